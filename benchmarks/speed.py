@@ -1,0 +1,220 @@
+"""How long does a cell-period take, against fixed-step RK4 on the same plane in the same run, and does it stay that?
+
+    python benchmarks/speed.py             # against the peer; what asking for P adds; compilation; import
+    python benchmarks/speed.py --scaling   # cost per cell from 16,384 to 1,048,576 cells
+    python benchmarks/speed.py --large     # 1024 x 1024 attractors with P: seconds and peak memory
+
+The plane: d 0.05..0.3, kappa 3..400 (log), r 0.5, start (0, 0.4), impacts per period over a window. Warm times are of
+whole calls of `vijax.sweep`, from axes to labelled dataset. Typical printout, two cores:
+
+    (to be filled in from a run)
+"""
+
+import argparse
+import csv
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+import vijax
+
+HERE = Path(__file__).parent
+REFERENCE = HERE.parent / "tests" / "data" / "trajectories.json"
+
+R, U0, V0 = 0.5, 0.0, 0.4
+PEER_STEPS = 1000  # per period; explicit RK4 is stable from 273 at kappa 400
+PEER_LIMIT = (
+    1.1  # us per cell-period on two cores: a slower peer is a poor program or a busy machine, and proves nothing
+)
+ACCURACY_PERIODS = 5  # later, chaotic cells turn any error into a difference of order one
+
+
+class Row(NamedTuple):
+    """One timed call, as it goes to the CSV file."""
+
+    what: str
+    cells: int
+    periods: int
+    repeat: int
+    seconds: float
+    impacts: float  # in all; NaN where the call does not count them
+
+    @property
+    def cell_period(self) -> float:
+        """Microseconds per cell-period."""
+        return 1e6 * self.seconds / (self.cells * self.periods)
+
+
+def axes(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """The axes d and kappa of the plane at side x side cells."""
+    return np.linspace(0.05, 0.3, side), np.geomspace(3, 400, side)
+
+
+def cells(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """d and kappa of every cell of the plane."""
+    d, kappa = np.meshgrid(*axes(side), indexing="ij")
+    return d.ravel(), kappa.ravel()
+
+
+def sweep(side: int, periods: int, outputs: tuple[str, ...] = ("impacts_per_period",)) -> Any:
+    """The plane's dataset by vijax."""
+    d, kappa = axes(side)
+    return vijax.sweep(d=d, kappa=kappa, r=R, u0=U0, v0=V0, until="window", periods=periods, outputs=outputs)
+
+
+def peer(side: int, periods: int) -> np.ndarray:
+    """The plane's impacts per period by RK4."""
+    from peers import rk4_impacts_per_period  # here: --scaling and --large do without numba, in time and memory
+
+    return rk4_impacts_per_period(*cells(side), R, U0, V0, periods, PEER_STEPS)
+
+
+def timed(what: str, side: int, periods: int, repeat: int, call: Callable[[], Any]) -> Row:
+    """Run a call whose result is, or holds, impacts per period in host memory, and time it."""
+    start = time.perf_counter()
+    result = call()
+    seconds = time.perf_counter() - start
+    counted = result if isinstance(result, np.ndarray) else result.get("impacts_per_period")
+    impacts = float("nan") if counted is None else float(np.sum(counted)) * periods
+    if counted is not None and not np.isfinite(impacts):
+        raise SystemExit(f"{what}: {int(np.sum(~np.isfinite(counted)))} cells without a number")
+    return Row(what, side * side, periods, repeat, seconds, impacts)
+
+
+def typical(rows: list[Row], what: str) -> Row:
+    """The median of the repeats of one thing."""
+    return statistics.median_low(sorted((row for row in rows if row.what == what), key=lambda row: row.seconds))
+
+
+def against_peer(quick: bool) -> Iterator[Row]:
+    """Warm times of vijax, of vijax asked for P, and of the peer, in alternation; what compiling costs; accuracy."""
+    side, periods, repeats = (64, 20, 3) if quick else (128, 100, 5)
+    contenders: dict[str, Callable[[], Any]] = {
+        "vijax": partial(sweep, side, periods),
+        "vijax with P": partial(sweep, side, periods, ("impacts_per_period", "P")),
+        "peer": partial(peer, side, periods),
+    }
+    rows = [timed(f"{what}, cold", side, periods, 0, call) for what, call in contenders.items()]
+    for repeat in range(repeats):
+        rows += [timed(what, side, periods, repeat, call) for what, call in contenders.items()]
+    yield from rows
+
+    for what in contenders:
+        row = typical(rows, what)
+        per_impact = 1e9 * row.seconds / row.impacts
+        print(f"{what:13} {row.cell_period:7.4f} us per cell-period  {per_impact:6.1f} ns per impact", end="")
+        cold = next(other.seconds for other in rows if other.what == f"{what}, cold")
+        print(f"  {row.seconds:6.3f} s warm  {cold - row.seconds:5.1f} s to compile")
+    ours, with_p, theirs = ([row.seconds for row in rows if row.what == what] for what in contenders)
+    ratios = [their / our for our, their in zip(ours, theirs, strict=True)]
+    print(f"vijax is {statistics.median(ratios):.1f} times faster ({min(ratios):.1f} to {max(ratios):.1f})")
+    added = statistics.median(more / our - 1 for our, more in zip(ours, with_p, strict=True))
+    print(f"asking for P adds {100 * added:.0f} %")
+    if (slow := typical(rows, "peer").cell_period) > PEER_LIMIT:
+        print(f"THE PEER DOES NOT COUNT: {slow:.2f} us per cell-period, above {PEER_LIMIT}: is the machine busy?")
+    accuracy(side)
+    print(f"import vijax  {import_seconds():.2f} s")
+
+
+def accuracy(side: int) -> None:
+    """Print the peer's error on the plane, and that of vijax on the stored impacts of 50 digits."""
+    from peers import rk4
+
+    d, kappa = cells(side)
+    _, u, v = rk4(d, kappa, R, U0, V0, ACCURACY_PERIODS, PEER_STEPS)
+    start = np.full(d.size, U0), np.full(d.size, V0)
+    run = vijax.trajectory(vijax.impact_pair(d, kappa, R, 0.0), *start, ACCURACY_PERIODS, max_impacts=64)
+    error = np.hypot(u - np.asarray(run.states.u)[:, -1], v - np.asarray(run.states.v)[:, -1])
+    print(f"peer: error of the state after {ACCURACY_PERIODS} periods: median {np.median(error):.1e}")
+
+    worst = 0.0
+    for case in json.loads(REFERENCE.read_text())["cases"]:
+        true = np.array([float(impact["vin"]) for impact in case["impacts"][:4]])
+        given = case["case"]
+        kappa_or_rigid = None if given.get("hard") else given["kappa"]
+        pair = vijax.impact_pair(given["d"], kappa_or_rigid, given["r"], given["gamma"])
+        last = float(case["impacts"][3]["t"])
+        run = vijax.trajectory(
+            pair, float(case["u0"]), float(case["v0"]), int(last / 2) + 1, t0=float(case["t0"]), max_impacts=16
+        )
+        worst = max(worst, float(np.max(np.abs(np.asarray(run.impacts.v_in)[:4] / true - 1))))
+    print(f"vijax: error of the first 4 entry speeds of each reference case: worst {worst:.1e} relative")
+
+
+def import_seconds() -> float:
+    """Seconds that `import vijax` takes in a new process, the least of three."""
+    code = "import time; start = time.perf_counter(); import vijax; print(time.perf_counter() - start)"
+    runs = (subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3))
+    return min(float(run.stdout) for run in runs)
+
+
+def scaling(quick: bool) -> Iterator[Row]:
+    """Warm cost per cell as the plane grows, in rounds over the sizes; the first round compiles and is dropped."""
+    sides, periods, repeats = ((64, 128, 256), 20, 2) if quick else ((128, 256, 512, 1024), 100, 3)
+    rows = []
+    for repeat in range(repeats + 1):
+        for side in sides:
+            row = timed(f"{side * side} cells", side, periods, repeat, partial(sweep, side, periods))
+            yield row
+            rows += [row] if repeat else []
+    base = typical(rows, f"{sides[0] ** 2} cells").cell_period
+    for side in sides:
+        row = typical(rows, f"{side * side} cells")
+        print(f"{row.cells:9,} cells  {row.cell_period:.4f} us per cell-period  {row.cell_period / base - 1:+.0%}")
+
+
+def large(quick: bool) -> Iterator[Row]:
+    """One cold call for the attractors and P of a large plane, and the most memory this process ever held."""
+    side, periods = (256 if quick else 1024), 400
+    d, kappa = axes(side)
+    start = time.perf_counter()
+    found = vijax.sweep(d=d, kappa=kappa, r=R, until="attractor", periods=periods, outputs=("P", "period"))
+    seconds = time.perf_counter() - start
+    yield Row("attractors, cold", side * side, periods, 0, seconds, float("nan"))
+    if lost := int(found["P"].isnull().sum()):
+        raise SystemExit(f"attractors: {lost} cells without P")
+    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # KiB on Linux
+    print(f"{side} x {side} attractors with P: {seconds:.1f} s with compilation, {resident:.2f} GiB resident at most")
+    labels, counts = np.unique(found["period"], return_counts=True)
+    shares = dict(zip(labels.tolist(), (counts / counts.sum()).tolist(), strict=True))
+    undecided, aperiodic = shares.pop(-1, 0.0), shares.pop(0, 0.0)
+    print(f"periodic {sum(shares.values()):.1%}  aperiodic {aperiodic:.1%}  undecided {undecided:.1%}")
+
+
+def main() -> None:
+    """Measure what the command line asks for, print it, and save the raw rows."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--scaling", action="store_const", const=scaling, dest="measure", help="cost per cell by size")
+    which.add_argument(
+        "--large", action="store_const", const=large, dest="measure", help="time and memory of 1024 x 1024"
+    )
+    parser.add_argument("--quick", action="store_true", help="small sizes, seconds in all: does it run?")
+    parser.add_argument("--rows", type=Path, default=HERE / "rows", help="folder for the raw rows")
+    parser.set_defaults(measure=against_peer)
+    given = parser.parse_args()
+
+    jax.config.update("jax_enable_compilation_cache", False)  # cold is to mean cold
+    print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
+    given.rows.mkdir(parents=True, exist_ok=True)
+    name = f"speed_{given.measure.__name__}{'_quick' if given.quick else ''}.csv"
+    with (given.rows / name).open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow([*Row._fields, "us_per_cell_period"])
+        for row in given.measure(given.quick):
+            table.writerow([*row, row.cell_period])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,11 @@
+#!/usr/bin/env bash
+# Everything a change must pass, in an environment of its own (.venv, made at need): bash scripts/check.sh [pytest arguments]
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python3 -m venv .venv
+export PATH="$PWD/.venv/bin:$PATH"
+python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
+ruff check .
+ruff format --check .
+mypy
+pytest -n 2 "$@"

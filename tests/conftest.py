@@ -1,0 +1,15 @@
+"""Settings every test runs under: strict dtype promotion, and property tests that CI draws the same way each time."""
+
+import os
+
+import jax
+from hypothesis import settings
+
+import vijax  # noqa: F401  switches x64 on before a test makes its first array
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# No deadline: the first example of a property pays for the compilation.
+settings.register_profile("vijax", deadline=None, max_examples=50)
+settings.register_profile("vijax-ci", settings.get_profile("vijax"), derandomize=True, database=None, print_blob=True)
+settings.load_profile("vijax-ci" if os.environ.get("CI") else "vijax")

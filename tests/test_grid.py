@@ -1,0 +1,474 @@
+"""Axes, cells, sweeps and stores: what a map holds, where, and that it comes back whole."""
+
+import json
+import math
+import threading
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+
+from vijax import dataset, grid, simulate
+from vijax.axes import cells, parse_axis
+from vijax.grid import load, save, sweep
+from vijax.model import Harvester, Status
+
+SETTINGS = {
+    "periods": 400,
+    "until": "attractor",
+    "transient": 0,
+    "wall": "soft",
+    "method": "exact",
+    "dtype": "float64",
+}
+LONG = 40  # periods: enough for the 1:1 orbits of these tests
+ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "max_penetration", "max_impact_speed"}
+
+
+def formula(pair, u0, v0, scale):
+    """A stand-in for the engine whose every field tells which cell it is."""
+    kappa = np.ones_like(pair.d) if pair.kappa is None else np.asarray(pair.kappa)
+    mark = np.asarray(pair.d) + 10 * kappa + 1e4 * np.asarray(pair.gamma) + 1e5 * np.asarray(u0) + 0 * np.asarray(v0)
+    metres = np.asarray(scale.length)[:, None] * np.asarray(scale.length_variant)
+    return mark, mark[:, None] * metres
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    """The stand-in in place of the engine; its list says how many real cells each tile had."""
+    tiles = []
+
+    def summarise(pair, u0, v0, scale, device, *, count, **settings):
+        tiles.append((int(count), settings, pair, device))
+        mark, energy = formula(pair, u0, v0, scale)
+        whole = np.arange(mark.size, dtype=np.int32)
+        wide, narrow = ("P", "P_stderr", "energy_ratio"), ("period", "impacts_left", "impacts_right", "status")
+        fields = {name: mark for name in simulate.Summary.__dataclass_fields__}
+        fields |= dict.fromkeys(wide, energy) | dict.fromkeys(narrow, 0 * whole)
+        return simulate.Summary(**fields)
+
+    monkeypatch.setattr(simulate, "summarise", summarise)
+    return tiles
+
+
+@pytest.fixture
+def no_engine(monkeypatch):
+    def summarise(*args, **settings):
+        raise AssertionError("the engine ran")
+
+    monkeypatch.setattr(simulate, "summarise", summarise)
+
+
+# --- axes ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("0.5", 0.5),
+        ("-3e-2", -0.03),
+        ("pi", math.pi),
+        ("-0.5pi", -0.5 * math.pi),
+        ("1,2.5, 4", [1, 2.5, 4]),
+        ("0.1:0.3:3", [0.1, 0.2, 0.3]),
+        ("-0.1:0.1:5", [-0.1, -0.05, 0, 0.05, 0.1]),
+        ("3:3:1", [3]),
+        ("1:100:3:log", [1, 10, 100]),
+        ("-4:-1:3:log", [-4, -2, -1]),
+        ("pi:3pi:3", [math.pi, 2 * math.pi, 3 * math.pi]),
+    ],
+)
+def test_axis_text(text, values):
+    parsed = parse_axis("u0", text)
+    assert parsed.shape == np.shape(values)
+    np.testing.assert_allclose(parsed, values, rtol=1e-15, atol=1e-17)
+
+
+def test_range_meets_its_ends():
+    values = parse_axis("kappa", "3:400:128:log")
+    assert (values[0], values[-1], values.size) == (3.0, 400.0, 128)
+
+
+def test_axis_from_file(tmp_path):
+    file = tmp_path / "axis.txt"
+    file.write_text("0.1 0.2\n0.25,0.3\n")
+    np.testing.assert_array_equal(parse_axis("d", f"@{file}"), [0.1, 0.2, 0.25, 0.3])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "x", "1,,2", "pipi", "pi2", "nan", "1,inf", "@nowhere"),
+        *("1:2", ":::", "1:2:0", "1:2:-3", "1:2:2.5", "1:inf:3"),
+        *("1:2:3:lin", "1:2:3:log:4", "0:1:5:log", "-1:1:5:log"),
+    ],
+)
+def test_malformed_axis_text_names_the_axis_and_the_text(text):
+    with pytest.raises(ValueError, match=r"u0\b") as error:
+        parse_axis("u0", text)
+    assert "\n" not in str(error.value)
+
+
+def test_dimensions_come_in_the_order_given():
+    of = cells({"kappa": [10.0, 20.0], "r": 0.5, "d": [0.1, 0.2, 0.3]}, Harvester(), "soft")
+    assert list(of.sizes.items()) == [("kappa", 2), ("d", 3)]
+
+
+@pytest.mark.parametrize(
+    ("axes", "wall", "dynamic"),
+    [
+        ({"d": 2, "kappa": 3, "A": 4, "omega": 5}, "soft", ["d", "kappa"]),
+        ({"omega": 5, "omega0": 3}, "soft", ["omega", "omega0"]),
+        ({"omega": 5, "s": 3, "kappa": 2}, "soft", ["omega", "s", "kappa"]),
+        ({"omega": 5, "d": 3}, "soft", ["omega", "d"]),  # kappa is the device's, so it follows omega
+        ({"omega": 5, "d": 3}, "rigid", ["d"]),
+        ({"d": 2, "kappa": 3, "r": 4}, "rigid", ["d", "r"]),
+        ({"d": 2, "k": 3, "u0": 4}, "rigid", ["d", "u0"]),
+        ({"d": 2, "gamma": 3, "A": 4}, "soft", ["d", "gamma"]),
+        ({"d": 2, "beta": 3, "A": 4}, "soft", ["d", "beta", "A"]),
+        ({"s": 2, "A": 4}, "soft", ["s", "A"]),
+    ],
+)
+def test_cells_that_share_their_dynamics_are_one_simulation(axes, wall, dynamic):
+    # Starts well within every gap.
+    values = {name: (0.001 if name == "u0" else 0.01) * np.arange(1, size + 1) for name, size in axes.items()}
+    of = cells(values, Harvester(), wall)
+    assert list(of.dynamic) == dynamic
+    assert of.count == math.prod(axes[dim] for dim in dynamic)
+    assert set(of.dynamic) | set(of.variant) == set(axes)
+
+
+def test_level_tube_ignores_the_forcing_amplitude():
+    assert cells({"d": 0.2, "beta": [0.0, 0.0], "A": [1.0, 2.0]}, Harvester(), "soft").variant == ("A",)
+
+
+def test_physical_axes_agree_with_the_device():
+    device = Harvester(beta=0.02)
+    axes = {"omega": [3.0, 7.0], "k": [300.0, 900.0], "A": [1.0, 2.0], "s": [0.2, 0.3]}
+    of = cells(axes, device, "soft")
+    full = {name: of.flat(of.quantities[name], np.arange(16)).reshape(2, 2, 2, 2) for name in ("d", "kappa", "gamma")}
+    for place in np.ndindex(2, 2, 2, 2):
+        omega, k, amplitude, s = (values[i] for values, i in zip(axes.values(), place, strict=True))
+        pair = Harvester(beta=0.02, omega=omega, omega0=math.sqrt(k / 0.0035), A=amplitude, s=s).pair()
+        for name, values in full.items():
+            np.testing.assert_allclose(values[place], getattr(pair, name), rtol=1e-14)
+
+
+@pytest.mark.parametrize("wall", ["soft", "rigid"])
+def test_scales_are_products_of_a_cell_and_a_variant(wall):
+    axes = {"A": [1.0, 3.0], "d": [0.1, 0.2], "omega": [3.0, 7.0], "kappa": [20.0, 50.0]}
+    of = cells(axes, Harvester(), wall)
+    for scale, power, bare in ((of.length, 2, wall == "soft"), (of.speed, 1, True)):
+        product = of.flat(scale, np.arange(of.count))[:, None] * of.factors(scale)
+        dims = of.dynamic + of.variant
+        got = xr.Variable(dims, product.reshape([2] * 4)).transpose(*axes).values
+        a, _, omega, kappa = np.meshgrid(*axes.values(), indexing="ij")
+        np.testing.assert_allclose(got, a * math.pi**power / omega**power / (1 if bare else kappa), rtol=1e-15)
+
+
+# --- the door --------------------------------------------------------------------------------------------------------
+
+BAD = [
+    ({"r": [0.5, -0.2]}, r"r must lie in \(0, 1\]; got -0.2 at index 1"),
+    ({"r": 0.0}, "r must lie"),
+    ({"d": 0.0}, "d must be positive"),
+    ({"kappa": np.inf}, "rigid"),
+    ({"kappa": [-1.0]}, "kappa must be positive"),
+    ({"omega": 0.0}, "omega must be positive"),
+    ({"A": [1.0, np.nan]}, "A must be .* index 1"),
+    ({"gamma": np.inf}, "gamma must be finite"),
+    ({"v0": [0.0, np.nan]}, "v0 must be finite"),
+    ({"d": "0.1"}, "d must be a real number"),
+    ({"d": [[0.1]]}, "d must be a number or a 1-D array"),
+    ({"d": []}, "d must be a number or a 1-D array"),
+    ({"d": 0.1, "s": 0.3}, "d and s"),
+    ({"omega0": 100.0, "k": 500.0}, "omega0 and k"),
+    ({"gamma": 0.1, "beta": 0.1}, "gamma and beta"),
+    ({"wall": "rigid", "d": [0.2, 0.1], "u0": 0.08}, "u0 must lie in the gap .* got 0.08 where d = 0.1"),
+    ({"wall": "hard"}, 'wall must be "soft" or "rigid"'),
+    ({"until": "chaos"}, "until must be"),
+    ({"method": "rk4"}, "method must be"),
+    ({"dtype": "float16"}, "dtype must be"),
+    ({"periods": 0}, "periods must be a whole number of at least 1; got 0"),
+    ({"periods": 1.5}, "periods must be"),
+    ({"transient": -1}, "transient must be"),
+    ({"outputs": ["P", "Q"]}, "outputs must be among .* got 'Q'"),
+    ({"device": Harvester(s=np.array([0.1, 0.2]))}, "device.s must be one number"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD, ids=[str(arguments)[:40] for arguments, _ in BAD])
+def test_bad_input_is_one_line_before_anything_runs(no_engine, arguments, words):
+    with pytest.raises(ValueError, match=words) as error:
+        sweep(**arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_axis_is_named(no_engine):
+    with pytest.raises(TypeError, match="no axis 'kapa'"):
+        sweep(kapa=3.0)
+
+
+# --- cells to map and back -------------------------------------------------------------------------------------------
+
+
+def test_every_cell_lands_in_its_place(engine, monkeypatch):
+    monkeypatch.setattr(grid, "_SMALLEST_TILE", 4)
+    monkeypatch.setattr(grid, "_LARGEST_TILE", 8)
+    axes = {"A": [1.0, 2.0, 5.0], "kappa": [3.0, 30.0, 300.0], "gamma": [0.1, 0.0], "d": np.linspace(0.1, 0.3, 11)}
+    steps = []
+    here = threading.current_thread()
+    found = sweep(**axes, omega=6.0, progress=lambda *step: steps.append((threading.current_thread() is here, *step)))
+    assert found["P"].dims == ("A", "kappa", "gamma", "d")
+    assert found["period"].dims == ("kappa", "gamma", "d")
+    mark = found["d"] + 10 * found["kappa"] + 1e4 * found["gamma"] + 1e5 * found["u0"]
+    np.testing.assert_allclose(found["impacts_per_period"], mark.transpose(*found["impacts_per_period"].dims))
+    energy = (mark * found["A"] * math.pi**2 / 36).transpose(*found["P"].dims)
+    np.testing.assert_allclose(found["P"], energy, rtol=1e-14)
+    np.testing.assert_allclose(found["power"], energy * 6 / math.pi, rtol=1e-14)
+    assert sum(count for count, *_ in engine) == 66
+    # Level cells and the others never share a tile: each kind has its own program.
+    assert all(len(set((np.asarray(pair.gamma) == 0).tolist())) == 1 for _, _, pair, _ in engine)
+    assert [step[1] for step in steps] == sorted(step[1] for step in steps)
+    assert steps[0] == (True, 0, 66)
+    assert steps[-1] == (True, 66, 66)
+
+
+@pytest.mark.parametrize("wall", ["soft", "rigid"])
+def test_a_variable_lacks_the_dimensions_it_cannot_depend_on(engine, wall):
+    found = sweep(d=[0.1, 0.2], kappa=[10.0, 20.0, 30.0], omega=[3.0, 4.0], wall=wall)
+    variants = {"omega"} if wall == "soft" else {"omega", "kappa"}
+    for name, variable in found.items():
+        expected = {"d", "kappa", "omega"} - (set() if name in ENERGY_ONLY else variants)
+        # A rigid wall's speeds know nothing of kappa.
+        expected -= {"kappa"} if (name, wall) == ("max_impact_speed", "rigid") else set()
+        assert set(variable.dims) == expected, name
+        assert list(variable.dims) == [dim for dim in ("d", "kappa", "omega") if dim in expected]
+
+
+def test_variables_and_coordinates_say_what_they_are(engine):
+    found = sweep(omega=[3.0, 4.0], omega0=[50.0, 60.0])
+    for name, variable in found.variables.items():
+        assert variable.attrs["units"], name
+        assert variable.attrs["long_name"], name
+    assert found["d"].dims == ("omega",)
+    assert found["kappa"].dims == ("omega", "omega0")
+    # On the curve of an omega sweep at fixed s and omega0.
+    np.testing.assert_allclose(*xr.broadcast(found["d"] * found["kappa"] ** 2, 0.3 * found["omega0"] ** 2))
+    assert found["status"].attrs["flag_values"] == [int(status) for status in Status]
+    assert found["status"].attrs["flag_meanings"].split()[Status.SLOW] == "slow"
+    assert found["status"].dtype == np.int8
+
+
+def test_attributes_record_how_the_map_was_made(engine):
+    found = sweep(d=0.2, periods=7, transient=3, until="window", device=Harvester(V=1000.0), outputs=["P"])
+    kept = {"periods": 7, "transient": 3, "until": "window", "wall": "soft", "method": "exact", "dtype": "float64"}
+    assert kept.items() <= found.attrs.items()
+    assert found.attrs["harvester_V"] == 1000.0
+    assert found.attrs["version_jax"] == jax.__version__
+    assert {"commit", "device", "outputs", "version_python"} <= set(found.attrs)
+    assert any(name.startswith("tolerance_") for name in found.attrs)
+    json.dumps(found.attrs)
+
+
+def test_only_what_is_asked_for_is_computed(engine):
+    found = sweep(d=[0.1, 0.2], kappa=20.0, outputs=["impacts_per_period"])
+    assert set(found) == {"impacts_per_period", "status"}
+    assert engine[0][1]["outputs"] == {"impacts_per_period", "status"}
+    assert "lyapunov" not in sweep(d=0.1, kappa=20.0)
+    assert set(sweep(d=0.1, kappa=20.0, outputs="lyapunov")) == {"lyapunov", "status"}
+
+
+def test_admissible_asks_for_energy_and_depth(monkeypatch):
+    plan = grid.plan({"d": [0.1, 0.2, 0.3, 0.4], "kappa": 20.0, "omega": math.pi}, ["admissible"], None, **SETTINGS)
+    ratio = np.array([[0.5], [1.5], [0.5], [np.nan]])
+    found = dataset.label(
+        plan, {"energy_ratio": ratio, "deepest": np.array([0.0062, 0.001, 0.0064, 0.001]), "status": np.zeros(4, int)}
+    )
+    assert found["admissible"].values.tolist() == [True, False, False, False]
+
+
+def test_ctrl_c_drops_the_waiting_tiles(engine, monkeypatch):
+    monkeypatch.setattr(grid, "_SMALLEST_TILE", 2)
+    monkeypatch.setattr(grid, "_LARGEST_TILE", 2)
+    slow = simulate.summarise
+
+    def summarise(*args, **settings):
+        time.sleep(0.01)
+        return slow(*args, **settings)
+
+    monkeypatch.setattr(simulate, "summarise", summarise)
+
+    def stop(done, total):
+        if done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep(d=np.linspace(0.1, 0.3, 200), kappa=20.0, progress=stop)
+    time.sleep(1.0)  # longer than all hundred tiles would take
+    assert len(engine) < 50
+
+
+# --- the store -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small(engine) -> xr.Dataset:
+    found = sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 5), A=[1.0, 2.0])
+    found["restitution"][0, 0] = np.nan
+    return found
+
+
+def test_a_map_comes_back_equal(small, tmp_path):
+    save(small, tmp_path / "map.zarr")
+    xr.testing.assert_identical(load(tmp_path / "map.zarr"), small)
+    assert [path.name for path in tmp_path.iterdir()] == ["map.zarr"]
+
+
+def test_a_single_cell_comes_back_equal(engine, tmp_path):
+    single = sweep(d=0.2, kappa=20.0, dtype="float32")
+    save(single, tmp_path / "map.zarr")
+    xr.testing.assert_identical(load(tmp_path / "map.zarr"), single)
+
+
+def test_a_flipped_bit_is_noticed(small, tmp_path):
+    save(small, tmp_path / "map.zarr")
+    chunk = next(path for path in (tmp_path / "map.zarr" / "P" / "c").rglob("*") if path.is_file())
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    with pytest.raises(ValueError, match=r"(?i)checksum"):
+        load(tmp_path / "map.zarr")
+
+
+def test_every_array_has_a_checksum(small, tmp_path):
+    save(small, tmp_path / "map.zarr")
+    arrays = [json.loads(path.read_text()) for path in (tmp_path / "map.zarr").glob("*/zarr.json")]
+    assert len(arrays) == len(small.variables)
+    assert all(array["codecs"][-1]["name"] == "crc32c" for array in arrays)
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError])
+@pytest.mark.parametrize("before", [False, True], ids=["new", "replaced"])
+def test_a_stopped_write_leaves_what_was_there(small, tmp_path, monkeypatch, failure, before):
+    target = tmp_path / "map.zarr"
+    if before:
+        save(small.isel(A=0), target)
+
+    def to_zarr(self, path, **options):
+        Path(path).mkdir()
+        (Path(path) / "half").write_text("written")
+        raise failure
+
+    monkeypatch.setattr(xr.Dataset, "to_zarr", to_zarr)
+    with pytest.raises(failure):
+        save(small, target, overwrite=True)
+    assert list(tmp_path.iterdir()) == ([target] if before else [])
+    if before:
+        xr.testing.assert_identical(load(target), small.isel(A=0))
+
+
+def test_a_stop_between_old_and_new_keeps_the_old(small, tmp_path, monkeypatch):
+    rename = Path.replace
+
+    def replace(self, target):
+        if Path(target).suffix == ".zarr":
+            raise KeyboardInterrupt
+        return rename(self, target)  # zarr's own
+
+    save(small.isel(A=0), tmp_path / "map.zarr")
+    monkeypatch.setattr(Path, "replace", replace)
+    with pytest.raises(KeyboardInterrupt):
+        save(small, tmp_path / "map.zarr", overwrite=True)
+    xr.testing.assert_identical(load(tmp_path / "map.zarr"), small.isel(A=0))
+    assert [path.name for path in tmp_path.iterdir()] == ["map.zarr"]
+
+
+def test_overwrite_replaces_a_store_and_nothing_else(small, tmp_path):
+    target = tmp_path / "map.zarr"
+    save(small.isel(A=0), target)
+    with pytest.raises(FileExistsError, match="path must not exist"):
+        save(small, target)
+    save(small, target, overwrite=True)
+    xr.testing.assert_identical(load(target), small)
+    folder = tmp_path / "thesis"
+    folder.mkdir()
+    with pytest.raises(FileExistsError, match="no zarr store"):
+        save(small, folder, overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["missing/map.zarr", ""])
+def test_a_place_that_cannot_be_written_is_named(small, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match="path must"):
+        save(small, name)
+
+
+def test_loading_nothing_says_so(tmp_path):
+    with pytest.raises(FileNotFoundError, match="path must name a zarr store"):
+        load(tmp_path / "map.zarr")
+
+
+# --- with the engine -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plane() -> xr.Dataset:
+    return sweep(d=[0.2, 0.25, 0.3], kappa=[100.0, 400.0], periods=LONG)
+
+
+def test_a_stiff_wide_gap_has_symmetric_orbits(plane):
+    assert plane["P"].dims == ("d", "kappa")
+    stiff = plane.sel(kappa=400.0)
+    for name in ("period", "impacts_left", "impacts_right"):
+        assert (stiff[name] == 1).all(), name
+    assert (stiff["impacts_per_period"] == 2).all()
+    assert (stiff["status"] == Status.OK).all()
+    assert (stiff["P_stderr"] == 0).all()
+    assert plane["admissible"].all()
+
+
+def test_cells_of_the_reference_plane():
+    reference = json.loads((Path(__file__).parent / "data" / "plane_cells.json").read_text())["cells"]
+    quick = [cell for cell in reference if cell["p"] > 0 and cell["converged_after"] < LONG / 2][:8]
+    for cell in quick:
+        found = sweep(periods=LONG, **{name: cell[name] for name in ("d", "kappa", "r", "gamma", "u0", "v0")})
+        got = [int(found[name]) for name in ("period", "impacts_left", "impacts_right")]
+        assert got == [cell[name] for name in ("p", "left", "right")]
+        np.testing.assert_allclose(found["P"], cell["P_J"], rtol=1e-9)
+
+
+def test_a_cell_is_the_same_alone(plane):
+    alone = sweep(d=0.25, kappa=400.0, periods=LONG)
+    among = plane.sel(d=0.25, kappa=400.0)
+    for name in plane.data_vars:
+        np.testing.assert_array_equal(alone[name], among[name], err_msg=str(name))
+
+
+def test_physical_and_dimensionless_axes_give_the_same_map(plane):
+    # d = s omega^2 / (A pi^2) and kappa = omega0 pi / omega, at A = 1 and omega = pi.
+    physical = sweep(s=[0.2, 0.25, 0.3], omega0=[100.0, 400.0], periods=LONG)
+    np.testing.assert_allclose(physical["P"], plane["P"], rtol=1e-9)
+    np.testing.assert_array_equal(physical["period"], plane["period"])
+
+
+def test_variants_are_what_separate_sweeps_give(plane):
+    both = sweep(d=[0.2, 0.3], kappa=400.0, A=[1.0, 2.0], periods=LONG)
+    np.testing.assert_allclose(both["P"].sel(A=1.0), plane["P"].sel(d=[0.2, 0.3], kappa=400.0), rtol=1e-12)
+    louder = sweep(d=[0.2, 0.3], kappa=400.0, A=2.0, periods=LONG)
+    for name in ("P", "energy_ratio", "max_penetration", "max_impact_speed"):
+        np.testing.assert_allclose(both[name].sel(A=2.0), louder[name], rtol=1e-12, err_msg=name)
+
+
+def test_rigid_walls_in_single_precision():
+    found = sweep(d=[0.25, 0.3], kappa=[200.0, 400.0], wall="rigid", dtype="float32", periods=LONG)
+    assert found["P"].dtype == np.float32
+    assert found["P"].dims == ("d", "kappa")
+    assert found["period"].dims == ("d",)
+    assert (found["period"] == 1).all()
+    # Eq. (35): the depth goes as 1/kappa, and a small one's energy as its square.
+    np.testing.assert_allclose(found["max_penetration"].sel(kappa=200.0), 2 * found["max_penetration"].sel(kappa=400.0))
+    np.testing.assert_allclose(found["restitution"], 0.5, rtol=1e-5)

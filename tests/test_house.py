@@ -1,0 +1,140 @@
+"""The layout: imports point downwards, heavy packages stay in their rooms, `import vijax` is light and quick."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+FOLDERS = ("vijax", "scripts", "benchmarks", "tests")
+SOURCES = sorted(path for folder in FOLDERS for path in (ROOT / folder).glob("*.py"))
+PUBLIC = [path for path in SOURCES if path.parent.name != "tests"]
+PACKAGE = [path for path in SOURCES if path.parent.name == "vijax"]
+
+# What each room may import of the others: the README's room table. `__init__` names the public functions of all.
+ROOMS: dict[str, set[str]] = {
+    "model": set(),
+    "flow": {"model"},
+    "energy": {"model", "flow"},
+    "exact": {"model", "flow", "energy"},
+    "quick": {"model", "flow", "energy", "exact"},
+    "lanes": set(),
+    "simulate": {"model", "flow", "energy", "exact", "quick", "lanes"},
+    "axes": {"model"},
+    "dataset": {"model", "axes", "simulate"},
+    "store": set(),
+    "grid": {"model", "axes", "dataset", "store", "simulate"},
+    "plot": {"model", "axes", "dataset", "store", "grid"},
+}
+ROOMS["__init__"] = set(ROOMS)
+
+ONLY_IN = {"diffrax": "vijax/ode.py", "matplotlib": "vijax/plot.py"}
+NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]
+IMPORT_SECONDS = 1.5
+
+# Built here, so that this line is not what it looks for.
+MACHINE_PATH = re.compile(r"(?<![\w.:/])/({})/\w".format("|".join(["home", "root", "tmp", "work", "Users", "mnt"])))
+
+
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def imported(parsed: ast.AST) -> Iterator[str]:
+    """Dotted names that a file imports, at any depth: `from vijax import flow` gives vijax.flow."""
+    for node in ast.walk(parsed):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            package = ("vijax." if node.level else "") + (node.module or "")
+            yield from (f"{package.rstrip('.')}.{alias.name}" for alias in node.names)
+
+
+def rooms_imported(parsed: ast.AST) -> set[str]:
+    """Rooms among a file's imports; a public name taken from the package itself counts as the room `__init__`."""
+    parts = [name.split(".") for name in imported(parsed)]
+    return {part[1] if part[1:] and part[1] in ROOMS else "__init__" for part in parts if part[0] == "vijax"}
+
+
+def name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def test_the_table_has_no_cycle_and_no_room_twice():
+    seen: set[str] = set()
+    for room, below in ROOMS.items():
+        assert below <= seen, f"{room} may import {below - seen}, which stand under it in the table"
+        seen.add(room)
+
+
+@pytest.mark.parametrize("path", PACKAGE, ids=name)
+def test_imports_point_downwards(path):
+    assert path.stem in ROOMS, f"{name(path)} has no line in the room table of tests/test_house.py"
+    upwards = rooms_imported(tree(path)) - ROOMS[path.stem]
+    assert not upwards, f"{name(path)} must not import {sorted(upwards)}"
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=name)
+def test_heavy_packages_stay_in_their_room(path):
+    packages = {package.split(".")[0] for package in imported(tree(path))}
+    strays = {package for package, room in ONLY_IN.items() if package in packages and name(path) != room}
+    assert not strays, f"{name(path)} imports {strays}; only {[ONLY_IN[package] for package in strays]} may"
+
+
+def test_rooms_and_imports_are_read_as_python_does():
+    source = "from vijax import flow, sweep\nimport numpy\nimport vijax.grid as g\nif g:\n    from .model import State"
+    assert rooms_imported(ast.parse(source)) == {"flow", "grid", "model", "__init__"}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=name)
+def test_annotations_are_not_deferred(path):
+    assert "__future__.annotations" not in set(imported(tree(path))), "jaxtyping reads annotations as they are defined"
+
+
+def public(parsed: ast.Module) -> Iterator[ast.FunctionDef | ast.ClassDef]:
+    """Public functions and classes of a module, and the public methods of those classes."""
+    for node in parsed.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node
+            if isinstance(node, ast.ClassDef):
+                yield from (n for n in node.body if isinstance(n, ast.FunctionDef) and not n.name.startswith("_"))
+
+
+@pytest.mark.parametrize("path", PUBLIC, ids=name)
+def test_everything_public_has_a_docstring(path):
+    parsed = tree(path)
+    assert ast.get_docstring(parsed), f"{name(path)} does not say what it is"
+    assert not [node.name for node in public(parsed) if not ast.get_docstring(node)]
+
+
+def test_no_file_names_a_path_of_one_machine():
+    texts = [*SOURCES, *ROOT.glob("*.md"), *ROOT.glob("*.toml"), *ROOT.glob("scripts/*"), *ROOT.glob(".ci/*")]
+    lines = ((path, line) for path in texts for line in path.read_text(encoding="utf-8").splitlines())
+    assert not [f"{name(path)}: {line.strip()}" for path, line in lines if MACHINE_PATH.search(line)]
+
+
+def fresh_import() -> tuple[float, list[str]]:
+    """Seconds that `import vijax` takes in a new process, and the top-level packages it loads."""
+    code = (
+        "import json, sys, time; start = time.perf_counter(); import vijax; seconds = time.perf_counter() - start; "
+        "print(json.dumps([seconds, sorted({name.split('.')[0] for name in sys.modules})]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    seconds, packages = json.loads(done.stdout)
+    return seconds, packages
+
+
+def test_import_loads_nothing_heavy():
+    _, packages = fresh_import()
+    assert "vijax" in packages
+    assert not set(NOT_AT_IMPORT) & set(packages)
+
+
+def test_import_is_quick():
+    # The least of three: other tests may hold both cores, and the first import after an install compiles bytecode.
+    assert min(fresh_import()[0] for _ in range(3)) < IMPORT_SECONDS

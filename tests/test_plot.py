@@ -1,0 +1,207 @@
+"""The picture of a map: layout, scales, marks, and what it says of cells that cannot be believed."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.colors import LogNorm
+from matplotlib.legend import Legend
+
+from vijax import plot
+from vijax.dataset import best
+
+SYMBOLS = {
+    "d": ("d", "1"),
+    "kappa": (r"\kappa", "1"),
+    "A": ("A", "m s-2"),
+    "r": ("r", "1"),
+    "omega0": (r"\omega_0", "rad s-1"),
+}
+
+
+def drawn_map(**axes) -> xr.Dataset:
+    """A map over the given axes with inadmissible, aperiodic, undecided and silent cells."""
+    coords = {}
+    for name, values in axes.items():
+        symbol, units = SYMBOLS[name]
+        coords[name] = (name, np.asarray(values), {"symbol": symbol, "units": units})
+    shape = [len(values) for values in axes.values()]
+    cell = np.arange(np.prod(shape)).reshape(shape)
+    periodic = cell[tuple(slice(None) if name in ("d", "kappa", "omega0") else 0 for name in axes)]
+    dims = [name for name in axes if name in ("d", "kappa", "omega0")]
+    return xr.Dataset(
+        {
+            "P": (list(axes), np.where(cell == 0, 0.0, 1e-6 * (1 + cell))),
+            "admissible": (list(axes), cell < 0.75 * cell.size),
+            "period": (dims, np.array([1, 1, 2, 0, 0, -1])[periodic % 6]),
+        },
+        coords=coords | {"gamma": ((), 0.1, {"symbol": r"\gamma", "units": "1"})},
+        attrs={"wall": "soft"},
+    )
+
+
+D, KAPPA = np.linspace(0.05, 0.3, 6), np.geomspace(3, 400, 8)
+
+
+def words(figure) -> str:
+    legends = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    titles = [axes.get_title() for axes in figure.axes]
+    labels = [text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel())]
+    return "\n".join([*legends, *titles, *labels, figure.get_suptitle()])
+
+
+@pytest.mark.parametrize(
+    ("sizes", "panels"),
+    [
+        ({"d": 5}, (1, 1)),
+        ({"d": 5, "kappa": 4}, (1, 1)),
+        ({"d": 5, "r": 1, "kappa": 4}, (1, 1)),
+        ({"d": 5, "kappa": 4, "r": 2}, (1, 2)),
+        ({"d": 5, "kappa": 4, "r": 7}, (3, 3)),
+        ({"d": 5, "kappa": 4, "r": 2, "A": 5}, (5, 2)),
+    ],
+)
+def test_layout(sizes, panels):
+    assert plot.layout(sizes) == panels
+
+
+@pytest.mark.parametrize(
+    ("sizes", "say"),
+    [
+        ({}, "single cell"),
+        ({"d": 1, "r": 1}, "single cell"),
+        ({"r": 3, "d": 3, "kappa": 64}, "at most 36 panels; got 64 values of kappa"),
+        ({"d": 2, "kappa": 2, "r": 2, "A": 2, "omega": 2}, "at most 4 axes"),
+    ],
+)
+def test_what_no_picture_holds_says_what_to_fix(sizes, say):
+    with pytest.raises(ValueError, match=say):
+        plot.layout(sizes)
+
+
+def test_power_map_explains_itself(tmp_path):
+    file = tmp_path / "map.png"
+    figure = plot.power_map(drawn_map(d=D, kappa=KAPPA), file)
+    assert file.read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
+    said = words(figure)
+    for part in (
+        "inadmissible",
+        "period 1",
+        "aperiodic",
+        "undecided",
+        "no impact",
+        "largest admissible",
+        "$d$",
+        r"$\kappa$",
+    ):
+        assert part in said, part
+    assert r"soft walls, $\gamma$ = 0.1" in said
+    axes, bar = figure.axes
+    assert (axes.get_xscale(), axes.get_yscale()) == ("linear", "log")
+    assert "[J per half period]" in bar.get_ylabel()
+
+
+def test_legend_names_only_what_is_there():
+    found = drawn_map(d=D, kappa=KAPPA)
+    found["period"][:] = 1
+    found["admissible"][:] = True
+    found["P"][:] = 1e-6
+    said = words(plot.power_map(found))
+    assert not [part for part in ("inadmissible", "aperiodic", "undecided", "no impact") if part in said]
+
+
+def test_colours_are_logarithmic_and_span_the_admissible_cells():
+    found = drawn_map(d=D, kappa=KAPPA)
+    mesh = plot.power_map(found).axes[0].collections[0]
+    assert isinstance(mesh.norm, LogNorm)
+    assert mesh.norm.vmax == pytest.approx(float(found["P"].where(found["admissible"]).max()))
+
+
+def test_star_stands_on_the_largest_admissible_cell():
+    found = drawn_map(d=D, kappa=KAPPA)
+    peak = best(found)
+    assert float(peak) == pytest.approx(36e-6)
+    star = next(line for line in plot.power_map(found).axes[0].lines if line.get_marker() == "*")
+    assert (star.get_xdata()[0], star.get_ydata()[0]) == (float(peak["d"]), float(peak["kappa"]))
+
+
+def test_best_is_none_without_an_admissible_cell():
+    found = drawn_map(d=D, kappa=KAPPA)
+    found["admissible"][:] = False
+    assert best(found) is None
+    assert "largest" not in words(plot.power_map(found))
+
+
+def test_hatch_border_and_dots_lie_on_their_cells():
+    found = drawn_map(d=D, kappa=KAPPA)
+    axes = plot.power_map(found).axes[0]
+    aperiodic = found["period"].stack(cell=["d", "kappa"])
+    aperiodic = aperiodic[(aperiodic == 0).values]
+    dots = next(line for line in axes.lines if line.get_marker() == ".")
+    drawn = sorted(zip(dots.get_xdata(), dots.get_ydata(), strict=True))
+    assert drawn == sorted(zip(aperiodic["d"].values, aperiodic["kappa"].values, strict=True))
+    veil = next(piece for piece in axes.collections if getattr(piece, "hatches", None))
+    for i, j in np.ndindex(6, 8):
+        inside = any(path.contains_point((D[i], KAPPA[j])) for path in veil.get_paths())
+        assert inside == (not bool(found["admissible"][i, j])), (i, j)
+
+
+def test_borders_part_a_mask_from_the_rest():
+    mask = np.array([[True, False, False], [True, True, False]])
+    segments = plot._borders(np.arange(4.0), np.arange(3.0), mask)
+    assert sorted(sorted(segment) for segment in segments) == [
+        [(1.0, 0.0), (1.0, 1.0)],
+        [(1.0, 1.0), (2.0, 1.0)],
+        [(2.0, 1.0), (2.0, 2.0)],
+    ]
+
+
+def test_fine_maps_carry_marks_by_blocks():
+    size = 2 * plot._MARKS
+    mask = np.zeros((size, size), bool)
+    mask[:2, :2] = True
+    mask[100, 100] = True
+    places = np.arange(size)
+    most = plot._marks(mask, places, places, most=True)
+    anywhere = plot._marks(mask, places, places, most=False)
+    assert (most[0].tolist(), most[1].tolist()) == ([1], [1])
+    assert len(anywhere[0]) == 2
+
+
+def test_panels_show_the_further_axes_in_order():
+    found = drawn_map(d=D, kappa=KAPPA, A=[1.0, 2.0], r=[0.3, 0.5, 0.8])
+    figure = plot.power_map(found)
+    titles = [axes.get_title() for axes in figure.axes[:6]]
+    assert titles[1] == "$A$ = 2 m s$^{-2}$, $r$ = 0.3"
+    assert titles[2] == "$A$ = 1 m s$^{-2}$, $r$ = 0.5"
+    for axes in figure.axes[:6]:
+        amplitude, r = (float(part.split("=")[1].split()[0]) for part in axes.get_title().split(","))
+        power = found["P"].sel(A=amplitude, r=r).transpose("kappa", "d").values
+        np.testing.assert_array_equal(np.ma.filled(axes.collections[0].get_array(), 0.0), power)
+
+
+def test_unsorted_values_are_drawn_sorted():
+    found = drawn_map(d=D, kappa=KAPPA)
+    mixed = found.isel(d=[3, 0, 5, 1, 4, 2])
+    want, got = (plot.power_map(each).axes[0].collections[0].get_array() for each in (found, mixed))
+    np.testing.assert_array_equal(np.ma.filled(got, 0.0), np.ma.filled(want, 0.0))
+
+
+def test_one_axis_is_a_curve():
+    figure = plot.power_map(drawn_map(omega0=np.linspace(20, 400, 30)))
+    (axes,) = figure.axes
+    assert (axes.get_xlabel(), axes.get_yscale()) == (r"$\omega_0$ [rad s$^{-1}$]", "log")
+    assert isinstance(figure.legends[0], Legend)
+
+
+def test_a_map_without_energy_is_drawn():
+    found = drawn_map(d=D, kappa=KAPPA)
+    found["P"][:] = 0.0
+    assert "no impact" in words(plot.power_map(found))
+
+
+def test_missing_variables_and_endings_are_named(tmp_path):
+    with pytest.raises(ValueError, match="without admissible"):
+        plot.power_map(drawn_map(d=D, kappa=KAPPA).drop_vars("admissible"))
+    with pytest.raises(ValueError, match=r"plot must end in \.png"):
+        plot.power_map(drawn_map(d=D, kappa=KAPPA), tmp_path / "map.doc")

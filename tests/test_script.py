@@ -1,0 +1,193 @@
+"""`scripts/grid.py`: from its arguments to a store and a picture, and nothing at all after bad input or Ctrl-C."""
+
+import importlib.util
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vijax import dataset, grid
+
+SCRIPT = Path(__file__).parent.parent / "scripts" / "grid.py"
+TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("grid_script", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# A background job of a shell ignores SIGINT, and so would its children.
+INTERRUPTIBLE = (
+    "import runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+)
+
+
+def started(arguments, folder):
+    command = [sys.executable, "-c", INTERRUPTIBLE, str(SCRIPT), *arguments]
+    environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache")}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
+
+
+BAD = [
+    (["--r", "1.2"], r"r must lie in \(0, 1\]; got 1.2"),
+    (["--d", "0"], "d must be positive"),
+    (["--kappa", "inf"], 'wall="rigid"'),
+    (["--omega=-1"], "omega must be positive"),
+    (["--d", "0.1:0.2:0"], "N in LO:HI:N"),
+    (["--u0=-1:1:5:log"], "log axis"),
+    (["--d", "0.1:0.2"], "d must be a number, a comma list"),
+    (["--d", "@nowhere"], "can be read; got @nowhere"),
+    (["--d", "0.1", "--s", "0.3"], "d and s give the same quantity"),
+    (["--wall", "rigid", "--u0", "0.2", "--d", "0.1,0.2"], "u0 must lie in the gap"),
+    (["--wall", "hard"], "wall must be"),
+    (["--dtype", "float16"], "dtype must be"),
+    (["--until", "never"], "until must be"),
+    (["--periods", "0"], "periods must be"),
+    (["--periods", "many"], "--periods"),
+    (["--outputs", "Q"], "outputs must be among"),
+    (["--outputs", "P"], "outputs must hold period, admissible"),
+    (["--set", "weight=1"], "weight must be a constant of the device"),
+    (["--set", "r=0.3"], "give --r=0.3"),
+    (["--set", "V"], "NAME=VALUE"),
+    (["--set", "m_b=-1"], "m_b must be positive"),
+    (["--out", "nowhere/map.zarr"], "out must lie in a folder that exists"),
+    (["--out", "map.nc"], "out must end in .zarr"),
+    (["--plot", "map.doc"], "plot must end in"),
+    (["--omega", "3:12:50"], "at most 36 panels; got 50 values of omega"),
+    (["--d", "0.1", "--kappa", "30"], "single cell"),
+    (["--gravity", "1"], "No such option"),
+    (["more"], "unexpected extra argument"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "say"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_is_one_line_and_exit_code_2(script, folder, capsys, monkeypatch, arguments, say):
+    monkeypatch.setattr(grid, "run", None)  # nothing may run
+    assert script.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert re.search(say, err)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(("option", "name"), [("--out", "map.zarr"), ("--plot", "map.png")])
+def test_what_exists_is_found_before_the_run(script, folder, capsys, monkeypatch, option, name):
+    monkeypatch.setattr(grid, "run", None)
+    (folder / name).write_text("precious")
+    assert script.main([option, name]) == 2
+    assert "must not exist yet" in capsys.readouterr().err
+    assert (folder / name).read_text() == "precious"
+
+
+@pytest.fixture
+def planned(script, monkeypatch, folder):
+    """What the script asks `run` for."""
+    plans = []
+
+    def run(plan, progress=None):
+        plans.append(plan)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(grid, "run", run)
+    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    monkeypatch.setattr(script.os, "_exit", lambda code: None)
+
+    def plan(*arguments):
+        script.main(list(arguments))
+        return plans.pop()
+
+    return plan
+
+
+def test_default_plane(planned):
+    plan = planned()
+    assert plan.cells.sizes == {"d": 128, "kappa": 128}
+    d, kappa = plan.cells.given["d"].values, plan.cells.given["kappa"].values
+    np.testing.assert_allclose(d, np.linspace(0.05, 0.3, 128))
+    np.testing.assert_allclose(kappa, np.geomspace(3, 400, 128))
+    quantities = {name: float(plan.cells.quantities[name]) for name in ("r", "gamma", "omega")}
+    assert quantities == {"r": 0.5, "gamma": 0.0, "omega": np.pi}
+    assert plan.settings["periods"] == 400
+    assert "lyapunov" not in plan.outputs
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sizes"),
+    [
+        (["--kappa", "3,4", "--d", "0.1:0.2:3"], {"kappa": 2, "d": 3}),
+        (["--gamma", "0,0.1"], {"d": 128, "kappa": 128, "gamma": 2}),
+        (["--omega0", "20:400:5", "--omega", "pi:6pi:4"], {"omega0": 5, "omega": 4}),
+        (["--s", "0.1:0.3:5", "--d", "0.1"], None),
+        (["--d", "0.2", "--u0=-0.1:0.1:9", "--v0", "-1:1:3"], {"kappa": 128, "u0": 9, "v0": 3}),
+        (["--k", "300,560", "--d", "0.1,0.2", "--beta=-0.1,0.1"], {"k": 2, "d": 2, "beta": 2}),
+    ],
+)
+def test_axes_in_the_order_given(script, planned, arguments, sizes):
+    if sizes is None:
+        assert script.main(arguments) == 2
+    else:
+        assert planned(*arguments).cells.sizes == sizes
+
+
+def test_settings_and_constants_arrive(planned):
+    settings = ["--until", "window", "--transient", "5", "--periods", "7", "--wall", "rigid"]
+    plan = planned(*settings, "--set", "V=1000", "--set", "m_b=0.01")
+    assert {"until": "window", "transient": 5, "periods": 7, "wall": "rigid"}.items() <= plan.settings.items()
+    assert (plan.device.V, plan.device.m_b) == (1000.0, 0.01)
+
+
+def test_from_arguments_to_store_and_picture(folder):
+    process = started([*TINY, "--out", "map.zarr", "--plot", "map.png"], folder)
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    found = grid.load(folder / "map.zarr")
+    assert dict(found.sizes) == {"d": 2, "kappa": 3}
+    assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
+    assert "6/6" in err.replace(".00", "")  # the progress bar has come to its end
+    peak = dataset.best(found)
+    for part in (
+        "6 cells in",
+        "cells/s",
+        "by status: ok 6",
+        "by period: period 1 ",
+        f"{float(peak):.6g} J per half period",
+    ):
+        assert part in out, part
+    assert sorted(path.name for path in folder.iterdir()) == ["cache", "map.png", "map.zarr"]
+    assert any((folder / "cache").rglob("*jit*"))  # the next run need not compile
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT reaches no single process there")
+def test_ctrl_c_leaves_nothing(folder):
+    process = started(["--out", "map.zarr", "--plot", "map.png"], folder)
+    try:
+        said = ""
+        while "compiling" not in said:
+            said += process.stderr.read(1)
+            assert process.poll() is None, said
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert err.endswith("stopped; nothing half-written is left\n")
+    assert not [path.name for path in folder.iterdir() if path.name != "cache"]

@@ -1,0 +1,27 @@
+"""Power maps of vibro-impact energy harvesters with soft and hard walls, by an exact event-driven engine in JAX.
+
+Importing vijax switches JAX to 64 bits, before any array is made: impact times are worth little at less.
+"""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from vijax.energy import harvested_energy
+from vijax.grid import load, save, sweep
+from vijax.model import Harvester, Impact, ImpactPair, State, Status, impact_pair
+from vijax.simulate import summarise
+
+__all__ = [
+    "Harvester",
+    "Impact",
+    "ImpactPair",
+    "State",
+    "Status",
+    "harvested_energy",
+    "impact_pair",
+    "load",
+    "save",
+    "summarise",
+    "sweep",
+]

@@ -1,0 +1,233 @@
+"""Axes of a sweep: text -> values -> the quantities that the dynamics and the energies of every cell depend on.
+
+This is the door of `grid.sweep` and of the scripts: whatever can be wrong with an axis is found here.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from vijax.model import Harvester, check
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Axis(NamedTuple):
+    """How an axis is written and what it is; `model.check` knows what its values must be."""
+
+    symbol: str
+    units: str
+    description: str
+
+
+AXES = {
+    "d": Axis("d", "1", "gap between the walls, s omega^2 / (A pi^2)"),
+    "kappa": Axis(r"\kappa", "1", "stiffness of the walls, omega0 pi / omega"),
+    "r": Axis("r", "1", "coefficient of restitution of a free contact"),
+    "gamma": Axis(r"\gamma", "1", "gravity along the axis, g sin(beta) / A"),
+    "omega": Axis(r"\omega", "rad s-1", "angular frequency of the forcing"),
+    "s": Axis("s", "m", "gap between the membranes"),
+    "omega0": Axis(r"\omega_0", "rad s-1", "natural frequency of ball and membrane"),
+    "k": Axis("k", "N m-1", "stiffness of the membrane"),
+    "A": Axis("A", "m s-2", "amplitude of the forcing"),
+    "beta": Axis(r"\beta", "rad", "inclination"),
+    "u0": Axis("u_0", "1", "displacement at the start, in units of A pi^2 / omega^2"),
+    "v0": Axis("v_0", "1", "velocity at the start, in units of A pi / omega"),
+}
+# Different names of one quantity: a sweep takes at most one of each row.
+_RIVALS = (("d", "s"), ("kappa", "omega0", "k"), ("gamma", "beta"))
+
+START = (0.05853, -0.47898)
+# A start off the centre of every gap: the default displacement is at most this part of the gap.
+_START_REACH = 0.49
+
+_FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
+
+
+def parse_axis(name: str, text: str) -> np.ndarray:
+    """Values of an axis written as a number (0-d), a comma list, `LO:HI:N`, `LO:HI:N:log` or `@FILE` (1-d).
+
+    A number may be written with pi, as in `pi` or `12pi`. A file holds numbers apart by white space or commas.
+
+    Raises:
+        ValueError: If the text is none of these, or its values are not allowed on the axis `name`.
+    """
+    text = text.strip()
+    if text.startswith("@"):
+        values: Any = _from_file(name, text[1:])
+    elif ":" in text:
+        values = _from_range(name, text)
+    elif "," in text:
+        values = [_number(name, item, text) for item in text.split(",")]
+    else:
+        values = _number(name, text, text)
+    return check_axis(name, values)
+
+
+def _number(name: str, item: str, text: str) -> float:
+    factor, pi, rest = item.strip().partition("pi")
+    try:
+        return float({"": "1", "-": "-1"}.get(factor, factor)) * math.pi if pi and not rest else float(item)
+    except ValueError:
+        within = "" if item == text else f" in {text!r}"
+        raise ValueError(f"{name} must be {_FORMS}; got {item!r}{within}") from None
+
+
+def _from_range(name: str, text: str) -> np.ndarray:
+    low, high, count, *spacing = text.split(":") if text.count(":") > 1 else [text, text, ""]
+    if not count or spacing not in ([], ["log"]):
+        raise ValueError(f"{name} must be {_FORMS}; got {text!r}")
+    if not count.strip().isdecimal() or int(count) < 1:
+        raise ValueError(f"{name}: N in LO:HI:N must be a whole number of at least 1; got {count!r} in {text!r}")
+    ends = _number(name, low, text), _number(name, high, text)
+    check_axis(name, ends)
+    if not spacing:
+        return np.linspace(*ends, int(count))
+    if ends[0] * ends[1] <= 0:
+        raise ValueError(f"{name}: LO and HI of a log axis must be on one side of zero; got {text!r}")
+    return np.geomspace(*ends, int(count))
+
+
+def _from_file(name: str, path: str) -> list[float]:
+    try:
+        items = Path(path).read_text(encoding="utf-8").replace(",", " ").split()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not text"
+        raise ValueError(f"{name} must name a file that can be read; got @{path} ({reason})") from None
+    return [_number(name, item, f"@{path}") for item in items]
+
+
+def check_axis(name: str, values: Any) -> np.ndarray:
+    """The values of the axis `name` as a float64 array of at most one dimension.
+
+    Raises:
+        ValueError: With what must hold, what came and where, if they are not allowed.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be a real number or an array of them; got {values!r}")
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(f"{name} must be a number or a 1-D array of at least one; got shape {array.shape}")
+    array = array.astype(np.float64)
+    if name not in ("u0", "v0"):
+        check(name, array)
+    elif not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} must be finite; got {array[~np.isfinite(array)].flat[0]}")
+    return array
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a sweep: which dimensions the dynamics see, and what each cell and each variant of it is.
+
+    Attributes:
+        given: The axes as they were given.
+        sizes: Length of every dimension, in the order given.
+        dynamic: Dimensions that the dynamics depend on: one simulation for each of their points.
+        variant: The other dimensions, which enter the energies alone.
+        quantities: d, kappa, r, gamma, u0, v0, omega [rad/s] and A [m/s^2], each over the dimensions it depends on.
+        length: Metres per unit of displacement (rigid wall: of speed over omega0, the engine's depth).
+        speed: Metres per second per unit of velocity.
+    """
+
+    given: "dict[str, xr.Variable]"
+    sizes: dict[str, int]
+    dynamic: tuple[str, ...]
+    variant: tuple[str, ...]
+    quantities: "dict[str, xr.Variable]"
+    length: "xr.Variable"
+    speed: "xr.Variable"
+
+    @property
+    def count(self) -> int:
+        """Number of simulations."""
+        return math.prod(self.sizes[dim] for dim in self.dynamic)
+
+    def flat(self, quantity: "xr.Variable", index: np.ndarray) -> np.ndarray:
+        """Values of a quantity in the cells with the given flat indices; variants at their first point."""
+        first = quantity.isel({dim: 0 for dim in self.variant if dim in quantity.dims})
+        full = first.set_dims({dim: self.sizes[dim] for dim in self.dynamic}).transpose(*self.dynamic)
+        return full.values[np.unravel_index(index, full.shape)] if self.dynamic else np.full(index.shape, full.values)
+
+    def factors(self, scale: "xr.Variable") -> np.ndarray:
+        """Factors by which the variants change a scale; the same for every cell, as scales are products over axes."""
+        first = scale.isel({dim: 0 for dim in self.dynamic if dim in scale.dims})
+        full = first.set_dims({dim: self.sizes[dim] for dim in self.variant}).transpose(*self.variant)
+        return np.ravel(full.values / full.values.flat[0])
+
+
+def cells(given: Mapping[str, Any], device: Harvester, wall: str) -> Cells:
+    """Cells of a sweep over the given axes; a quantity that no axis gives is the device's.
+
+    Raises:
+        ValueError: If a value is not allowed, two axes give one quantity, or a start lies outside a rigid gap.
+        TypeError: If there is no axis of a given name.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    for name in given:
+        if name not in AXES:
+            raise TypeError(f"there is no axis {name!r}; the axes are {', '.join(AXES)}")
+    for row in _RIVALS:
+        rivals = [name for name in row if name in given]
+        if len(rivals) > 1:
+            raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
+    arrays = {name: check_axis(name, values) for name, values in given.items()}
+    values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
+    sizes = {name: array.size for name, array in arrays.items() if array.ndim}
+    quantities = _quantities(values, device, xr)
+    if wall == "rigid":
+        _check_start(quantities["d"], quantities["u0"])
+    motion = [quantities[name] for name in ("d", "r", "gamma", "u0", "v0")]
+    motion += [quantities["kappa"]] if wall == "soft" else []
+    dynamic = tuple(dim for dim in sizes if any(dim in quantity.dims for quantity in motion))
+    length = quantities["A"] * math.pi**2 / quantities["omega"] ** 2
+    return Cells(
+        given=values,
+        sizes=sizes,
+        dynamic=dynamic,
+        variant=tuple(dim for dim in sizes if dim not in dynamic),
+        quantities=quantities,
+        length=length if wall == "soft" else length / quantities["kappa"],
+        speed=quantities["A"] * math.pi / quantities["omega"],
+    )
+
+
+def _quantities(values: "dict[str, xr.Variable]", device: Harvester, xr: Any) -> "dict[str, xr.Variable]":
+    def own(name: str) -> "xr.Variable":
+        if name in values:
+            return values[name]
+        constant = np.asarray(getattr(device, name))
+        if constant.ndim:
+            raise ValueError(f"device.{name} must be one number; got shape {constant.shape}; give it as an axis")
+        return xr.Variable((), check_axis(name, constant))
+
+    r, omega, amplitude, beta = own("r"), own("omega"), own("A"), own("beta")
+    omega0 = np.sqrt(values["k"] / float(device.m_b)) if "k" in values else own("omega0")
+    d = values["d"] if "d" in values else own("s") * omega**2 / (amplitude * math.pi**2)
+    # A level tube has gamma = 0 whatever A is: dividing would make an energy-only axis a dynamic one.
+    tilt = float(device.g) * np.sin(beta)
+    gamma = values["gamma"] if "gamma" in values else (tilt / amplitude if tilt.values.any() else tilt)
+    return {
+        "d": d,
+        "kappa": values["kappa"] if "kappa" in values else omega0 * math.pi / omega,
+        "r": r,
+        "gamma": gamma,
+        "u0": values["u0"] if "u0" in values else np.minimum(START[0], _START_REACH * d),
+        "v0": values["v0"] if "v0" in values else xr.Variable((), START[1]),
+        "omega": omega,
+        "A": amplitude,
+    }
+
+
+def _check_start(d: "xr.Variable", u0: "xr.Variable") -> None:
+    room = 0.5 * d - abs(u0)
+    first = np.argmin(room.values >= 0)
+    if room.values.flat[first] < 0:
+        got = [float((0 * room + value).values.flat[first]) for value in (u0, d)]
+        raise ValueError(f"u0 must lie in the gap of a rigid wall, |u0| <= d/2; got {got[0]:g} where d = {got[1]:g}")

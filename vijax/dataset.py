@@ -1,0 +1,170 @@
+"""The map that a sweep returns: its variables, coordinates and units, and the record of how it was made."""
+
+import os
+import platform
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+
+from vijax import simulate
+from vijax.axes import AXES, Cells
+from vijax.model import Harvester, Status
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Found = dict[str, Any]  # field of Summary -> xr.Variable
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep that has passed the door: its cells, its settings by name, the outputs wanted, the device."""
+
+    cells: Cells
+    settings: dict[str, Any]
+    outputs: tuple[str, ...]
+    device: Harvester
+
+
+class Output(NamedTuple):
+    """A variable of the map: what it is, the fields of `Summary` it needs, and how it follows from them."""
+
+    units: str
+    description: str
+    needs: tuple[str, ...]
+    formula: "Callable[[Found, Plan], xr.Variable] | None" = None
+
+
+def _power(found: Found, planned: Plan) -> "xr.Variable":
+    return found["P"] * planned.cells.quantities["omega"] / np.pi
+
+
+def _penetration(found: Found, planned: Plan) -> "xr.Variable":
+    return found["deepest"] * planned.cells.length
+
+
+def _speed(found: Found, planned: Plan) -> "xr.Variable":
+    return found["fastest"] * planned.cells.speed
+
+
+def _admissible(found: Found, planned: Plan) -> "xr.Variable":
+    within = _penetration(found, planned) <= float(planned.device.depth_limit)
+    return (found["energy_ratio"] <= 1) & within
+
+
+OUTPUTS = {
+    "P": Output("J", "energy harvested per half forcing period", ("P",)),
+    "power": Output("W", "harvested power, P omega / pi", ("P",), _power),
+    "P_stderr": Output("J", "standard error of P by batch means, 0 when periodic", ("P_stderr",)),
+    "period": Output("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided", ("period",)),
+    "impacts_left": Output("1", "left impacts in `period` periods, -1 unless period > 0", ("impacts_left",)),
+    "impacts_right": Output("1", "right impacts in `period` periods, -1 unless period > 0", ("impacts_right",)),
+    "impacts_per_period": Output("1", "impacts on both walls per forcing period", ("impacts_per_period",)),
+    "max_penetration": Output("m", "greatest penetration of the membrane", ("deepest",), _penetration),
+    "max_impact_speed": Output("m s-1", "greatest speed at the onset of an impact", ("fastest",), _speed),
+    "restitution": Output("1", "mean of -v_out / v_in over all impacts, NaN without impacts", ("restitution",)),
+    "restitution_left": Output("1", "mean of -v_out / v_in over left impacts", ("restitution_left",)),
+    "restitution_right": Output("1", "mean of -v_out / v_in over right impacts", ("restitution_right",)),
+    "contact_time": Output("1", "mean duration of a contact, in half forcing periods", ("contact_time",)),
+    "contact_fraction": Output("1", "part of the time spent in contact", ("contact_fraction",)),
+    "admissible": Output(
+        "1",
+        "no impact yields more energy than it gives to the membrane, none passes the penetration limit",
+        ("energy_ratio", "deepest"),
+        _admissible,
+    ),
+    "energy_ratio": Output("1", "largest ratio of harvested energy to energy given to the membrane", ("energy_ratio",)),
+    "lyapunov": Output("1", "largest Lyapunov exponent per forcing period", ("lyapunov",)),
+    "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
+    "status": Output("1", "how the cell ended", ("status",)),
+}
+
+
+def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
+    """The map from the fields of `Summary`, each [cells] or [cells, variants] in the flat order of the plan."""
+    import xarray as xr  # here, as importing vijax must not load it
+
+    of = planned.cells
+    found = {}
+    for name, values in fields_found.items():
+        dims = of.dynamic + (of.variant if values.ndim > 1 else ())
+        found[name] = xr.Variable(dims, values.reshape([of.sizes[dim] for dim in dims]))
+    variables = {name: _variable(name, found, planned) for name in planned.outputs}
+    variables["status"] = variables["status"].astype(np.int8)
+    variables["status"].attrs |= {
+        "flag_values": [int(status) for status in Status],
+        "flag_meanings": " ".join(status.name.lower() for status in Status),
+    }
+    return xr.Dataset(variables, coords=_coordinates(of), attrs=_provenance(planned))
+
+
+def best(dataset: "xr.Dataset") -> "xr.DataArray | None":
+    """The largest admissible P with the coordinates of its cell; None if no cell yields any."""
+    power = dataset["P"].where(dataset["admissible"]).fillna(0.0)
+    peak = power.isel({dim: int(i) for dim, i in power.argmax(...).items()})
+    return peak if peak > 0 else None
+
+
+def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":
+    output = OUTPUTS[name]
+    values = output.formula(found, planned) if output.formula else found[output.needs[0]]
+    values = values.transpose(*(dim for dim in planned.cells.sizes if dim in values.dims))
+    # Scales are float64 whatever the cells were computed in.
+    values = values.astype(planned.settings["dtype"] if values.dtype.kind == "f" else values.dtype)
+    values.attrs = {"units": output.units, "long_name": output.description}
+    return values
+
+
+def _coordinates(of: Cells) -> "dict[str, xr.Variable]":
+    coordinates = {}
+    for name, values in {**of.given, **of.quantities}.items():
+        axis = AXES[name]
+        coordinates[name] = values.transpose(*(dim for dim in of.sizes if dim in values.dims))
+        coordinates[name].attrs = {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
+    return coordinates
+
+
+def _provenance(planned: Plan) -> dict[str, Any]:
+    accelerator = jax.devices()[0]
+    # The constants that axes stand for are coordinates.
+    constants = [field.name for field in fields(planned.device) if field.name not in (*AXES, "penetration_limit")]
+    return {
+        "title": "Energy harvested by a vibro-impact pair",
+        "Conventions": "CF-1.11",
+        "source": f"vijax {_version('vijax')}",
+        "commit": _commit(),
+        **{f"version_{name}": _version(name) for name in ("jax", "jaxlib", "equinox", "numpy", "xarray", "zarr")},
+        "version_python": platform.python_version(),
+        "device": f"{accelerator.device_kind} ({accelerator.platform}), {platform.machine()}, {os.cpu_count()} cores",
+        **planned.settings,
+        "outputs": " ".join(planned.outputs),
+        **{f"harvester_{name}": float(getattr(planned.device, name)) for name in constants},
+        "harvester_penetration_limit": float(planned.device.depth_limit),
+        **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings["dtype"]).items()},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _commit() -> str:
+    """Commit of the source that runs, with -dirty if it was changed; "unknown" outside its own repository."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    options: dict[str, Any] = {"capture_output": True, "text": True, "check": True}
+    try:
+        # An installed copy may lie inside some other repository.
+        subprocess.run([*git, "ls-files", "--error-unmatch", Path(__file__).name], **options)
+        described = subprocess.run([*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"], **options)
+        return described.stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

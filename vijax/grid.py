@@ -1,0 +1,241 @@
+"""Sweeps: axes -> cells -> tiles on every core -> a labelled map.
+
+`plan` checks everything that can be wrong and starts nothing, `run` does the work, `sweep` is both.
+"""
+
+import math
+import operator
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from vijax import simulate
+from vijax.axes import cells
+from vijax.dataset import OUTPUTS, Plan, label
+from vijax.model import Harvester, ImpactPair
+from vijax.store import load, save
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Axes", "load", "plan", "run", "save", "sweep"]
+
+_CHOICES = {
+    "until": ("attractor", "window"),
+    "wall": ("soft", "rigid"),
+    "method": ("exact",),
+    "dtype": ("float64", "float32"),
+}
+# A tile is one compiled call of about a second: large enough to keep the lanes full, small enough for progress.
+_SMALLEST_TILE, _LARGEST_TILE = 1024, 32768
+
+
+class Axes(TypedDict, total=False):
+    """The axes of a sweep, each a number or a 1-D array; `vijax.axes.AXES` describes them."""
+
+    d: ArrayLike
+    kappa: ArrayLike
+    r: ArrayLike
+    gamma: ArrayLike
+    omega: ArrayLike
+    s: ArrayLike
+    omega0: ArrayLike
+    k: ArrayLike
+    A: ArrayLike
+    beta: ArrayLike
+    u0: ArrayLike
+    v0: ArrayLike
+
+
+def sweep(
+    *,
+    periods: int = 400,
+    until: str = "attractor",
+    transient: int = 0,
+    wall: str = "soft",
+    method: str = "exact",
+    outputs: Iterable[str] | None = None,
+    device: Harvester | None = None,
+    dtype: str = "float64",
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Unpack[Axes],
+) -> "xr.Dataset":
+    """Energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
+
+    Each axis is a number or a 1-D array; arrays become dimensions in the order in which they are given:
+
+        sweep(d=np.linspace(0.05, 0.3, 128), kappa=np.geomspace(3, 400, 128), r=0.5)  # the (d, kappa) plane
+        sweep(omega=np.pi * np.linspace(1, 12, 64), omega0=np.linspace(20, 400, 64))  # one device, other frequencies
+        sweep(d=0.2, kappa=np.geomspace(3, 400, 64), A=[1, 2, 5])                     # here A enters energies alone
+
+    Dimensionless axes are d, kappa, r, gamma and the start u0, v0; physical ones omega [rad/s], s [m], omega0 [rad/s]
+    or k [N/m], A [m/s^2], beta [rad]. d and s are one quantity, so are kappa, omega0 and k, gamma and beta: give one
+    of each. Whatever no axis gives is the device's (s, omega0, r, A, omega, beta): d follows omega unless d is given.
+    The start is u0 = min(0.05853, 0.49 d), v0 = -0.47898 unless given.
+    Cells that share (d, kappa, r, gamma, u0, v0) are simulated once however many omega or A there are, and with rigid
+    walls however many kappa: it then enters energies alone.
+
+    Args:
+        periods: Forcing periods to run: at most (until="attractor"), or after the transient (until="window").
+        until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
+            `transient` periods and measures over the next `periods`.
+        transient: Forcing periods to drop first.
+        wall: "soft" or "rigid".
+        method: "exact", the event-driven engine.
+        outputs: The variables wanted, of those in `vijax.dataset.OUTPUTS`; all but `lyapunov` unless given. What is not
+            wanted is not computed. `status` always comes.
+        device: Constants of the device; Tables I and II unless given.
+        dtype: "float64", or "float32" with tolerances to match.
+        progress: Called with (cells done, cells in all) from the calling thread, first with 0 done.
+
+    Returns:
+        A dataset with one dimension per array, every parameter as a coordinate with units, and the variables wanted,
+        each without the dimensions that it cannot depend on. P is in joules per HALF forcing period. Believe it only
+        where `admissible` is true, and read `status` (CF flags) where `period` is -1. Attributes record versions,
+        commit, machine, tolerances and every setting.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+
+    Source: Eqs. (36)-(38), corrected.
+    """
+    planned = plan(
+        axes,
+        outputs,
+        device,
+        periods=periods,
+        until=until,
+        transient=transient,
+        wall=wall,
+        method=method,
+        dtype=dtype,
+    )
+    return run(planned, progress)
+
+
+def plan(
+    axes: Mapping[str, Any], outputs: Iterable[str] | None = None, device: Harvester | None = None, **settings: Any
+) -> Plan:
+    """Check what a sweep is asked for and lay out its cells; runs nothing.
+
+    Args:
+        axes: Value or values of each axis; None counts as not given.
+        outputs: As in `sweep`.
+        device: As in `sweep`.
+        settings: periods, until, transient, wall, method, dtype: all of them, as in `sweep`.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came.
+    """
+    for name, least in (("periods", 1), ("transient", 0)):
+        settings[name] = _whole(name, settings[name], least)
+    for name, allowed in _CHOICES.items():
+        if settings[name] not in allowed:
+            choices = " or ".join(f'"{choice}"' for choice in allowed)
+            raise ValueError(f"{name} must be {choices}; got {settings[name]!r}")
+    if outputs is None:
+        outputs = (name for name in OUTPUTS if name != "lyapunov")
+    wanted = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    for name in wanted:
+        if name not in OUTPUTS:
+            raise ValueError(f"outputs must be among {', '.join(OUTPUTS)}; got {name!r}")
+    device = Harvester() if device is None else device
+    given = {name: values for name, values in axes.items() if values is not None}
+    return Plan(
+        cells=cells(given, device, settings["wall"]),
+        settings=settings,
+        # No map can be read without knowing how its cells ended.
+        outputs=tuple(name for name in OUTPUTS if name in wanted or name == "status"),
+        device=device,
+    )
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}")
+    return number
+
+
+def run(planned: Plan, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
+    """The map of a plan, its cells simulated tile by tile on every core; see `sweep`."""
+    of, tell = planned.cells, progress or (lambda done, total: None)
+    tell(0, of.count)
+    gamma = of.flat(of.quantities["gamma"], np.arange(of.count))
+    # Level cells have a faster program, and one cell with gravity in a tile would keep all of it from that.
+    groups = [np.flatnonzero(gamma == 0), np.flatnonzero(gamma != 0)]
+    found: dict[str, np.ndarray] = {}
+    done = 0
+    for group in groups:
+        for index, fields_found in _simulate_all(planned, group):
+            for name, part in fields_found.items():
+                found.setdefault(name, np.empty((of.count, *part.shape[1:]), part.dtype))[index] = part
+            done += index.size
+            tell(done, of.count)
+    return label(planned, found)
+
+
+def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Flat indices and fields of `Summary` of every tile of a group of cells, as the tiles are done."""
+    if not group.size:
+        return
+    workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
+    share = math.ceil(group.size / workers)
+    tile = min(max(1 << (share - 1).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
+    # Strided tiles are samples of the whole plane: they cost the same, and no core is left with the slow corner.
+    number = math.ceil(group.size / tile)
+    tiles = [group[first::number] for first in range(number)]
+    # No tile runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
+    pool = ThreadPoolExecutor(workers)
+    try:
+        if number > 1:
+            # Compiles, and runs no cell; all threads at once would each compile.
+            pool.submit(_simulate, planned, tiles[0], tile, 0).result()
+        running = {pool.submit(_simulate, planned, index, tile, index.size): index for index in tiles}
+        for future in as_completed(running):
+            yield running.pop(future), future.result()
+    finally:
+        # After Ctrl-C the waiting tiles are dropped, and those that run end by themselves.
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _simulate(planned: Plan, index: np.ndarray, tile: int, count: int) -> dict[str, np.ndarray]:
+    """Fields of `Summary` for the first `count` of these cells, padded to a tile so that one program serves all."""
+    of, settings = planned.cells, planned.settings
+    padded = np.resize(index, tile)
+    needs = frozenset(need for name in planned.outputs for need in OUTPUTS[name].needs)
+
+    def column(quantity: "xr.Variable") -> jax.Array:
+        return jnp.asarray(of.flat(quantity, padded).astype(settings["dtype"]))
+
+    def factors(scale: "xr.Variable") -> jax.Array:
+        return jnp.asarray(of.factors(scale).astype(settings["dtype"]))
+
+    d, kappa, r, gamma, u0, v0 = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0"))
+    summary = simulate.summarise(
+        ImpactPair(d=d, kappa=kappa if settings["wall"] == "soft" else None, r=r, gamma=gamma),
+        u0,
+        v0,
+        simulate.Scale(
+            length=column(of.length),
+            speed=column(of.speed),
+            length_variant=factors(of.length),
+            speed_variant=factors(of.speed),
+        ),
+        jax.tree.map(lambda constant: np.asarray(constant, settings["dtype"]), planned.device),
+        periods=settings["periods"],
+        until=settings["until"],
+        transient=settings["transient"],
+        outputs=needs,
+        count=count,
+    )
+    return {name: np.asarray(getattr(summary, name))[:count] for name in needs}

@@ -1,0 +1,166 @@
+"""Run N independent cells on L lanes in one compiled loop of fixed shape; finished lanes take waiting cells.
+
+Knows no physics: a `Program` says what a cell is, what one quick trip does to every lane at once, and what the rare lane
+that declines needs instead. Memory is set by L and by the rows that go in and come out.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+Carry = Any
+"""A pytree of arrays whose leading axis is the lane."""
+
+TRIPS = 16  # quick trips between two rounds of serving, reviewing and refilling
+FIRST_PATIENCE = 6  # stages that a careful trip may take before its lane is set aside as hard
+LAST_PATIENCE = 2**30
+_WIDTH = 128
+_SHARE = 16  # a refill waits until one lane in so many is free
+_CPU_OPTIONS = {
+    # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
+    "xla_cpu_prefer_vector_width": 512,
+    # Keeps `lax.optimization_barrier` until fusion, so that a shared value is computed once (see quick.share).
+    "xla_disable_hlo_passes": "cse_barrier_expander",
+}
+
+
+def compiler_options() -> dict[str, Any]:
+    """Options for `jax.jit` of a program that calls `run`, on the backend that JAX will use."""
+    return dict(_CPU_OPTIONS) if jax.default_backend() == "cpu" else {}
+
+
+class Program(NamedTuple):
+    """What `run` is told about a cell; every function works on a whole batch of lanes, row by row.
+
+    Attributes:
+        load: Rows of the cell table -> fresh carry.
+        trip: Carry -> carry after one quick trip; it may mark lanes as declined.
+        careful: Carry of declined lanes, patience -> carry after one careful trip; lanes that a limited patience did not
+            do for stay declined and are marked hard.
+        review: Carry -> carry; what is too slow for every trip: decisions, ends.
+        declined, hard, stopped, done: Carry -> which lanes are; a stopped lane waits for review.
+        unload: Carry -> rows of the result table.
+    """
+
+    load: Callable[[Float[Array, "row in"]], Carry]
+    trip: Callable[[Carry], Carry]
+    careful: Callable[[Carry, Int[Array, ""]], Carry]
+    review: Callable[[Carry], Carry]
+    declined: Callable[[Carry], Bool[Array, "lane"]]
+    stopped: Callable[[Carry], Bool[Array, "lane"]]
+    hard: Callable[[Carry], Bool[Array, "lane"]]
+    done: Callable[[Carry], Bool[Array, "lane"]]
+    unload: Callable[[Carry], Float[Array, "row out"]]
+
+
+class _Queue(NamedTuple):
+    """The loop's state: lanes, the cell each one works on (-1: idle), the next cell to start, the results."""
+
+    carry: Carry
+    cell: Int[Array, "lane"]
+    waiting: Int[Array, ""]
+    results: Float[Array, "cell out"]
+
+
+def _first(mask: Bool[Array, "lane"], width: int) -> tuple[Int[Array, "width"], Int[Array, "lane"], Bool[Array, "lane"]]:
+    """The first `width` lanes of a mask, each lane's place among them, and which lanes are among them.
+
+    By rank and binary search: gathers run at memory speed on every backend, scatters do not.
+    """
+    rank = jnp.cumsum(mask.astype(jnp.int32))
+    members = jnp.searchsorted(rank, jnp.arange(1, width + 1, dtype=jnp.int32))
+    return jnp.minimum(members, mask.size - 1), jnp.maximum(rank - 1, 0), mask & (rank <= width)
+
+
+def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
+    return jax.tree.map(lambda leaf: leaf[rows], carry)
+
+
+def _put(carry: Carry, part: Carry, place: Int[Array, "lane"], chosen: Bool[Array, "lane"]) -> Carry:
+    """`carry` with the chosen lanes replaced by their places in `part`."""
+
+    def merge(leaf, fresh):
+        mask = chosen.reshape(chosen.shape + (1,) * (leaf.ndim - 1))
+        return jnp.where(mask, fresh[jnp.minimum(place, fresh.shape[0] - 1)], leaf)
+
+    return jax.tree.map(merge, carry, part)
+
+
+def run(
+    program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int
+) -> Float[Array, "cell out"]:
+    """Run the first `count` cells to their end; rows past `count` come back as zeros.
+
+    Args:
+        program: What a cell is.
+        cells: One row of parameters a cell.
+        count: How many are real; the table may be padded.
+        outputs: Length of a result row.
+        lanes: How many cells are worked on at once.
+
+    A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same elementwise
+    arithmetic wherever it sits.
+    """
+    width = min(lanes, _WIDTH)  # how many lanes are served, or refilled, together
+
+    def serve(cell, carry):
+        """Serve the easy lanes first; the hard ones, each of which may hold up a whole batch, in batches of their own."""
+        declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
+        easy = (declined & ~hard).any()
+        members, place, chosen = _first(declined & (hard != easy), width)
+        patience = jnp.where(easy, FIRST_PATIENCE, LAST_PATIENCE)
+        return _put(carry, program.careful(_take(carry, members), patience), place, chosen)
+
+    def to_serve(cell, carry):
+        """Whether easy lanes wait, or a batch of hard ones, or every lane that is at work."""
+        declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
+        many = (declined & hard).sum() >= min(width, 64)
+        return (declined & ~hard).any() | many | (declined.any() & ((cell < 0) | declined).all())
+
+    def refill(queue: _Queue) -> _Queue:
+        members, place, chosen = _first(program.done(queue.carry) & (queue.cell >= 0), width)
+        ready = jnp.arange(width, dtype=jnp.int32) < chosen.sum(dtype=jnp.int32)
+        rows = jnp.where(ready, queue.cell[members], cells.shape[0])  # past the end: dropped
+        results = queue.results.at[rows].set(program.unload(_take(queue.carry, members)), mode="drop")
+        start = queue.waiting + jnp.arange(width, dtype=jnp.int32)
+        fresh = program.load(cells[jnp.minimum(start, cells.shape[0] - 1)])
+        carry = _put(queue.carry, fresh, place, chosen)
+        begun = jnp.where(start < count, start, -1)
+        cell = jnp.where(chosen, begun[jnp.minimum(place, width - 1)], queue.cell)
+        return _Queue(carry, cell, queue.waiting + ready.sum(dtype=jnp.int32), results)
+
+    def idle(queue: _Queue) -> Int[Array, ""]:
+        return (program.done(queue.carry) & (queue.cell >= 0)).sum(dtype=jnp.int32)
+
+    def able(carry):
+        return (~program.declined(carry) & ~program.stopped(carry)).sum()
+
+    def keeps_on(at_first, state):
+        """Up to `TRIPS` trips, fewer once half the lanes that set out wait for something else."""
+        trip, carry = state
+        return (trip < TRIPS) & (2 * able(carry) > at_first)
+
+    def one_trip(state):
+        return state[0] + 1, program.trip(state[1])
+
+    def round_trip(queue: _Queue) -> _Queue:
+        _, carry = lax.while_loop(partial(keeps_on, able(queue.carry)), one_trip, (0, queue.carry))
+        carry = lax.while_loop(partial(to_serve, queue.cell), partial(serve, queue.cell), carry)
+        queue = queue._replace(carry=program.review(carry))
+        # With cells waiting a refill is worth its price only for several lanes; at the end nobody waits for it.
+        enough = jnp.where(queue.waiting < count, max(lanes // _SHARE, 1), 1)
+        return lax.while_loop(lambda q: idle(q) >= enough, refill, queue)
+
+    first = jnp.arange(lanes, dtype=jnp.int32)
+    queue = _Queue(
+        carry=program.load(cells[jnp.minimum(first, cells.shape[0] - 1)]),
+        cell=jnp.where(first < count, first, -1),
+        waiting=jnp.asarray(lanes, jnp.int32),
+        results=jnp.zeros((cells.shape[0], outputs), cells.dtype),
+    )
+    return lax.while_loop(lambda q: (q.cell >= 0).any(), round_trip, queue).results

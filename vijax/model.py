@@ -1,0 +1,369 @@
+"""Records of the vibro-impact pair (device, nondimensional system, state, impact) and the scalings that join them."""
+
+import dataclasses
+import enum
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+Real = float | Float[Array, "..."]
+
+
+class Status(enum.IntEnum):
+    """How a cell ended; the values are what the `status` variable of a map stores."""
+
+    OK = 0  # a periodic attractor, or averages with a standard error over an aperiodic one
+    NO_IMPACT = 1  # neutral or free motion that never touches a wall again
+    PERMANENT_CONTACT = 2  # rests in or on one wall for ever
+    STICKING = 3  # as OK, but the attractor chatters into sticking on a rigid wall
+    SLOW = 4  # neither periodic nor certainly aperiodic when the periods were spent
+    EVENT_BUDGET = 5  # more impacts than the budget allows
+    NONFINITE = 6  # the state left the finite numbers
+
+
+class State(eqx.Module):
+    """Where the ball is: displacement, velocity, phase t in [0, 2), periods completed, and the mode (-1, 0, +1)."""
+
+    u: Float[Array, "..."]
+    v: Float[Array, "..."]
+    t: Float[Array, "..."]
+    n: Int[Array, "..."]
+    mode: Int[Array, "..."]
+
+
+class Impact(eqx.Module):
+    """One finished impact. `work` is the energy given to the membrane per unit mass, in squared velocity units."""
+
+    n: Int[Array, "..."]
+    t: Float[Array, "..."]
+    side: Int[Array, "..."]
+    v_in: Float[Array, "..."]
+    v_out: Float[Array, "..."]
+    depth: Float[Array, "..."]
+    duration: Float[Array, "..."]
+    work: Float[Array, "..."]
+
+
+class ImpactPair(eqx.Module):
+    """Nondimensional impact pair, Eqs. (37)-(38); every field a scalar or an array of one common shape.
+
+    Fields are not checked, so that the record can be traced; `impact_pair` is the door that checks.
+
+    Attributes:
+        d: Gap between the walls in units of A pi^2/omega^2, > 0.
+        kappa: Natural frequency of the soft wall, omega0 pi/omega > 0; None for a rigid wall.
+        r: Coefficient of restitution of a free contact, in (0, 1].
+        gamma: Gravity along the axis over the forcing amplitude, g sin(beta)/A.
+    """
+
+    d: Float[Array, "..."]
+    kappa: Float[Array, "..."] | None
+    r: Float[Array, "..."]
+    gamma: Float[Array, "..."]
+
+    @property
+    def mu(self) -> Float[Array, "..."]:
+        """Damping of w'' + mu w' + kappa^2 w = f, by the calibration of Eq. (19)."""
+        return 2 * self.zeta
+
+    @property
+    def zeta(self) -> Float[Array, "..."]:
+        """Decay rate mu/2 of a free contact."""
+        return self._soft_kappa() * damping_ratio(self.r)
+
+    @property
+    def omega1(self) -> Float[Array, "..."]:
+        """Damped frequency sqrt(kappa^2 - zeta^2) = kappa pi/sqrt(pi^2 + ln^2 r): from r, as the difference cancels."""
+        return self._soft_kappa() * math.pi / jnp.sqrt(math.pi**2 + jnp.log(self.r) ** 2)
+
+    def _soft_kappa(self) -> Float[Array, "..."]:
+        if self.kappa is None:
+            raise ValueError("kappa must be a number for a membrane's damping and frequency; got None (a rigid wall)")
+        return self.kappa
+
+
+def damping_ratio(r: Real) -> Float[Array, "..."]:
+    """Ratio c/(2 sqrt(k m_b)) = mu/(2 kappa) whose free contact has restitution r.
+
+    -ln r/sqrt(pi^2 + ln^2 r), in [0, 1): every contact is underdamped.
+
+    Source: Eqs. (14)-(19).
+    """
+    decrement = 0.0 - jnp.log(r)  # +0 at r = 1, where a bare minus leaves -0
+    return decrement / jnp.sqrt(math.pi**2 + decrement * decrement)
+
+
+class Harvester(eqx.Module):
+    """The device in SI units; the defaults are Tables I and II of the paper.
+
+    Every field is a number or an array, traced and never static. The stiffness k is derived from m_b and omega0;
+    `with_constants(device, k=...)` sets omega0 by it.
+
+    Attributes:
+        m_b: Mass of the ball [kg].
+        s: Gap between the membranes [m].
+        omega0: Natural frequency of ball and membrane [rad/s].
+        r: Coefficient of restitution of a free contact, in (0, 1].
+        A: Amplitude of the forcing acceleration [m/s^2].
+        omega: Frequency of the forcing [rad/s].
+        beta: Inclination [rad].
+        g: Acceleration of gravity [m/s^2].
+        w0: Thickness of the undeformed membrane [m].
+        R0: Radius of the membrane [m].
+        eps_M: Permittivity of the membrane [F/m].
+        C_T: Transfer capacitance [F].
+        V: Voltage [V].
+        r_b: Radius of the ball [m], below R0.
+        penetration_limit: Largest admissible penetration [m]; None for R0.
+
+    Raises:
+        ValueError: A constant that cannot be (traced values are not looked at).
+    """
+
+    m_b: Real = 0.0035
+    s: Real = 0.3
+    omega0: Real = 400.0
+    r: Real = 0.5
+    A: Real = 1.0
+    omega: Real = math.pi
+    beta: Real = 0.0
+    g: Real = 9.8
+    w0: Real = 0.00025
+    R0: Real = 0.0063
+    eps_M: Real = 4.15e-11
+    C_T: Real = 99.35e-9
+    V: Real = 2000.0
+    r_b: Real = 0.0050
+    penetration_limit: Real | None = None
+
+    def __check_init__(self):
+        for field in dataclasses.fields(self):
+            if field.name != "penetration_limit" or self.penetration_limit is not None:
+                check(field.name, getattr(self, field.name))
+        if is_concrete(self.r_b, self.R0) and not np.all(np.asarray(self.r_b) < np.asarray(self.R0)):
+            raise ValueError(
+                f"r_b must be smaller than R0, the radius of the membrane that the ball sinks into; "
+                f"got r_b = {self.r_b}, R0 = {self.R0}"
+            )
+
+    @property
+    def k(self) -> Real:
+        """Stiffness of the membrane, m_b omega0^2 [N/m]."""
+        return self.m_b * self.omega0**2
+
+    @property
+    def length_unit(self) -> Real:
+        """Metres per unit of u: A pi^2/omega^2."""
+        return self.A * (math.pi / self.omega) ** 2
+
+    @property
+    def speed_unit(self) -> Real:
+        """Metres per second per unit of u': A pi/omega."""
+        return self.A * (math.pi / self.omega)
+
+    @property
+    def depth_limit(self) -> Real:
+        """Largest admissible penetration [m]."""
+        return self.R0 if self.penetration_limit is None else self.penetration_limit
+
+    def pair(self, wall: str = "soft") -> ImpactPair:
+        """The device in nondimensional form, Eqs. (37)-(38).
+
+        d = s omega^2/(A pi^2), kappa = omega0 pi/omega, gamma = g sin(beta)/A.
+
+        Args:
+            wall: "soft" for the membrane, "rigid" for the wall that it becomes as omega0 grows (kappa = None).
+        """
+        if wall not in ("soft", "rigid"):
+            raise ValueError(f'wall must be "soft" or "rigid"; got {wall!r}')
+        d, gamma = self.s / self.length_unit, self.g * jnp.sin(self.beta) / self.A
+        d, kappa, r, gamma = jnp.broadcast_arrays(d, self.omega0 * (math.pi / self.omega), self.r, gamma)
+        return ImpactPair(d, None if wall == "rigid" else kappa, r, gamma)
+
+
+def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
+    """The device that has the given nondimensional form, by its s, omega0, r and beta; the inverse of `Harvester.pair`.
+
+    Args:
+        device: Gives A, omega, g and everything electrical; and omega0 where the wall of `pair` is rigid.
+        pair: A pair that an inclination can give: |gamma| <= g/A.
+
+    Raises:
+        ValueError: No inclination gives gamma, or a field that cannot be (traced values leave beta = NaN instead).
+    """
+    sine = pair.gamma * device.A / device.g
+    if is_concrete(sine) and np.any(np.abs(sine) > 1):
+        raise ValueError(
+            f"gamma must lie in [-g/A, g/A] for an inclination to give it; got {_first(sine, np.abs(sine) <= 1)} "
+            f"for gamma A/g; lower A or raise g"
+        )
+    omega0 = device.omega0 if pair.kappa is None else pair.kappa * device.omega / math.pi
+    return dataclasses.replace(device, s=pair.d * device.length_unit, omega0=omega0, r=pair.r, beta=jnp.arcsin(sine))
+
+
+def with_constants(device: Harvester, **constants: Real) -> Harvester:
+    """The device with some constants changed, checked by name; `k` [N/m] sets omega0 = sqrt(k/m_b).
+
+    Raises:
+        ValueError: An unknown constant, both k and omega0, or a value that cannot be.
+    """
+    known = [field.name for field in dataclasses.fields(device)]
+    for name in constants:
+        if name not in (*known, "k"):
+            raise ValueError(f"{name} must be a constant of the device; got {name!r}; known are k, {', '.join(known)}")
+    if "k" in constants:
+        if "omega0" in constants:
+            raise ValueError("k and omega0 must not both be given, as k = m_b omega0^2; got both; leave one out")
+        k, m_b = constants.pop("k"), constants.get("m_b", device.m_b)
+        check("k", k)
+        check("m_b", m_b)
+        constants["omega0"] = jnp.sqrt(k / m_b)
+    return dataclasses.replace(device, **constants)
+
+
+class MembranePair(eqx.Module):
+    """The soft pair in the second scaling, Eq. (39): lengths in units of s, times in units of 1/omega0.
+
+    With x = U/s and t* = omega0 tau:  x'' = -g* + A* cos(omega* t*), and in contact -sign(x)(|x| - 1/2) - c* x' more.
+    It stays put while omega moves, where (d, kappa) follows a curve d kappa^2 = 1/A* = const.
+    """
+
+    g_star: Float[Array, "..."]
+    A_star: Float[Array, "..."]
+    omega_star: Float[Array, "..."]
+    c_star: Float[Array, "..."]
+
+    @property
+    def length_unit(self) -> Float[Array, "..."]:
+        """Units of u per unit of x: d."""
+        return (self.omega_star / math.pi) ** 2 / self.A_star
+
+    @property
+    def time_unit(self) -> Float[Array, "..."]:
+        """Units of t per unit of t*: 1/kappa."""
+        return self.omega_star / math.pi
+
+
+def membrane_pair(pair: ImpactPair) -> MembranePair:
+    """A soft pair in the scaling of Eq. (39).
+
+    A* = 1/(d kappa^2), g* = gamma A*, omega* = pi/kappa, c* = mu/kappa.
+    """
+    kappa = pair._soft_kappa()
+    strength = 1 / (pair.d * kappa**2)
+    return MembranePair(pair.gamma * strength, strength, math.pi / kappa, 2 * damping_ratio(pair.r))
+
+
+def from_membrane_pair(pair: MembranePair) -> ImpactPair:
+    """A soft pair in the scaling of Eqs. (37)-(38); the inverse of `membrane_pair` for 0 <= c* < 2."""
+    ratio = 0.5 * pair.c_star
+    r = jnp.exp(-math.pi * ratio / jnp.sqrt((1 - ratio) * (1 + ratio)))
+    return ImpactPair(pair.length_unit, 1 / pair.time_unit, r, pair.g_star / pair.A_star)
+
+
+# --- the door --------------------------------------------------------------------------------------------------------
+
+
+class _Rule(NamedTuple):
+    """What values of a quantity must be, in code and in words, and what to do about others."""
+
+    holds: Callable[[np.ndarray], np.ndarray]
+    must: str
+    advice: str
+
+
+_POSITIVE = (lambda x: (x > 0) & np.isfinite(x), "must be positive and finite")
+_FINITE = (np.isfinite, "must be finite")
+_RIGID = 'a rigid wall is wall="rigid" (kappa=None in an ImpactPair)'
+
+_RULES = {
+    "d": _Rule(*_POSITIVE, "it is the gap between the walls in units of A pi^2/omega^2"),
+    "kappa": _Rule(*_POSITIVE, _RIGID),
+    "r": _Rule(lambda x: (x > 0) & (x <= 1), "must lie in (0, 1]", "an elastic wall is r = 1"),
+    "gamma": _Rule(*_FINITE, "level ground is gamma = 0"),
+    "m_b": _Rule(*_POSITIVE, "it is the mass of the ball in kg"),
+    "s": _Rule(*_POSITIVE, "it is the gap between the membranes in m"),
+    "omega0": _Rule(*_POSITIVE, _RIGID),
+    "k": _Rule(*_POSITIVE, _RIGID),
+    "A": _Rule(*_POSITIVE, "it is the forcing amplitude in m/s^2; without forcing there is no unit of length"),
+    "omega": _Rule(*_POSITIVE, "it is the forcing frequency in rad/s"),
+    "beta": _Rule(*_FINITE, "it is the inclination in rad; level ground is beta = 0"),
+    "g": _Rule(*_POSITIVE, "it is the acceleration of gravity in m/s^2; level ground is beta = 0"),
+    "w0": _Rule(*_POSITIVE, "it is the thickness of the membrane in m"),
+    "R0": _Rule(*_POSITIVE, "it is the radius of the membrane in m"),
+    "eps_M": _Rule(*_POSITIVE, "it is the permittivity of the membrane in F/m"),
+    "C_T": _Rule(lambda x: (x >= 0) & np.isfinite(x), "must be finite and not negative", "it is a capacitance in F"),
+    "V": _Rule(*_FINITE, "it is a voltage in V"),
+    "r_b": _Rule(*_POSITIVE, "it is the radius of the ball in m"),
+    "penetration_limit": _Rule(lambda x: x > 0, "must be positive", "leave it out for R0, or give inf for no limit"),
+}
+
+
+def is_concrete(*values: Any) -> bool:
+    """Whether no value is traced, so that it may be looked at."""
+    return not any(isinstance(value, jax.core.Tracer) for value in values)
+
+
+def check(name: str, value: Any) -> None:
+    """Raise unless every element of `value` may be the quantity `name`; traced values pass unseen.
+
+    Args:
+        name: A field of `ImpactPair` or `Harvester`, or "k".
+        value: A number or an array.
+
+    Raises:
+        ValueError: "r must lie in (0, 1]; got -0.2 at index (3, 7); an elastic wall is r = 1".
+    """
+    if not is_concrete(value):
+        return
+    rule = _RULES[name]
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be a number or an array of numbers; got {value!r}; {rule.advice}")
+    good = rule.holds(array)
+    if not np.all(good):
+        raise ValueError(f"{name} {rule.must}; got {_first(array, good)}; {rule.advice}")
+
+
+def _first(values: Any, good: Any) -> str:
+    """The first element that is not good, with its index where there is one."""
+    values, good = np.asarray(values), np.asarray(good)
+    index = tuple(int(i) for i in np.argwhere(~good)[0])
+    where = f" at index {index if len(index) > 1 else index[0]}" if index else ""
+    return f"{values[index]}{where}"
+
+
+def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
+    """A checked `ImpactPair`, its fields broadcast to one shape.
+
+    Args:
+        d: Gap between the walls, > 0, any shape.
+        kappa: Natural frequency of the soft walls, > 0 and finite; None for rigid walls.
+        r: Coefficient of restitution, in (0, 1].
+        gamma: Gravity over forcing amplitude, finite.
+
+    Raises:
+        ValueError: A value that cannot be, or shapes that do not broadcast (traced values are not looked at).
+    """
+    given = {"d": d, "kappa": kappa, "r": r, "gamma": gamma}
+    if kappa is None:
+        del given["kappa"]
+    for name, value in given.items():
+        check(name, value)
+    arrays = [np.asarray(value) if isinstance(value, list | tuple) else value for value in given.values()]
+    dtype = jnp.result_type(float, *arrays)  # float64, or float32 where all arrays are
+    arrays = [jnp.asarray(array, dtype) for array in arrays]
+    try:
+        fields = dict(zip(given, jnp.broadcast_arrays(*arrays), strict=True))
+    except ValueError:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(given, arrays, strict=True))
+        raise ValueError(
+            f"d, kappa, r and gamma must broadcast to one shape; got {shapes}; a plane of them is what sweep makes"
+        ) from None
+    return ImpactPair(fields["d"], fields.get("kappa"), fields["r"], fields["gamma"])

@@ -1,0 +1,276 @@
+"""Pictures of maps, for print; the only room that loads matplotlib."""
+
+import itertools
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.patheffects import Normal, Stroke
+from matplotlib.ticker import EngFormatter
+
+from vijax.dataset import best
+from vijax.store import replacing
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+NEEDS = ("P", "period", "admissible")
+MOST_PANELS = 36
+
+_STYLE: Any = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "font.size": 9,
+    "axes.linewidth": 0.6,
+    "hatch.linewidth": 0.4,
+    "savefig.dpi": 250,
+}
+_ENDINGS = (".png", ".pdf", ".svg", ".eps")
+_POWER = "$P$ [J per half period]"
+# Worth a place in the title: neither the start, nor a quantity under a second name.
+_CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
+_NO_ENERGY = "0.75"
+# A wider scale would say more about its faintest cells than about those worth building.
+_DECADES = 4
+# Values count as evenly spaced if their steps differ by less than this part of their range.
+_EVEN = 1e-6
+# At most so many marks to a side, whatever the resolution of the map.
+_MARKS = 128
+
+_LINE: dict[str, Any] = {
+    "color": "white",
+    "linewidth": 0.8,
+    "path_effects": [Stroke(linewidth=1.6, foreground="black"), Normal()],
+}
+_DOT: dict[str, Any] = {"marker": ".", "markersize": 1.3, "color": "black", "mew": 0, "linestyle": "none"}
+_CROSS: dict[str, Any] = {"marker": "x", "markersize": 3.0, "color": "red", "mew": 0.7, "linestyle": "none"}
+_STAR: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "red", "mec": "white", "linestyle": "none"}
+_VEIL: dict[str, Any] = {"facecolor": (1, 1, 1, 0.55), "edgecolor": "0.3", "hatch": "/////", "linewidth": 0}
+
+
+def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
+    """Rows and columns of panels for a map whose dimensions are, in order, x, y, columns and rows.
+
+    Args:
+        sizes: Length of every dimension of P; those of length one are not drawn.
+
+    Raises:
+        ValueError: If no picture can be made of it: why, and what to take away.
+    """
+    drawn = {dim: size for dim, size in sizes.items() if size > 1}
+    if not drawn:
+        raise ValueError("plot must have an axis of more than one value; got a single cell")
+    if len(drawn) > 4:
+        raise ValueError(f"plot must have at most 4 axes; got {', '.join(drawn)}; keep some of them at one value")
+    panels = dict(itertools.islice(drawn.items(), 2, None))
+    count = math.prod(panels.values())
+    if count > MOST_PANELS:
+        got = " x ".join(f"{size} values of {dim}" for dim, size in panels.items())
+        raise ValueError(f"plot must have at most {MOST_PANELS} panels; got {got}; give the two longest axes first")
+    columns = min(count, 3) if len(panels) < 2 else next(iter(panels.values()))
+    return math.ceil(count / columns), columns
+
+
+def check_format(path: str | Path) -> None:
+    """Raise ValueError unless the path ends as a picture does."""
+    if Path(path).suffix not in _ENDINGS:
+        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {str(path)!r}")
+
+
+def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """P on a log colour scale, with all that tells where to believe it.
+
+    Inadmissible cells are veiled and hatched, the border of the period-1 region is a line, aperiodic cells carry dots
+    and undecided ones crosses, and a star stands on the largest admissible P. The colours span the admissible cells.
+
+    Args:
+        dataset: A map with `P`, `period` and `admissible`. Its dimensions are, in order, x, y, columns and rows of
+            panels; of one dimension a curve is drawn.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
+    """
+    missing = [name for name in NEEDS if name not in dataset]
+    if missing:
+        raise ValueError(f"plot must have {', '.join(NEEDS)}; got a map without {', '.join(missing)}")
+    if path is not None:
+        check_format(path)
+    rows, columns = layout({str(dim): size for dim, size in dataset["P"].sizes.items()})
+    # A variable lacks the dimensions that it does not depend on; the picture wants them all.
+    full = {name: dataset[name].broadcast_like(dataset["P"]).transpose(*dataset["P"].dims) for name in NEEDS}
+    dataset = dataset.assign(full)[list(NEEDS)].squeeze()
+    dims = [str(dim) for dim in dataset["P"].dims]
+    with mpl.rc_context(_STYLE):
+        figure = _curve(dataset) if len(dims) == 1 else _maps(dataset, dims, rows, columns)
+        if path is not None:
+            with replacing(Path(path)) as part:
+                figure.savefig(part)
+    return figure
+
+
+def _maps(dataset: "xr.Dataset", dims: list[str], rows: int, columns: int) -> Figure:
+    size = (5.2, 4.6) if rows * columns == 1 else (1.6 + 2.1 * columns, 1.6 + 1.9 * rows)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    norm, peak = _norm(dataset), best(dataset)
+    # Panels by rows, cells by y: the dimensions backwards.
+    dataset = dataset.sortby(dims[:2]).transpose(*dims[::-1])
+    outer = dims[:1:-1]
+    for axes, index in itertools.zip_longest(grid.flat, np.ndindex(*(dataset.sizes[dim] for dim in outer))):
+        if index is None:
+            axes.set_visible(False)
+            continue
+        panel = dataset.isel(dict(zip(outer, index, strict=True)))
+        mesh = _panel(axes, panel, dims[0], dims[1], norm)
+        axes.set_title(_values(panel, dims[2:]), fontsize="medium")
+        if peak is not None and all(peak[dim] == panel[dim] for dim in outer):
+            axes.plot(peak[dims[0]], peak[dims[1]], **_STAR, clip_on=False, zorder=5)
+    for axes in grid[-1]:
+        axes.set_xlabel(_label(dataset[dims[0]]))
+    for axes in grid[:, 0]:
+        axes.set_ylabel(_label(dataset[dims[1]]))
+    figure.colorbar(mesh, ax=grid, extend="both", label=_POWER)
+    _explain(figure, dataset, peak)
+    return figure
+
+
+def _panel(axes: Axes, panel: "xr.Dataset", x: str, y: str, norm: LogNorm) -> QuadMesh:
+    (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in (x, y))
+    axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_NO_ENERGY)
+    power, period = panel["P"].values, panel["period"].values
+    mesh = axes.pcolormesh(across, up, np.ma.masked_where(~(power > 0), power), norm=norm, rasterized=True)
+    _hatch(axes, across, up, ~panel["admissible"].values)
+    axes.add_collection(LineCollection(_borders(across, up, period == 1), **_LINE))
+    axes.plot(*_marks(period == 0, panel[x].values, panel[y].values, most=True), **_DOT)
+    axes.plot(*_marks(period < 0, panel[x].values, panel[y].values, most=False), **_CROSS)
+    return mesh
+
+
+def _curve(dataset: "xr.Dataset") -> Figure:
+    """P over a single axis, with the marks of a map."""
+    (x,) = (str(dim) for dim in dataset["P"].dims)
+    dataset = dataset.sortby(x)
+    places, power, period = dataset[x].values, dataset["P"].values, dataset["period"].values
+    figure = Figure(figsize=(5.2, 3.8), layout="constrained")
+    axes, peak = figure.subplots(), best(dataset)
+    across, xscale = _edges(places)
+    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=_label(dataset[x]), ylabel=_POWER)
+    axes.plot(places, np.where(power > 0, power, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
+    axes.margins(y=0.05)
+    for start, end in _runs(~dataset["admissible"].values):
+        axes.axvspan(across[start], across[end], **_VEIL, zorder=0)
+    for border in _runs(period == 1):
+        for edge in set(border) - {0, places.size}:
+            axes.axvline(across[edge], **_LINE, zorder=0.5)
+    for mask, style in ((period == 0, _DOT | {"markersize": 4}), (period < 0, _CROSS)):
+        axes.plot(places[mask], power[mask], **style, zorder=2)
+    if peak is not None:
+        axes.plot(peak[x], peak, **_STAR, zorder=5)
+    _explain(figure, dataset, peak)
+    return figure
+
+
+def _explain(figure: Figure, dataset: "xr.Dataset", peak: "xr.DataArray | None") -> None:
+    """What the map holds constant above it, what its marks mean below; only the marks that it has."""
+    constants = [name for name in _CONSTANTS if name in dataset.coords and not dataset[name].ndim]
+    title = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
+    figure.suptitle(", ".join([*title, _values(dataset, constants)]), fontsize="medium")
+    period = dataset["period"].values
+    marks = [
+        (~dataset["admissible"].values, Patch(**_VEIL), "inadmissible"),
+        (period == 1, Line2D([], [], **_LINE), "border of period 1"),
+        (period == 0, Line2D([], [], **_DOT | {"markersize": 4}), "aperiodic"),
+        (period < 0, Line2D([], [], **_CROSS), "undecided"),
+        (dataset["P"].values == 0, Patch(color=_NO_ENERGY), "no impact"),
+    ]
+    shown = [(handle, text) for mask, handle, text in marks if mask.any()]
+    if peak is not None:
+        amount = EngFormatter("J", places=2)(float(peak))
+        shown.append((Line2D([], [], **_STAR), f"largest admissible $P$, {amount}"))
+    handles, texts = zip(*shown, strict=True) if shown else ((), ())
+    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
+
+
+def _norm(dataset: "xr.Dataset") -> LogNorm:
+    """Colours for the admissible cells: outside, the formula may give any number of times more."""
+    power = dataset["P"].values
+    trusted = power[(power > 0) & dataset["admissible"].values]
+    shown = trusted if trusted.size else power[power > 0]
+    if not shown.size:
+        return LogNorm(1e-9, 1e-6)
+    return LogNorm(max(shown.min(), shown.max() / 10**_DECADES), shown.max())
+
+
+def _edges(values: np.ndarray) -> tuple[np.ndarray, str]:
+    """Edges of the cells around ascending values, and the scale on which these are evenly spaced."""
+    log = values.size > 2 and values[0] > 0 and np.ptp(np.diff(np.log(values))) < _EVEN * np.log(values[-1] / values[0])
+    points = np.log(values) if log else values
+    middle = 0.5 * (points[1:] + points[:-1])
+    edges = np.concatenate([[2 * points[0] - middle[0]], middle, [2 * points[-1] - middle[-1]]])
+    return (np.exp(edges), "log") if log else (edges, "linear")
+
+
+def _hatch(axes: Axes, across: np.ndarray, up: np.ndarray, mask: np.ndarray) -> None:
+    if not mask.any():
+        return
+    # Every cell twice, at both its edges: the contour then follows the cells instead of cutting their corners.
+    stairs = np.repeat(np.repeat(mask.astype(float), 2, axis=0), 2, axis=1)
+    corners = np.repeat(across, 2)[1:-1], np.repeat(up, 2)[1:-1]
+    veil = axes.contourf(*corners, stairs, levels=[0.5, 1.5], colors=[_VEIL["facecolor"]], hatches=[_VEIL["hatch"]])
+    veil.set(edgecolor=_VEIL["edgecolor"], linewidth=0)
+
+
+def _borders(across: np.ndarray, up: np.ndarray, mask: np.ndarray) -> list[Any]:
+    """The edges between cells in the mask and cells outside it."""
+    segments = []
+    for i, j in np.argwhere(mask[:, 1:] != mask[:, :-1]):
+        segments.append([(across[j + 1], up[i]), (across[j + 1], up[i + 1])])
+    for i, j in np.argwhere(mask[1:] != mask[:-1]):
+        segments.append([(across[j], up[i + 1]), (across[j + 1], up[i + 1])])
+    return segments
+
+
+def _runs(mask: np.ndarray) -> np.ndarray:
+    """First and one past the last index of every run of true values."""
+    return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
+
+
+def _marks(mask: np.ndarray, x: np.ndarray, y: np.ndarray, *, most: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Places of the cells in the mask; on a fine map, of the blocks of which most cells, or any, are in it."""
+    step = max(math.ceil(size / _MARKS) for size in mask.shape)
+    starts = [np.arange(0, size, step) for size in mask.shape]
+    share = np.add.reduceat(np.add.reduceat(mask.astype(int), starts[0], axis=0), starts[1], axis=1)
+    rows, columns = np.nonzero(2 * share > step**2 if most else share)
+    centre = [np.minimum(start + step // 2, size - 1) for start, size in zip(starts, mask.shape, strict=True)]
+    return x[centre[1][columns]], y[centre[0][rows]]
+
+
+def _label(coordinate: "xr.DataArray") -> str:
+    units = _units(coordinate)
+    return _symbol(coordinate) + (f" [{units}]" if units else "")
+
+
+def _symbol(coordinate: "xr.DataArray") -> str:
+    return f"${coordinate.attrs.get('symbol', coordinate.name)}$"
+
+
+def _values(dataset: "xr.Dataset", names: list[str]) -> str:
+    """The values of scalar coordinates: r = 0.5, omega = 3.14 rad/s."""
+    scalars = [dataset[name] for name in names]
+    return ", ".join(f"{_symbol(scalar)} = {float(scalar):.4g} {_units(scalar)}".strip() for scalar in scalars)
+
+
+def _units(coordinate: "xr.DataArray") -> str:
+    units = coordinate.attrs.get("units", "1")
+    return "" if units == "1" else re.sub(r"(-?\d+)", r"$^{\1}$", units)

@@ -1,0 +1,532 @@
+"""The regular impact in straight-line arithmetic: one flight without gravity and one contact, certified or declined.
+
+Elementwise over lanes: fixed trips, polynomial sine, cosine and exponential on known ranges, no library call. A lane
+whose impact is not certified to be the first and converged to rounding is declined, and `exact.step` does it instead.
+"""
+
+import math
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from vijax import energy
+from vijax.exact import stick_speed
+from vijax.flow import PI, horner, membrane, share
+from vijax.model import ImpactPair
+
+Lane = Float[Array, "lane"]
+
+_FLIGHT_TRIPS = 3
+_CONTACT_TRIPS = 2
+_REACH = 1.65  # of sine and cosine below, in radians
+_EXP_REACH = 2.4
+_DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
+
+
+def _economised(series: list[float], reach: float, terms: int) -> tuple[float, ...]:
+    """The polynomial of few terms that interpolates a power series at the Chebyshev points of [0, reach]."""
+    nodes = 0.5 * reach * (1 + np.cos(np.pi * (np.arange(terms) + 0.5) / terms))
+    values = np.polynomial.polynomial.polyval(nodes, series)
+    fit = np.polynomial.chebyshev.Chebyshev.fit(nodes, values, terms - 1, domain=[0, reach])
+    return tuple(fit.convert(kind=np.polynomial.Polynomial).coef.tolist())
+
+
+def _series(start: int, sign: float) -> list[float]:
+    """Coefficients sign^k/(start + 2k)! of the tail of a sine or cosine in x^2."""
+    return [sign**k / math.factorial(start + 2 * k) for k in range(16)]
+
+
+# Tails beyond the leading terms, so that the fit's rounding is scaled down: worst errors 2e-16 of one
+# (test_quick.py), with four to six terms fewer than Taylor's.
+_SINE = _economised(_series(3, -1.0), _REACH**2, 10)  # (x - sin x)/x^3
+_COSINE = _economised(_series(4, -1.0), _REACH**2, 9)  # (cos x - 1 + x^2/2)/x^4
+_EXP = tuple(1.0 / math.factorial(k) for k in range(16))  # on |x| <= 0.6
+_ARCSINE = _economised([math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(1, 60)], 0.25, 12)
+
+
+class Lanes(eqx.Module):
+    """The state between impacts, all floating point: displacement, velocity, phase in [0, 2), periods completed."""
+
+    u: Lane
+    v: Lane
+    t: Lane
+    n: Lane
+
+
+class Wall(eqx.Module):
+    """What the contact of a cell needs and no impact changes."""
+
+    half: Lane
+    r: Lane
+    chi: Lane | None = None  # rigid: greatest depth per speed
+    kappa: Lane | None = None
+    zeta: Lane | None = None
+    omega1: Lane | None = None
+    gain_in: Lane | None = None  # steady response per forcing, in phase
+    gain_out: Lane | None = None  # and a quarter turn behind
+    span: Lane | None = None  # pi/omega1: the free contact
+    cos_span: Lane | None = None
+    sin_span: Lane | None = None
+    cos_middle: Lane | None = None
+    sin_middle: Lane | None = None
+    root_r: Lane | None = None
+    hop: Lane | None = None  # a contact whose cubic Taylor polynomial ends before this is expanded about half the span
+    crest: Lane | None = None  # free time of greatest depth
+    cos_crest: Lane | None = None
+    sin_crest: Lane | None = None
+    crest_decay: Lane | None = None
+    steep: Lane | None = None  # least speed at which w' is sure to have its first zero near the free crest
+    lift: Lane | None = None  # least -w'' at the crest, per bound of f', that keeps w' negative until the exit
+    usable: Bool[Array, "lane"] | None = None
+
+
+class Hit(eqx.Module):
+    """One impact of every lane: onset, exit and, where asked for, depth, work and tangent map (row by row)."""
+
+    onset_t: Lane
+    onset_n: Lane
+    side: Lane
+    v_in: Lane
+    v_out: Lane
+    flight: Lane
+    duration: Lane
+    after: Lanes
+    depth: Lane | None = None
+    work: Lane | None = None
+    tangent: tuple[Lane, Lane, Lane, Lane] | None = None
+
+
+def prepare(pair: ImpactPair) -> Wall:
+    """Constants of the quick step for every cell.
+
+    The size certificates, for a forcing of at most 1: while v h'(s) > h(s), up to half the free time of greatest depth
+    s_a, w' stays positive (Duhamel with h' > 0), and once kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From
+    there -w' starts with slope V = -w'' and is driven by at most max f': it stays positive while V h > max f' H, H the
+    integral of h ("lift"); h/H falls with time since h is log-concave.
+    """
+    if pair.kappa is None:
+        return Wall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r))
+    wall = membrane(pair)
+    kappa, zeta, omega1 = wall.kappa, wall.zeta, wall.omega1
+    square = kappa * kappa
+    stiffness, loss = square - PI**2, 2 * zeta * PI
+    size = stiffness * stiffness + loss * loss
+    span, theta = PI / omega1, jnp.arctan2(omega1, zeta)
+    crest = theta / omega1
+    bend = zeta * zeta - (2 / 3) * (4 * zeta * zeta - square)
+
+    def response(x):  # h, h' and H at omega1 s = x
+        decay = jnp.exp(-zeta / omega1 * x)
+        h, slope = decay * jnp.sin(x) / omega1, decay * (jnp.cos(x) - zeta / omega1 * jnp.sin(x))
+        return h, slope, (1 - slope - 2 * zeta * h) / square
+
+    h_a, slope_a, static_a = response(0.5 * theta)
+    h_d, _, static_d = response(jnp.full_like(theta, _DEEP_REACH))
+    return Wall(
+        half=0.5 * pair.d,
+        r=pair.r,
+        kappa=kappa,
+        zeta=zeta,
+        omega1=omega1,
+        gain_in=stiffness / size,
+        gain_out=loss / size,
+        span=span,
+        cos_span=jnp.cos(PI * span),
+        sin_span=jnp.sin(PI * span),
+        cos_middle=jnp.cos(0.5 * PI * span),
+        sin_middle=jnp.sin(0.5 * PI * span),
+        root_r=jnp.sqrt(pair.r),
+        hop=jnp.where(bend > 0, 1.6 / (jnp.sqrt(jnp.maximum(bend, 0.0)) + zeta), 0.0),  # 0.8 of the free contact's
+        crest=crest,
+        cos_crest=jnp.cos(PI * crest),
+        sin_crest=jnp.sin(PI * crest),
+        crest_decay=jnp.exp(-zeta * crest),
+        steep=jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a),
+        lift=static_d / h_d,
+        # Near the resonance the steady response is large and cancels.
+        usable=(size > 1.0) & (pair.r > 1e-2),
+    )
+
+
+def _sine_cosine(x: Lane) -> tuple[Lane, Lane]:
+    """sin and cos on |x| <= _REACH."""
+    square = x * x
+    sine = x - x * square * horner(_SINE, square)
+    return sine, 1 - square * (0.5 - square * horner(_COSINE, square))
+
+
+def _exp(x: Lane) -> Lane:
+    """exp on |x| <= _EXP_REACH."""
+    quarter = horner(_EXP, 0.25 * x)
+    half = quarter * quarter
+    return half * half
+
+
+def _phase(t: Lane) -> tuple[Lane, Lane]:
+    """sin(pi t) and cos(pi t) for t in [0, 2]."""
+    quadrant = jnp.round(2 * t)
+    sine, cosine = _sine_cosine(PI * (t - 0.5 * quadrant))
+    odd, back = (quadrant == 1) | (quadrant == 3), (quadrant == 2) | (quadrant == 3)
+    sine, cosine = jnp.where(odd, cosine, sine), jnp.where(odd, -sine, cosine)
+    return jnp.where(back, -sine, sine), jnp.where(back, -cosine, cosine)
+
+
+def _arcsine(x: Lane) -> Lane:
+    """asin on [-1, 1], by asin(x) = pi/2 - 2 asin(sqrt((1 - x)/2)) beyond 1/2."""
+    size = jnp.abs(x)
+    outer = size > 0.5
+    square = jnp.where(outer, 0.5 * (1 - size), size * size)
+    root = jnp.where(outer, jnp.sqrt(jnp.where(outer, square, 1.0)), size)
+    inner = root + root * square * horner(_ARCSINE, square)
+    return jnp.where(x < 0, -1.0, 1.0) * jnp.where(outer, 0.5 * PI - 2 * inner, inner)
+
+
+def _converged(eps: float) -> float:
+    """Largest last step, times the equation's stiffness, that a fourth-order iteration leaves an error of eps behind."""
+    return eps**0.25
+
+
+def _householder(f: Lane, f1: Lane, f2: Lane, f3: Lane) -> Lane:
+    """Step of the fourth-order root iteration from f and its first three derivatives."""
+    inverse = 1 / f1
+    h = -f * inverse
+    b, c = f2 * inverse, f3 * inverse
+    return h * (1 + 0.5 * b * h) / (1 + h * (b + c * h * (1 / 6)))
+
+
+class _Flight(eqx.Module):
+    """Arrival at a wall, in the frame where the ball starts downwards: sin and cos of the angle past the crossing's centre."""
+
+    elapsed: Lane
+    speed: Lane  # towards the wall
+    flip: Lane  # +-1: the frame is mirrored
+    wall: Lane  # +-1 in the frame
+    sine: Lane
+    cosine: Lane
+    sure: Bool[Array, "lane"]
+    never: Bool[Array, "lane"]
+
+
+def _fly(half: Lane, lane: Lanes) -> _Flight:
+    """First wall crossing without gravity: pick the one monotone stretch that holds it, then Kepler's equation.
+
+    u' = (p + sin pi t)/pi. For |p| < 1 the extrema are closed-form, and each period lifts them by 2p/pi, so comparing
+    two of them with the walls and one division give the crossing's stretch. About the centre of a stretch the crossing
+    obeys sin y + P y = G, Kepler's equation, monotone there; a Householder iteration from the centre, where the left
+    side is nearly straight, converges in two or three trips.
+    """
+    eps = jnp.finfo(half.dtype).eps
+    flip = jnp.where(lane.v < 0, 1.0, -1.0).astype(half.dtype)
+    sine, cosine = _phase(lane.t)
+    sine, cosine = flip * sine, flip * cosine
+    t = jnp.where(flip > 0, lane.t, jnp.where(lane.t >= 1, lane.t - 1, lane.t + 1))
+    u = flip * lane.u
+    p = flip * PI * lane.v - sine
+    u, t, p, cosine = share((u, t, p, cosine))
+    inside = jnp.clip(p, -1.0, 1.0)
+    angle = _arcsine(inside) * (1 / PI)
+    swing = jnp.sqrt((1 - inside) * (1 + inside)) * (1 / PI**2)
+    drift = p * (1 / PI)
+    centre = jnp.where(t < 0.5, -0.5, 1.5)
+    u_centre = u + drift * (centre - t) + cosine * (1 / PI**2)
+    lowest = u_centre + drift * (0.5 - angle) - swing
+    highest = u_centre + drift * (1.5 + angle) + swing
+    lowest, highest, u_centre, drift = share((lowest, highest, u_centre, drift))
+    falls = p <= -1  # downwards for ever
+    left, right = (lowest <= -half) | falls, highest >= half
+    up = ~left & (right | (drift > 0))
+    slow_point = jnp.where(falls, u_centre + drift, lowest)
+    short = jnp.where(drift > 0, half - highest, slow_point + half)  # still to climb or sink, period by period
+    periods = jnp.ceil(short / jnp.maximum(jnp.abs(2 * drift), jnp.finfo(half.dtype).tiny))
+    periods = jnp.where((right & ~left) | (left & ~falls), 0.0, jnp.maximum(periods, 0.0))
+    # An extremum within rounding of the wall may be a graze or a miss: not for here.
+    margin = 512 * eps
+    lift = 2 * drift * periods
+    near = jnp.abs(jnp.where(up, highest, lowest) + lift - jnp.where(up, half, -half)) < margin
+    before = (jnp.abs(jnp.where(up, highest, lowest) + lift - 2 * drift - jnp.where(up, half, -half)) < margin) & (
+        periods > 0
+    )
+    passed = (jnp.abs(lowest + half) < margin) | (~left & (jnp.abs(highest - half) < margin))
+    wall = jnp.where(up, 1.0, -1.0).astype(half.dtype)
+    centre = centre + jnp.where(up, 1.0, 0.0) + 2 * periods
+    away = centre - t
+    slope = wall * p
+    goal = PI**2 * (half - wall * (u + drift * away + cosine * (1 / PI**2)))
+    never = periods > 1e7
+    slope, goal, away, doubt = share((slope, goal, away, (near | before | passed) & ~falls))
+    y = jnp.clip(goal / (1 + slope), -2.6, 2.6)
+    for _ in range(_FLIGHT_TRIPS):
+        size = jnp.abs(y)
+        beyond = size > 0.5 * PI
+        sine, cosine = _sine_cosine(jnp.where(beyond, PI - size, size))
+        sine, cosine = jnp.where(y < 0, -sine, sine), jnp.where(beyond, -cosine, cosine)
+        step = _householder(sine + slope * y - goal, slope + cosine, -sine, -cosine)
+        y, step, sine, cosine = share((y + step, step, sine, cosine))
+    square = step * step
+    turn_sine, turn_cosine = step * (1 - square * (1 / 6)), 1 - square * (0.5 - square * (1 / 24))
+    stiffness = jnp.maximum(1.0, jnp.abs(sine / (slope + cosine)))
+    sine, cosine = sine * turn_cosine + cosine * turn_sine, cosine * turn_cosine - sine * turn_sine
+    speed = (slope + cosine) * (1 / PI)
+    elapsed = away + y * (1 / PI)
+    # The iteration is of fourth order: what is left after the last step is (stiffness step)^3 step.
+    converged = stiffness * jnp.abs(step) < _converged(eps)
+    # A short hop loses its leading digits in the phases.
+    sure = converged & ~doubt & (speed > 0) & (elapsed > 1 / 256) & (lane.v != 0) & (jnp.abs(y) < 3.4)
+    return _Flight(*share((elapsed, speed, flip, wall, sine, cosine, sure, never & (lane.v != 0))))
+
+
+class _Motion(eqx.Module):
+    """Penetration w and its derivatives at one time of the contact, with the parts they were made of."""
+
+    w: Lane
+    rate: Lane
+    force: Lane
+    push: Lane  # w''
+    jerk: Lane  # w'''
+    drive: Lane  # derivative of the forcing
+    sine: Lane
+    cosine: Lane
+    decay: Lane
+
+
+class _Course(eqx.Module):
+    """A contact as seen from one reference time: steady part, forcing and free part rotated to it."""
+
+    steady_cos: Lane
+    steady_sin: Lane
+    force_cos: Lane
+    force_sin: Lane
+    free_cos: Lane
+    free_sin: Lane
+    decay: Lane
+
+
+def _motion(wall: Wall, course: _Course, s: Lane) -> _Motion:
+    """The contact at time s from the course's reference."""
+    sine, cosine = _sine_cosine(wall.omega1 * s)
+    drive_sine, drive_cosine = _sine_cosine(PI * s)
+    decay = course.decay * _exp(-wall.zeta * s)
+    along = course.free_cos * cosine + course.free_sin * sine
+    across = course.free_sin * cosine - course.free_cos * sine
+    steady = course.steady_cos * drive_cosine + course.steady_sin * drive_sine
+    steady_rate = PI * (course.steady_sin * drive_cosine - course.steady_cos * drive_sine)
+    force = course.force_cos * drive_cosine - course.force_sin * drive_sine
+    drive = -PI * (course.force_sin * drive_cosine + course.force_cos * drive_sine)
+    w = steady + decay * along
+    rate = steady_rate + decay * (wall.omega1 * across - wall.zeta * along)
+    return _derivatives(wall, w, rate, force, drive, sine, cosine, decay)
+
+
+def _derivatives(wall, w, rate, force, drive, sine, cosine, decay) -> _Motion:
+    push = force - 2 * wall.zeta * rate - wall.kappa * wall.kappa * w
+    jerk = drive - 2 * wall.zeta * push - wall.kappa * wall.kappa * rate
+    return _Motion(w, rate, force, push, jerk, drive, sine, cosine, decay)
+
+
+def _at_reference(wall: Wall, course: _Course) -> _Motion:
+    """The contact at the course's reference: no sine and no exponential is needed there."""
+    one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
+    w = course.steady_cos + course.decay * course.free_cos
+    rate = PI * course.steady_sin + course.decay * (wall.omega1 * course.free_sin - wall.zeta * course.free_cos)
+    return _derivatives(wall, w, rate, course.force_cos, -PI * course.force_sin, zero, one, course.decay)
+
+
+def _in_reach(wall: Wall, s: Lane) -> Bool[Array, "lane"]:
+    """Whether the polynomials of `_motion` hold at s."""
+    return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < _REACH) & (wall.zeta * jnp.abs(s) < _EXP_REACH)
+
+
+def _course(parts: tuple[Lane, ...], cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> _Course:
+    """The contact rotated to a reference time with the given cos and sin of pi s; `free` is its free part there."""
+    steady_cos, steady_sin, force_cos, force_sin, _, _ = parts
+    return _Course(
+        steady_cos * cosine + steady_sin * sine,
+        steady_sin * cosine - steady_cos * sine,
+        force_cos * cosine - force_sin * sine,
+        force_cos * sine + force_sin * cosine,
+        *free,
+        decay,
+    )
+
+
+def _taylor(derivatives: tuple[Lane, ...], order: int, s: Lane) -> Lane:
+    """Sum of derivatives[k] s^k/(k + order)!."""
+    return horner(tuple(d * (1 / math.factorial(k + order)) for k, d in enumerate(derivatives)), s)
+
+
+def _either(short: Bool[Array, "lane"], near: _Course, far: _Course) -> _Course:
+    return share(jax.tree.map(lambda a, b: jnp.where(short, a, b), near, far))
+
+
+class _Exit(eqx.Module):
+    """The end of a contact: duration and outward speed; sin, cos of omega1 s and exp(-zeta s) there."""
+
+    duration: Lane
+    speed: Lane
+    sine: Lane
+    cosine: Lane
+    decay: Lane
+
+
+def _touch(wall: Wall, flight: _Flight) -> tuple[_Exit, Lane, Bool[Array, "lane"]]:
+    """Exit and greatest depth of the contact, and certainty that w rises once and falls once between onset and exit.
+
+    The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
+    nothing has to be evaluated there; that of a slow entry against the forcing, from the root of its cubic Taylor
+    polynomial, about half of pi/omega1.
+    """
+    eps = jnp.finfo(wall.half.dtype).eps
+    speed = flight.speed
+    force_cos, force_sin = -flight.sine, flight.cosine
+    steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
+    steady_sin = wall.gain_out * force_cos - wall.gain_in * force_sin
+    # The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin.
+    free_cos = -steady_cos
+    free_sin = (speed - PI * steady_sin + wall.zeta * free_cos) / wall.omega1
+    push = force_cos - 2 * wall.zeta * speed
+    square = wall.kappa * wall.kappa
+    jerk = -PI * force_sin - 2 * wall.zeta * push - square * speed
+    parts = share((steady_cos, steady_sin, force_cos, force_sin, free_cos, free_sin))
+    steady_cos, steady_sin, force_cos, force_sin, free_cos, free_sin = parts
+    bend = 0.25 * push * push - (2 / 3) * jerk * speed
+    hop = 2 * speed / (jnp.sqrt(jnp.maximum(bend, 0.0)) - 0.5 * push)
+    short = (bend > 0) & (hop > 0) & (hop < wall.hop)
+    # One Newton step on the Taylor polynomial of degree six brings the guess within reach of two trips.
+    snap = -(PI**2) * force_cos - 2 * wall.zeta * jerk - square * push
+    fifth = PI**3 * force_sin - 2 * wall.zeta * snap - square * jerk
+    sixth = PI**4 * force_cos - 2 * wall.zeta * fifth - square * snap
+    derivatives = (speed, push, jerk, snap, fifth, sixth)
+    value = _taylor(derivatives, 1, hop) * hop
+    slope = _taylor(derivatives, 0, hop)
+    hop = jnp.where(slope < 0, hop - value / slope, hop)
+    rise = 2 * speed / (jnp.sqrt(jnp.maximum(push * push - 2 * jerk * speed, 0.0)) - push)
+    rise = rise - _taylor(derivatives, 0, rise) / _taylor(derivatives[1:], 0, rise)
+    hop, rise, short = share((hop, rise, short))
+    middle = _course(parts, wall.cos_middle, wall.sin_middle, (free_sin, -free_cos), wall.root_r)
+    far = share(_course(parts, wall.cos_span, wall.sin_span, (-free_cos, -free_sin), wall.r))
+    free = share(_at_reference(wall, far))
+    course = _either(short, middle, far)
+    reference = jnp.where(short, 0.5 * wall.span, wall.span)
+    s = jnp.where(short, hop - reference, _householder(free.w, free.rate, free.push, free.jerk))
+    reached = jnp.ones_like(flight.sure)
+    for _ in range(_CONTACT_TRIPS):
+        reached = reached & _in_reach(wall, s)
+        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
+        step = _householder(at.w, at.rate, at.push, at.jerk)
+        s, step, reached = share((s + step, step, reached))
+    out = -(at.rate + step * (at.push + step * (0.5 * at.jerk)))
+    duration = reference + s
+    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.push / at.rate))
+    # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
+    converged = reached & (stiffness * jnp.abs(step) < _converged(eps)) & (wall.omega1 * duration > 0.25)
+    depth, certain = _deepest(wall, speed, parts, (short, rise), duration, at.drive, at.force)
+    sure = wall.usable & converged & (out > 0) & certain
+    turn = wall.omega1 * step
+    twist = turn * turn
+    turn_sine, turn_cosine = turn * (1 - twist * (1 / 6)), 1 - twist * (0.5 - twist * (1 / 24))
+    sine, cosine = at.sine * turn_cosine + at.cosine * turn_sine, at.cosine * turn_cosine - at.sine * turn_sine
+    sine, cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)  # from the reference to the onset
+    rot = wall.zeta * step
+    decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
+    return share((_Exit(duration, out, sine, cosine, decay), depth, sure))
+
+
+def _deepest(
+    wall: Wall,
+    speed: Lane,
+    parts: tuple[Lane, ...],
+    slow: tuple[Bool[Array, "lane"], Lane],
+    duration: Lane,
+    exit_drive: Lane,
+    exit_force: Lane,
+) -> tuple[Lane, Bool[Array, "lane"]]:
+    """Greatest depth, sought from the free contact's, and certainty that w has no other extremum before the exit.
+
+    w' is an oscillator too, driven by the derivative f' of the forcing. Write e^(zeta s) w' = phi q with phi the free
+    solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero only.
+    Beyond it -w' > 0 has no zero while f' < 0, and where f' ends positive at most one, so none if -w' > 0 at the exit.
+    Moreover a minimum of w needs a positive forcing. Else by size: `Wall.steep` and `Wall.lift`.
+    """
+    eps = jnp.finfo(wall.half.dtype).eps
+    _, _, force_cos, force_sin, free_cos, free_sin = parts
+    short, rise = slow
+    # At the free crest cos and sin of omega1 s are zeta/kappa and omega1/kappa.
+    cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
+    turned = (free_cos * cosine + free_sin * sine, free_sin * cosine - free_cos * sine)
+    far = share(_course(parts, wall.cos_crest, wall.sin_crest, turned, wall.crest_decay))
+    square = wall.kappa * wall.kappa
+
+    def snap(at: _Motion) -> Lane:
+        return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - square * at.push
+
+    free = share(_at_reference(wall, far))
+    s = jnp.where(short, rise - wall.crest, _householder(free.rate, free.push, free.jerk, snap(free)))
+    reached = _in_reach(wall, s)
+    at = share(_motion(wall, far, jnp.where(reached, s, 0.0)))
+    fourth = snap(at)
+    step = _householder(at.rate, at.push, at.jerk, fourth)
+    depth = at.w + step * (at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth)))
+    when = wall.crest + s + step
+    way = duration - when
+    # The depth is stationary, and its Taylor polynomial of fifth order: a coarser time than the exit's will do.
+    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
+    converged = reached & (stiffness * jnp.abs(step) < 16 * _converged(eps)) & (at.push < 0)
+    falls, pulled, one_change = at.drive <= 0, at.force <= 0, duration < 1
+    first = falls & ((force_sin >= 0) | ((force_cos > 0) & (far.force_sin >= 0)))
+    first = (one_change & (first | ((force_cos <= 0) & pulled))) | (speed > wall.steep)
+    only = one_change & (falls | (exit_drive > 0) | (pulled & (exit_force <= 0)))
+    # While the forcing is positive f' falls, so its value at the crest bounds it.
+    most = jnp.where((at.force > 0) & (exit_force > 0) & one_change, jnp.maximum(at.drive, 0.0), PI)
+    only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < _DEEP_REACH))
+    return depth, converged & first & only & (when > 0) & (way > 0) & (way < wall.span)
+
+
+def quick_step(
+    wall: Wall, gamma: Lane, lane: Lanes, *, deep: bool = False, tangent: bool = False
+) -> tuple[Hit, Bool[Array, "lane"], Bool[Array, "lane"]]:
+    """One impact of every lane by the regular path; gamma must be 0.
+
+    Args:
+        deep: Also find the greatest depth and the work given to the membrane.
+        tangent: Also give the tangent map of the step, flight and saltations included.
+
+    Returns:
+        The hit, for which lanes it is certain, and which lanes will never meet a wall again.
+    """
+    flight = _fly(wall.half, lane)
+    side = flight.flip * flight.wall
+    onset = lane.t + flight.elapsed
+    passed = jnp.floor(0.5 * onset)
+    onset_t, onset_n = onset - 2 * passed, lane.n + passed
+    v_in = side * flight.speed
+    depth = work = contact = None
+    if wall.kappa is None:
+        out, duration = wall.r * flight.speed, jnp.zeros_like(onset)
+        leave_t, leave_n = onset_t, onset_n
+        sure = flight.sure & (out > 10 * stick_speed(out.dtype))
+        if deep:
+            depth, work = wall.chi * flight.speed, energy.membrane_work_rigid(v_in, wall.r)
+        if tangent:
+            # In the frame of the wall the acceleration there is -sine.
+            contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * flight.sine / flight.speed, -wall.r)
+    else:
+        left, depth, sure = _touch(wall, flight)
+        duration, out = left.duration, left.speed
+        sure = sure & flight.sure
+        leave = onset_t + duration
+        passed = jnp.floor(0.5 * leave)
+        leave_t, leave_n = leave - 2 * passed, onset_n + passed
+        if deep:
+            work = energy.membrane_work(wall.kappa, 2 * wall.zeta, gamma, side, onset_t, duration, v_in, -side * out)
+        if tangent:
+            h = left.decay * left.sine / wall.omega1
+            slope = left.decay * left.cosine - wall.zeta * h
+            contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)
+    if contact is not None:
+        a, b, c, d = contact
+        contact = (a, a * flight.elapsed + b, c, c * flight.elapsed + d)
+    after = Lanes(side * wall.half, -side * out, leave_t, leave_n)
+    hit = Hit(onset_t, onset_n, side, v_in, -side * out, flight.elapsed, duration, after, depth, work, contact)
+    return hit, sure & ~flight.never, flight.never & flight.sure

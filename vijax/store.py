@@ -1,0 +1,92 @@
+"""Maps on disk: zarr stores that are whole or absent, each chunk with a checksum."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def check_output(name: str, path: str | Path, overwrite: bool = False) -> Path:
+    """The path, if something can be written there; `name` is the argument that an error speaks of.
+
+    Raises:
+        FileExistsError: If it is taken, and not ours to overwrite.
+        FileNotFoundError, PermissionError: If its folder is missing or closed.
+    """
+    target = Path(path)
+    folder = target.absolute().parent
+    if not target.name:
+        raise FileNotFoundError(f"{name} must name a file; got {str(path)!r}")
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{name} must lie in a folder that exists; got {path}; make {folder} first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"{name} must lie in a folder that can be written; got {path}")
+    if target.is_symlink() or target.exists():
+        if not overwrite:
+            raise FileExistsError(f"{name} must not exist yet; got {path}; allow overwriting, or take another name")
+        # A slip of the hand must not delete a folder of other things.
+        if target.is_dir() and not (target / "zarr.json").is_file():
+            raise FileExistsError(f"{name} must not replace a folder that is no zarr store; got {path}")
+    return target
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary sibling to write, renamed to `path` when the block succeeds and removed when it does not."""
+    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    old = path.with_name(f".{path.stem}.{os.getpid()}.old{path.suffix}")
+    try:
+        yield part
+        if path.is_dir():  # a folder cannot be renamed onto another
+            path.rename(old)
+        part.replace(path)
+    except BaseException:  # Ctrl-C too
+        if old.exists() and not path.exists():
+            old.rename(path)
+        raise
+    finally:
+        for leftover in (part, old):
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
+
+
+def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a map as a zarr store (format 3, zstd, CRC-32C); a write that fails or is stopped leaves nothing behind.
+
+    Args:
+        dataset: What `sweep` returned, or any part of it.
+        path: Folder to make.
+        overwrite: Replace a store that is there.
+
+    Raises:
+        FileExistsError, FileNotFoundError, PermissionError: As `check_output`.
+    """
+    from zarr.codecs import Crc32cCodec, ZstdCodec  # here, as importing vijax must not load it
+
+    target = check_output("path", path, overwrite)
+    compressors = (ZstdCodec(level=3), Crc32cCodec())
+    encoding = {name: {"compressors": compressors} for name in dataset.variables}
+    with replacing(target) as part:
+        dataset.to_zarr(part, mode="w-", zarr_format=3, consolidated=False, encoding=encoding)
+
+
+def load(path: str | Path) -> "xr.Dataset":
+    """The map that `save` wrote, equal to the one that was saved.
+
+    Raises:
+        FileNotFoundError: If there is no store.
+        ValueError: If a checksum does not match.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    if not (Path(path) / "zarr.json").is_file():
+        raise FileNotFoundError(f"path must name a zarr store written by vijax.save; got {path}")
+    with xr.open_zarr(path, consolidated=False, chunks=None) as dataset:
+        return dataset.load()
