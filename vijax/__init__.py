@@ -11,6 +11,7 @@ from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
 from vijax.model import Harvester, Impact, ImpactPair, State, Status, impact_pair
 from vijax.simulate import summarise
+from vijax.trajectory import trajectory
 
 __all__ = [
     "Harvester",
@@ -24,4 +25,5 @@ __all__ = [
     "save",
     "summarise",
     "sweep",
+    "trajectory",
 ]

@@ -332,10 +332,17 @@ _STICK_SHARE = 1e-3  # the rest of the chatter must last less than this share of
 
 
 def _soft_contact(
-    pair: ImpactPair, side: Scalar, t: Scalar, w0: Scalar, z0: Scalar, wanted: Flag, deep: bool, patience: int | Array
+    pair: ImpactPair,
+    wall: Membrane,
+    side: Scalar,
+    t: Scalar,
+    w0: Scalar,
+    z0: Scalar,
+    wanted: Flag,
+    deep: bool,
+    patience: int | Array,
 ):
     """Duration (inf: for ever), outward speed -w' at the exit, and largest penetration of a contact."""
-    wall = flow.membrane(pair)
     force = flow.contact_force(pair.gamma, side, t)
     args = (wall, force, w0, z0)
     frozen = lax.stop_gradient(args)
@@ -383,7 +390,13 @@ def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, hel
 
 
 def step(
-    pair: ImpactPair, state: State, horizon: Scalar, *, deep: bool = True, patience: int | Array = PATIENCE
+    pair: ImpactPair,
+    state: State,
+    horizon: Scalar,
+    *,
+    deep: bool = True,
+    patience: int | Array = PATIENCE,
+    rolled: bool = False,
 ) -> Outcome:
     """Fly to the next wall, go through the contact there, and leave it: one impact.
 
@@ -393,6 +406,7 @@ def step(
         horizon: Time beyond which no onset is looked for.
         deep: Whether to look for the greatest depth (and the work); NaN else.
         patience: Stages that a contact may take to be decided; if they do not do, its `stay` or depth is NaN.
+        rolled: For programs that are differentiated; see `flow.Membrane`.
 
     Differentiable in pair and state, forward and reverse, to any order: event times by the implicit function.
     """
@@ -414,7 +428,9 @@ def step(
         work = energy.membrane_work_rigid(v_in, pair.r)
     else:
         w0 = jnp.where(held, side * state.u - 0.5 * pair.d, 0.0)
-        stay, out, depth = _soft_contact(pair, side, t, w0, side * v_in, meets, deep, patience)
+        stay, out, depth = _soft_contact(
+            pair, flow.membrane(pair, rolled=rolled), side, t, w0, side * v_in, meets, deep, patience
+        )
         stuck = jnp.zeros_like(held)
         ends = jnp.isfinite(stay)
         work = energy.membrane_work(

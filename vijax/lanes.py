@@ -24,8 +24,9 @@ _SHARE = 16  # a refill waits until one lane in so many is free
 _CPU_OPTIONS = {
     # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
     "xla_cpu_prefer_vector_width": 512,
-    # Keeps `lax.optimization_barrier` until fusion, so that a shared value is computed once (see quick.share).
-    "xla_disable_hlo_passes": "cse_barrier_expander",
+    # Keeps `lax.optimization_barrier` until fusion, so that a shared value is computed once (see flow.share). The second
+    # pass hands loops of a few bytes to an emitter that does not know the barrier, and crashes.
+    "xla_disable_hlo_passes": "cse_barrier_expander,small-while-loop-hoisting",
 }
 
 
@@ -67,7 +68,9 @@ class _Queue(NamedTuple):
     results: Float[Array, "cell out"]
 
 
-def _first(mask: Bool[Array, "lane"], width: int) -> tuple[Int[Array, "width"], Int[Array, "lane"], Bool[Array, "lane"]]:
+def _first(
+    mask: Bool[Array, "lane"], width: int
+) -> tuple[Int[Array, "width"], Int[Array, "lane"], Bool[Array, "lane"]]:
     """The first `width` lanes of a mask, each lane's place among them, and which lanes are among them.
 
     By rank and binary search: gathers run at memory speed on every backend, scatters do not.

@@ -123,6 +123,7 @@ class Candidate(eqx.Module):
     left: Lane  # impacts still to come in this round, or that a round will have
     length: Lane  # impacts of a round
     period: Lane
+    prime: Lane  # smallest recurrence seen on this round: a flip's slow decay recurs sooner after two turns than one
     base: Lanes
     moved: Lane
     last: Lane
@@ -178,12 +179,17 @@ def _candidate(like: Lane, ball: Lanes) -> Candidate:
     zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
     inf = jnp.full_like(like, jnp.inf)
     tolerance = jnp.full_like(like, _recurrence(like.dtype))
-    return Candidate(zero, zero, inf, zero, zero, tolerance, no, no, zero, zero, zero, ball, zero, inf, zero)
+    return Candidate(zero, zero, inf, zero, zero, tolerance, no, no, zero, zero, zero, zero, ball, zero, inf, zero)
 
 
 def _recurrence(dtype) -> float:
     """How closely an impact must recur to start a Newton round: 1e-6 in float64."""
     return 1e-6 if dtype == jnp.float64 else 3e-3
+
+
+def _settled(dtype) -> float:
+    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64."""
+    return 1e4 * float(jnp.finfo(dtype).eps)
 
 
 def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell:
@@ -243,9 +249,7 @@ def _batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
 
 def _quick_trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     active = cell.running & ~cell.declined
-    hit, sure, never = quick.quick_step(
-        cell.wall, cell.pair.gamma, cell.ball, deep=plan.deep, tangent=plan.tangent
-    )
+    hit, sure, never = quick.quick_step(cell.wall, cell.pair.gamma, cell.ball, deep=plan.deep, tangent=plan.tangent)
     free = active & (cell.held == 0)
     no = jnp.zeros_like(active)
     event = _Event(hit, free & sure, free & never, no, no)
@@ -314,7 +318,7 @@ def _fold(plan: Plan, settings: Settings, cell: Cell, event: _Event) -> Cell:
     status = jnp.where(event.quiet, Status.NO_IMPACT, cell.status)
     status = jnp.where(event.permanent, Status.PERMANENT_CONTACT, status).astype(cell.status.dtype)
     counted = kept & (tracing | (hit.onset_n >= cell.since))
-    count = cell.count + kept
+    count = cell.count + kept.astype(cell.count.dtype)
     spent = count > _BUDGET * (_window_end(plan, settings) + 1)
     broken = event.real & ~jnp.isfinite(hit.v_out + hit.after.t)
     status = jnp.where(spent, Status.EVENT_BUDGET, jnp.where(broken, Status.NONFINITE, status))
@@ -384,8 +388,8 @@ def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, traci
         square = jnp.where(turned, old.energy_square + old.energy * old.energy, old.energy_square)
         gain = jnp.where(turned, 0.0, old.energy) + jnp.where(wide, got, 0.0)
     return Tally(
-        left=old.left + left,
-        right=old.right + right,
+        left=old.left + left.astype(speed.dtype),
+        right=old.right + right.astype(speed.dtype),
         rebound_left=old.rebound_left + jnp.where(left, rebound, 0.0),
         rebound_right=old.rebound_right + jnp.where(right, rebound, 0.0),
         contact=old.contact + jnp.where(counted, hit.duration, 0.0),
@@ -409,8 +413,13 @@ def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
     near = (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < c.tolerance) & (period >= 1)
     found = kept & ~c.tracing & near & (period <= MAX_PERIOD)
     fresh = kept & ~c.tracing & ~found & (count >= c.next_anchor)
-    left = c.left - (kept & c.tracing)
+    left = c.left - (kept & c.tracing).astype(c.left.dtype)
     finished = kept & c.tracing & (left <= 0)
+    # On a round the anchor is the round's first impact.
+    opening = kept & c.tracing & (c.left == c.length)
+    again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
+    again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < 1e-2 * _recurrence(lag.dtype))
+    fresh = fresh | opening
     return (
         Candidate(
             anchor_t=jnp.where(fresh, hit.onset_t, c.anchor_t),
@@ -424,6 +433,7 @@ def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
             left=left,
             length=jnp.where(found, count - c.anchor_count, c.length),
             period=jnp.where(found, period, c.period),
+            prime=jnp.where(again, period, c.prime),
             base=c.base,
             moved=c.moved,
             last=c.last,
@@ -446,8 +456,8 @@ def _review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     start = stopped & c.found & ~failed
     judged = stopped & c.tracing & (c.left <= 0) & ~failed
     size, nudge_u, nudge_v, largest = _newton(plan, cell)
-    eps = float(jnp.finfo(size.dtype).eps)
-    settled = (size < 1e4 * eps) | ((size < 1e7 * eps) & (size > 0.25 * c.last))
+    close = _settled(size.dtype)
+    settled = (size < close) | ((size < 1e3 * close) & (size > 0.25 * c.last))
     good = judged & settled & (largest < 1 + 1e-6)
     # Where a bounded, contracting Newton step leads nowhere near, the recurrence was a coincidence.
     bad = judged & ~good & (settled | ~(size + c.moved < 1e3 * _recurrence(size.dtype)) | (c.rounds >= _ROUNDS))
@@ -455,9 +465,7 @@ def _review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     cell = _begin_round(plan, cell, start | again, start, nudge_u, nudge_v, size)
     cell = _back_to_search(plan, cell, bad)
     done = cell.done | (stopped & ~start & ~again & ~bad)
-    return eqx.tree_at(
-        lambda x: (x.done, x.multiplier), cell, (done, jnp.where(good, largest, cell.multiplier))
-    )
+    return eqx.tree_at(lambda x: (x.done, x.multiplier), cell, (done, jnp.where(good, largest, cell.multiplier)))
 
 
 def _newton(plan: Plan, cell: Cell):
@@ -501,6 +509,7 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
         left=jnp.where(begin, c.length, c.left),
         length=c.length,
         period=c.period,
+        prime=jnp.where(begin, c.period, c.prime),
         base=base,
         moved=jnp.where(begin, jnp.where(first, 0.0, c.moved + size), c.moved),
         last=jnp.where(begin, jnp.where(first, jnp.inf, size), c.last),
@@ -566,7 +575,8 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
     silent = ~periodic & ~failed & ~permanent & ((hits == 0) | (quiet if attractor else False))
     still = silent | permanent
     status = jnp.where(silent, Status.NO_IMPACT, jnp.where(permanent | failed, cell.status, Status.OK))
-    period = jnp.where(periodic, span, -1.0)
+    prime = cell.candidate.prime if attractor else span
+    period = jnp.where(periodic, prime, -1.0)
     lyapunov = None
     if plan.tangent:
         size = sum(jnp.abs(x) for x in cell.tangent)
@@ -575,7 +585,7 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
         lyapunov = jnp.where(periodic, jnp.log(cell.multiplier) / span, growth / window)
         lyapunov = jnp.where(still | failed, jnp.nan, lyapunov)
         if attractor:
-            period = jnp.where(periodic, span, jnp.where(chaotic, 0.0, -1.0))
+            period = jnp.where(periodic, prime, jnp.where(chaotic, 0.0, -1.0))
             status = jnp.where(~periodic & ~chaotic & ~still & ~failed, Status.SLOW, status)
     if attractor:
         period = jnp.where(still, 1.0, jnp.where(failed, -1.0, period))
@@ -603,8 +613,8 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
         deepest=jnp.where(failed, jnp.nan, jnp.where(silent, 0.0, t.deepest)) if plan.deep else None,
         fastest=measured(t.fastest),
         period=period,
-        impacts_left=jnp.where(labelled, jnp.where(still, 0.0, t.left), -1.0),
-        impacts_right=jnp.where(labelled, jnp.where(still, 0.0, t.right), -1.0),
+        impacts_left=jnp.where(labelled, jnp.where(still, 0.0, jnp.round(t.left * prime / span)), -1.0),
+        impacts_right=jnp.where(labelled, jnp.where(still, 0.0, jnp.round(t.right * prime / span)), -1.0),
         impacts_per_period=measured(hits / span),
         restitution=per(t.rebound_left + t.rebound_right, hits),
         restitution_left=per(t.rebound_left, t.left),
@@ -641,7 +651,9 @@ def _declined(cell: Cell) -> Mask:
 
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
     # With gravity the quick step does not apply: every lane waits for the careful one.
-    trip = partial(_quick_trip, plan, settings) if plan.level else lambda cell: eqx.tree_at(_declined, cell, cell.running)
+    trip = (
+        partial(_quick_trip, plan, settings) if plan.level else lambda cell: eqx.tree_at(_declined, cell, cell.running)
+    )
     return lanes.Program(
         load=partial(_load, plan, settings),
         trip=trip,
@@ -714,6 +726,17 @@ def _compiled(plan: Plan, width: int):
 def _width(cells: int) -> int:
     """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill."""
     return max(min(cells // 8, 2048), 128)
+
+
+def tolerances(dtype: str) -> dict[str, float]:
+    """The tolerances that a run in the given precision uses, by name."""
+    kind = jnp.dtype(dtype)
+    return {
+        "recurrence": _recurrence(kind),
+        "orbit": _settled(kind),
+        "stick_speed": exact.stick_speed(kind),
+        "max_period": float(MAX_PERIOD),
+    }
 
 
 def summarise(

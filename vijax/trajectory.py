@@ -1,0 +1,149 @@
+"""The motion of single starts, impact by impact: recorded, sampled at phase 0, and differentiable in both directions."""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vijax import exact, flow, lanes
+from vijax.model import Impact, ImpactPair, State, Status, check
+
+
+class Trajectory(eqx.Module):
+    """Impacts and stroboscopic states of one start, or of many along leading axes.
+
+    Attributes:
+        impacts: `Impact` records along the last axis, in order; NaN (side 0) beyond `filled`.
+        filled: How many impacts there are.
+        states: The ball at phase 0 of periods 1 ... periods, along the last axis; NaN where `impacts` was too short.
+        status: OK, NO_IMPACT, PERMANENT_CONTACT, or EVENT_BUDGET where `max_impacts` came before the last period.
+    """
+
+    impacts: Impact
+    filled: Int[Array, "..."]
+    states: State
+    status: Int[Array, "..."]
+
+
+def _begin(pair: ImpactPair, u0, v0, t0) -> State:
+    """The start with its mode: in a soft wall the contact; on a wall by the velocity, at rest by the acceleration."""
+    t, n = flow.wrap_phase(t0)
+    side = jnp.where(u0 > 0, 1.0, -1.0)
+    gap = 0.5 * pair.d - side * u0
+    push = side * flow.acceleration(pair.gamma, t)
+    resting = (gap == 0) & (v0 == 0) & (push > 0)
+    held = resting if pair.kappa is None else (gap < 0) | resting | ((gap == 0) & (side * v0 > 0))
+    return State(u0, v0, t, n.astype(jnp.int32), jnp.where(held, side, 0.0).astype(jnp.int32))
+
+
+def _at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Array, ""]) -> tuple:
+    """Displacement, velocity and mode at a time `when` after the start of a step."""
+    aloft = (when <= out.flight) | out.quiet
+    rise, v = flow.flight(pair.gamma, start.t, start.v, jnp.where(aloft, when, 0.0))
+    held = start.mode != 0
+    side = jnp.where(held, start.mode, out.impact.side).astype(rise.dtype)
+    inside = jnp.where(aloft, 0.0, when - out.flight)
+    if pair.kappa is None:
+        # Only sticking lasts: at rest on the wall.
+        w, z = jnp.zeros_like(rise), jnp.zeros_like(rise)
+    else:
+        force = flow.contact_force(pair.gamma, side, out.impact.t)
+        w0 = jnp.where(held, side * start.u - 0.5 * pair.d, 0.0)
+        w, z = flow.oscillate(flow.membrane(pair, rolled=True), force, w0, side * out.impact.v_in, inside)
+    u = jnp.where(aloft, start.u + rise, side * (0.5 * pair.d + w))
+    return u, jnp.where(aloft, v, side * z), jnp.where(aloft, 0, side.astype(jnp.int32))
+
+
+def _one(periods: int, max_impacts: int, pair: ImpactPair, u0, v0, t0) -> Trajectory:
+    start = _begin(pair, u0, v0, t0)
+
+    def advance(carry, _):
+        state, over = carry
+        horizon = jnp.where(over, 0.0, 2.0 * (periods - state.n) - state.t)
+        out = exact.step(pair, state, horizon, rolled=True)
+        ends = over | out.quiet | out.permanent | (horizon <= 0)
+        after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
+        return (after, ends), (state, out, over)
+
+    # One step more than impacts: the flight or contact in which the last period ends.
+    steps = max_impacts + 1
+    (_, _), (begun, out, idle) = lax.scan(advance, (start, jnp.asarray(False)), None, length=steps)
+    real = ~idle & (out.impact.side != 0)
+    real = real & (jnp.cumsum(real) <= max_impacts) & (out.impact.n < periods)
+    order = jnp.argsort(~real, stable=True)[:max_impacts]
+    filled = real.sum(dtype=jnp.int32)
+    there = jnp.arange(max_impacts) < filled
+
+    def keep(leaf):
+        blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
+        return jnp.where(there, leaf[order], blank)
+
+    clock = jnp.where(idle, jnp.inf, 2.0 * begun.n + begun.t)
+    ended = out.quiet | out.permanent
+    until = jnp.where(idle | ended, jnp.inf, 2.0 * out.state.n + out.state.t)
+
+    def strobe(k):
+        index = jnp.clip(jnp.searchsorted(clock, 2.0 * k, side="right") - 1, 0, steps - 1)
+        first, happened = jax.tree.map(lambda leaf: leaf[index], (begun, out))
+        known = 2.0 * k <= until[index]
+        when = jnp.where(known, 2.0 * (k - first.n) - first.t, 0.0)
+        u, v, mode = _at(pair, first, happened, when)
+        blank = jnp.where(known, 0.0, jnp.nan)
+        return State(u + blank, v + blank, jnp.zeros_like(u), k, mode)
+
+    states = jax.vmap(strobe)(jnp.arange(1, periods + 1, dtype=jnp.int32))
+    permanent = (out.permanent & ~idle).any()
+    short = ~(ended & ~idle).any() & (until[-1] < 2.0 * periods)
+    status = jnp.where(permanent, Status.PERMANENT_CONTACT, jnp.where(filled == 0, Status.NO_IMPACT, Status.OK))
+    status = jnp.where(short, Status.EVENT_BUDGET, status).astype(jnp.int32)
+    return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
+
+
+@lru_cache(maxsize=32)
+def _compiled(periods: int, max_impacts: int, axes: int) -> Callable[..., Trajectory]:
+    run = partial(_one, periods, max_impacts)
+    for _ in range(axes):
+        run = jax.vmap(run)
+    return jax.jit(run)
+
+
+def trajectory(
+    pair: ImpactPair,
+    u0: Float[Array, "..."] | float,
+    v0: Float[Array, "..."] | float,
+    periods: int,
+    t0: Float[Array, "..."] | float = 0.0,
+    *,
+    max_impacts: int | None = None,
+) -> Trajectory:
+    """Follow one start, or an array of starts, for a number of forcing periods.
+
+    Args:
+        pair: One cell, or arrays that broadcast against the starts.
+        u0, v0: Displacement and velocity at time t0.
+        periods: The motion is followed to t = 2 periods.
+        t0: Time of the start, in [0, 2 periods).
+        max_impacts: Room for impacts; 16 a period and 16 more unless given.
+
+    Returns:
+        The `Trajectory`. Differentiable in pair and start to any order, forward and reverse: a scan of bounded length.
+
+    Raises:
+        ValueError: periods or max_impacts below 1, an inadmissible pair or start.
+    """
+    room = 16 * periods + 16 if max_impacts is None else max_impacts
+    for name, value in (("periods", periods), ("max_impacts", room)):
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1; got {value}")
+    for name in ("d", "r", "gamma") + (() if pair.kappa is None else ("kappa",)):
+        check(name, getattr(pair, name))
+    dtype = jnp.result_type(pair.d)
+    numbers = [jnp.asarray(x, dtype) for x in (u0, v0, t0)]
+    shape = jnp.broadcast_shapes(*(x.shape for x in numbers), *(jnp.shape(x) for x in jax.tree.leaves(pair)))
+    pair = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), shape), pair)
+    u0, v0, t0 = (jnp.broadcast_to(x, shape) for x in numbers)
+    return _compiled(periods, room, len(shape))(pair, u0, v0, t0)
