@@ -152,11 +152,17 @@ def _envelope_end(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -
 
 
 def first_return(
-    m: Membrane, force: Force, w0: Scalar, z0: Scalar, wanted: Flag, patience: int | Array = PATIENCE
+    m: Membrane,
+    force: Force,
+    w0: Scalar,
+    z0: Scalar,
+    wanted: Flag,
+    patience: int | Array = PATIENCE,
+    limit: Scalar | float = math.inf,
 ) -> Scalar:
-    """First s > 0 with w(s) = 0 of the forced oscillator that starts at w0 >= 0 moving up or held up; inf if never.
+    """First s in (0, limit) with w(s) = 0 of the forced oscillator that starts at w0 >= 0, moving up or held up.
 
-    NaN if `patience` stages do not decide it.
+    inf if there is none; NaN if `patience` stages do not decide it.
 
     Write e^(zeta s) w = phi q with phi the free solution through the present state. While the forcing is positive q only
     grows: no zero before phi's own. While it is negative q only falls: at most one zero before phi's, and certainly
@@ -164,41 +170,43 @@ def first_return(
     oscillation has decayed, the steady response carries many free half cycles at once.
     """
     steady = flow.steady_response(m, force)
-    eps = jnp.finfo(w0.dtype).eps
 
     def advance(search: _Search) -> _Search:
         s, spell = search.s, search.spell
         free = s + _free_end(m, search.w, search.z)
         envelope = _envelope_end(m, steady, search.w, search.z, s)
-        ahead = jnp.minimum(free, spell.end)
-        leap = envelope > ahead
-        ahead = flow.share(jnp.where(leap, envelope, ahead))
+        stretch = jnp.minimum(free, spell.end)
+        leap = envelope > stretch
+        ahead = jnp.minimum(jnp.where(leap, envelope, stretch), limit)
+        ahead, free, leap = flow.share((ahead, free, leap))
         never = ~jnp.isfinite(ahead)
-        at = jnp.where(never, s, ahead)
-        w, z = flow.oscillate(m, force, w0, z0, at)
+        w, z = flow.oscillate(m, force, w0, z0, jnp.where(never, s, ahead))
         falling = ~spell.positive & ~leap
-        bracketed = falling & ((free <= spell.end) | (w <= 0))
+        # A free half cycle under negative forcing ends below zero, whatever rounding says.
+        bracketed = falling & ((w <= 0) | ((free <= spell.end) & (ahead < limit)))
         # The stages approach a root under positive forcing quadratically, from below.
-        arrived = ~falling & ((w <= 0) | (ahead - s <= _ARRIVED * ahead))
+        arrived = ~falling & ((w <= 0) | (ahead - s <= _ARRIVED * ahead)) & (ahead < limit)
         last = jnp.where((w > 0) & (z < 0), -w / jnp.where(z < 0, z, -1.0), 0.0)
         ahead = jnp.where(arrived, ahead + jnp.minimum(last, ahead - s), ahead)
-        running = ~(bracketed | arrived | never)
+        never = never | (~bracketed & ~arrived & (ahead >= limit))
+        bracketed, arrived, never, ahead = flow.share((bracketed, arrived, never, ahead))
         return _Search(
-            s=jnp.where(bracketed, s, ahead),
+            s=jnp.where(bracketed, s, jnp.where(never, jnp.inf, ahead)),
             w=jnp.where(bracketed, search.w, w),
             z=jnp.where(bracketed, search.z, z),
             high=jnp.where(bracketed, ahead, search.high),
-            spell=_spell(force, at),
-            running=running,
+            spell=flow.share(_spell(force, ahead)),
+            running=~(bracketed | arrived | never),
             bracketed=bracketed,
             stage=search.stage + 1,
         )
 
-    zero = jnp.zeros_like(w0)
-    no = jnp.zeros_like(wanted)
+    zero, no = jnp.zeros_like(w0), jnp.zeros_like(wanted)
     start = _Search(zero, w0, z0, zero, _spell(force, zero), wanted, no, jnp.int32(0))
     found = lax.while_loop(lambda search: search.running & (search.stage < patience), advance, start)
-    guess = jnp.where(found.s == 0, -2 * z0 / jnp.minimum(force.at(zero) - m.mu * z0, -jnp.finfo(w0.dtype).tiny), zero)
+    # From rest on the wall against a negative push the contact is a parabola of length 2 z0/|push|.
+    push = jnp.minimum(force.at(zero) - m.mu * z0, -jnp.finfo(w0.dtype).tiny)
+    guess = jnp.where(found.s == 0, -2 * z0 / push, zero)
     exact = bracketed_root(
         lambda s: flow.oscillate(m, force, w0, z0, s), found.s, found.high, guess, wanted & found.bracketed
     )
@@ -230,7 +238,7 @@ def deepest_time(
         jerk = slope.later(s)
         jerk = Force(sign * jerk.c, sign * jerk.q, sign * jerk.g)
         z = jnp.where(s == 0, z, 0.0)  # at an extremum w' is zero, not its rounding error
-        ahead = s + first_return(m, jerk, sign * z, sign * rate, going, patience)
+        ahead = s + first_return(m, jerk, sign * z, sign * rate, going, patience, end - s)
         going = going & (ahead < end)
         return cycle + 1, jnp.where(going, ahead, s), -sign, best, best_w, going
 

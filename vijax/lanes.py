@@ -114,16 +114,16 @@ def run(
     def serve(cell, carry):
         """Serve the easy lanes first; the hard ones, each of which may hold up a whole batch, in batches of their own."""
         declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
-        easy = (declined & ~hard).any()
+        easy = (declined & ~hard).sum() >= jnp.minimum((declined & hard).sum(), width)
         members, place, chosen = _first(declined & (hard != easy), width)
         patience = jnp.where(easy, FIRST_PATIENCE, LAST_PATIENCE)
         return _put(carry, program.careful(_take(carry, members), patience), place, chosen)
 
     def to_serve(cell, carry):
-        """Whether easy lanes wait, or a batch of hard ones, or every lane that is at work."""
+        """Whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
         declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
-        many = (declined & hard).sum() >= min(width, 64)
-        return (declined & ~hard).any() | many | (declined.any() & ((cell < 0) | declined).all())
+        full = ((declined & ~hard).sum() >= width) | ((declined & hard).sum() >= width)
+        return full | (declined.any() & (declined.sum() >= able(carry)))
 
     def refill(queue: _Queue) -> _Queue:
         members, place, chosen = _first(program.done(queue.carry) & (queue.cell >= 0), width)

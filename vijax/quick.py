@@ -5,6 +5,7 @@ whose impact is not certified to be the first and converged to rounding is decli
 """
 
 import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,9 @@ from vijax.model import ImpactPair
 
 Lane = Float[Array, "lane"]
 
-_FLIGHT_TRIPS = 3
+_FLIGHT_TRIPS = 4
 _CONTACT_TRIPS = 2
+_CREST_TRIPS = 2
 _REACH = 1.65  # of sine and cosine below, in radians
 _EXP_REACH = 2.4
 _DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
@@ -463,12 +465,15 @@ def _deepest(
 
     free = share(_at_reference(wall, far))
     s = jnp.where(short, rise - wall.crest, _householder(free.rate, free.push, free.jerk, snap(free)))
-    reached = _in_reach(wall, s)
-    at = share(_motion(wall, far, jnp.where(reached, s, 0.0)))
-    fourth = snap(at)
-    step = _householder(at.rate, at.push, at.jerk, fourth)
+    reached = jnp.ones_like(short)
+    for _ in range(_CREST_TRIPS):
+        reached = reached & _in_reach(wall, s)
+        at = share(_motion(wall, far, jnp.where(reached, s, 0.0)))
+        fourth = snap(at)
+        step = _householder(at.rate, at.push, at.jerk, fourth)
+        s, step, fourth, reached = share((s + step, step, fourth, reached))
     depth = at.w + step * (at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth)))
-    when = wall.crest + s + step
+    when = wall.crest + s
     way = duration - when
     # The depth is stationary, and its Taylor polynomial of fifth order: a coarser time than the exit's will do.
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax import energy, exact, flow, lanes, quick
-from vijax.model import Harvester, Impact, ImpactPair, State, Status
+from vijax.model import Harvester, ImpactPair, State, Status
 from vijax.quick import Hit, Lanes, Wall
 
 Lane = Float[Array, "lane"]

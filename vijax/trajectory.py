@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import exact, flow, lanes
+from vijax import exact, flow
 from vijax.model import Impact, ImpactPair, State, Status, check
 
 

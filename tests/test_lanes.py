@@ -1,0 +1,159 @@
+"""Lanes on a toy program: every cell ends as a plain loop over it says, whatever it shares the lanes with."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Bool, Float
+
+from vijax import lanes
+
+Lane = Float[Array, "lane"]
+
+EASY, DECLINES, HARD = 0, 1, 2
+OUTPUTS = 3
+
+
+class Toy(NamedTuple):
+    """A countdown that hashes its way down; rows are (name, start, kind, rounds)."""
+
+    name: Lane
+    start: Lane
+    kind: Lane
+    rounds: Lane
+    left: Lane
+    hash: Lane
+    careful: Lane
+    declined: Bool[Array, "lane"]
+    hard: Bool[Array, "lane"]
+    done: Bool[Array, "lane"]
+
+
+def load(rows):
+    name, start, kind, rounds = rows.T
+    zero, no = jnp.zeros_like(name), jnp.zeros(name.shape, bool)
+    return Toy(name, start, kind, rounds, start, name, zero, no, no, no)
+
+
+def wants_care(left, kind):
+    """The same expression serves the lanes and the plain loop."""
+    return ((kind == DECLINES) & (left % 3 == 0)) | ((kind == HARD) & (left % 5 == 0))
+
+
+def trip(toy):
+    active = (toy.left > 0) & ~toy.declined & ~toy.done
+    asks = active & wants_care(toy.left, toy.kind)
+    moves = active & ~asks
+    return toy._replace(
+        hash=jnp.where(moves, (3 * toy.hash + toy.left) % 1009, toy.hash),
+        left=toy.left - moves.astype(toy.left.dtype),
+        declined=toy.declined | asks,
+    )
+
+
+def careful(toy, patience):
+    hard = (toy.kind == HARD) & (patience < lanes.LAST_PATIENCE)
+    moves = ~hard
+    return toy._replace(
+        hash=jnp.where(moves, (5 * toy.hash + toy.left) % 1009, toy.hash),
+        left=toy.left - moves.astype(toy.left.dtype),
+        careful=toy.careful + moves.astype(toy.left.dtype),
+        declined=hard,
+        hard=hard,
+    )
+
+
+def review(toy):
+    ended = (toy.left <= 0) & ~toy.done
+    again = ended & (toy.rounds > 1)
+    return toy._replace(
+        left=jnp.where(again, toy.start, toy.left),
+        rounds=toy.rounds - ended.astype(toy.rounds.dtype),
+        done=toy.done | (ended & ~again),
+    )
+
+
+PROGRAM = lanes.Program(
+    load=load,
+    trip=trip,
+    careful=careful,
+    review=review,
+    declined=lambda toy: toy.declined,
+    stopped=lambda toy: toy.left <= 0,
+    hard=lambda toy: toy.hard,
+    done=lambda toy: toy.done,
+    unload=lambda toy: jnp.stack([toy.name, toy.hash, toy.careful], axis=1),
+)
+
+
+def plain(row):
+    """What becomes of one cell, in a loop of its own."""
+    name, start, kind, rounds = (int(x) for x in row)
+    digest, served = name, 0
+    for _ in range(max(rounds, 1)):
+        for left in range(start, 0, -1):
+            asked = bool(wants_care(left, kind))
+            digest = ((5 if asked else 3) * digest + left) % 1009
+            served += asked
+    return [name, digest, served]
+
+
+def draw(number, kinds):
+    rng = np.random.default_rng(7)
+    lengths = np.where(rng.random(number) < 0.05, rng.integers(200, 400, number), rng.integers(0, 40, number))
+    return np.stack([1 + np.arange(number), lengths, rng.choice(kinds, number), rng.integers(1, 4, number)], 1) * 1.0
+
+
+@partial(jax.jit, static_argnames="width")
+def run(cells, count, width):
+    return lanes.run(PROGRAM, cells, count, OUTPUTS, width)
+
+
+def results(cells, width, count=None):
+    return np.asarray(run(jnp.asarray(cells), jnp.asarray(len(cells) if count is None else count, jnp.int32), width))
+
+
+@pytest.mark.parametrize(
+    "kinds", [[EASY], [EASY, DECLINES], [HARD], [EASY, EASY, DECLINES, HARD]], ids=["easy", "declining", "hard", "mixed"]
+)
+def test_every_cell_ends_as_in_a_plain_loop_of_its_own(kinds):
+    cells = draw(1500, kinds)
+    assert np.array_equal(results(cells, width=256), [plain(row) for row in cells])
+
+
+@pytest.mark.parametrize("width", [1, 7, 128, 200, 1024])
+def test_results_do_not_depend_on_the_number_of_lanes(width):
+    cells = draw(600, [EASY, DECLINES, HARD])
+    assert np.array_equal(results(cells, width), [plain(row) for row in cells])
+
+
+@pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 599, 600])
+def test_only_the_first_count_cells_run_and_the_rest_stays_zero(count):
+    cells = draw(600, [EASY, DECLINES, HARD])
+    expected = np.zeros((600, OUTPUTS))
+    expected[:count] = np.reshape([plain(row) for row in cells[:count]], (count, OUTPUTS))
+    assert np.array_equal(results(cells, width=128, count=count), expected)
+
+
+def test_padding_is_never_looked_at():
+    cells = draw(600, [EASY, DECLINES])
+    padded = cells.copy()
+    padded[77:] = np.nan  # a countdown of NaN never ends
+    assert np.array_equal(results(padded, width=128, count=77)[:77], results(cells, width=128)[:77])
+
+
+def test_a_cell_ends_alike_wherever_it_stands_in_the_table():
+    cells = draw(600, [EASY, DECLINES, HARD])
+    order = np.random.default_rng(1).permutation(600)
+    assert np.array_equal(results(cells[order], width=128), results(cells, width=128)[order])
+
+
+def test_a_new_number_of_real_cells_compiles_nothing():
+    cells = draw(600, [EASY])
+    results(cells, width=128)
+    before = run._cache_size()
+    results(cells, width=128, count=5)
+    assert run._cache_size() == before
