@@ -148,6 +148,9 @@ def audit_flights(pair: ImpactPair, ran: March, samples: int = 400) -> np.ndarra
     return np.concatenate(worst)
 
 
+_WIDTHS = (256, 4096, 65536, 262144)  # samples of a contact: 40 a half cycle of the faster oscillation, as far as that goes
+
+
 def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
     """How far w was below zero before the reported end of each contact, over the scale of w (negative: never)."""
     held = ((ran.out.impact.side != 0) | (ran.before.mode != 0)) & ~np.isnan(ran.out.stay)
@@ -163,15 +166,12 @@ def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
     zeta = -np.log(r) / np.hypot(np.pi, np.log(r)) * kappa
     need = np.where(zeta * length > 60, 40 * (60 / zeta * kappa + 40 * length) / np.pi, need)
     worst = np.empty(len(d))
-    for low, high in ((0, 256), (256, 4096), (4096, 65536), (65536, np.inf)):
+    for low, high in zip((0, *_WIDTHS[:-1]), (*_WIDTHS[:-1], np.inf), strict=True):
         chosen = np.nonzero((need >= low) & (need < high))[0]
-        width = max(int(min(high, 262144)) // 8, 16) if high < np.inf else 1
-        for first in range(0, len(chosen), max(1, 2**21 // int(min(high, 262144)))):
-            k = chosen[first : first + max(1, 2**21 // int(min(high, 262144)))]
-            del width
-            width = 0
-            grid = np.linspace(0, 1, int(min(high, 262144)))[1:]
-            s = length[k, None] * grid
+        width = int(min(high, _WIDTHS[-1]))
+        for first in range(0, len(chosen), 2**19 // width):
+            k = chosen[first : first + 2**19 // width]
+            s = length[k, None] * np.linspace(0, 1, width)[1:]
             w, _ = long_contact(*(x[k, None] for x in (kappa, r, gamma, side, t, w0, z0)), s)
             scale = np.abs(w).max(axis=-1)
             worst[k] = (_peak(-w) / np.where(scale > 0, scale, 1)).astype(float)

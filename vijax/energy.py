@@ -7,7 +7,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vijax.flow import half_turn
+from vijax.flow import half_turn, once
 from vijax.model import Harvester
 
 PI = math.pi
@@ -47,6 +47,7 @@ def capacitance(device: Harvester, depth: Values) -> Values:
     return _rest_capacitance(device) * (1 + stretch(device, depth)) ** 2
 
 
+@once
 def harvested_energy(device: Harvester, depth: Values) -> Values:
     """Energy E_j [J] harvested from an impact whose largest penetration is `depth` [m].
 
@@ -126,6 +127,7 @@ def _squared_speed_short(
     return half * total
 
 
+@once
 def membrane_work(
     kappa: Values,
     mu: Values,

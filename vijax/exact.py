@@ -1,7 +1,7 @@
 """Exact event-driven engine: next wall crossing, the contact or the reset there, and the state after it.
 
-The careful form: every search brackets the first root by a certificate before it iterates, so that no crossing, graze or
-early exit is missed in any regime. `quick.py` does the regular impacts faster and declines the others.
+The careful form: every search brackets the first root by a certificate before it iterates, so that no crossing, graze
+or early exit is missed in any regime. `quick.py` does the regular impacts faster and declines the others.
 """
 
 import math
@@ -32,7 +32,7 @@ def _snap(dtype: Any) -> float:
     return 16 * float(jnp.finfo(dtype).eps)
 
 
-# --- roots -----------------------------------------------------------------------------------------------------------
+# --- roots ----------------------------------------------------------------------------------------
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -100,6 +100,7 @@ def _half_width(force: Force) -> Scalar:
     return jnp.arccos(jnp.clip(level, -1.0, 1.0)) / PI
 
 
+@flow.once
 def _spell(force: Force, s: Scalar) -> Spell:
     """The sign of the forcing just after s, and the end of that stretch; an end within rounding of s counts as past."""
     half = _half_width(force)
@@ -115,7 +116,7 @@ def _spell(force: Force, s: Scalar) -> Spell:
     return Spell(positive, s + left)
 
 
-# --- the first return of a forced oscillator to zero -------------------------------------------------------------------
+# --- the first return of a forced oscillator to zero ----------------------------------------------
 
 
 class _Search(eqx.Module):
@@ -151,6 +152,7 @@ def _envelope_end(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -
     return jnp.where(jnp.isfinite(bound) & spell.positive, spell.end, s)
 
 
+@flow.once
 def first_return(
     m: Membrane,
     force: Force,
@@ -164,8 +166,8 @@ def first_return(
 
     inf if there is none; NaN if `patience` stages do not decide it.
 
-    Write e^(zeta s) w = phi q with phi the free solution through the present state. While the forcing is positive q only
-    grows: no zero before phi's own. While it is negative q only falls: at most one zero before phi's, and certainly
+    Write e^(zeta s) w = phi q with phi the free solution through the present state. While the forcing is positive q
+    only grows: no zero before phi's own. While it is negative q only falls: at most one zero before phi's, and certainly
     one by then. So stage by stage either a stretch is certified free of zeros or a bracket holds exactly one. Where the
     oscillation has decayed, the steady response carries many free half cycles at once.
     """
@@ -253,7 +255,7 @@ def deepest_time(
     return jnp.where(left, jnp.nan, jnp.where(known & (w > best_w), crest, best))
 
 
-# --- the next wall crossing of a flight ---------------------------------------------------------------------------------
+# --- the next wall crossing of a flight -----------------------------------------------------------
 
 
 class _Scan(eqx.Module):
@@ -273,7 +275,7 @@ def next_wall(
     """Time to the first wall crossing and its side (0: none before `horizon`).
 
     Between zeros of the acceleration (analytic) the velocity is monotone, so each velocity zero is bracketed; between
-    those the position is monotone, so each crossing is bracketed. `room` holds the distances to the left and right wall.
+    those the position is monotone, so each crossing is bracketed. `room` holds the room to the left and right wall.
     """
     force = flow.flight_force(gamma, t0)
 
@@ -316,7 +318,7 @@ def _beyond(gamma, room, t0, v0, heading, s):
     return jnp.where(past & (heading != 0), heading, 0.0)
 
 
-# --- one step -----------------------------------------------------------------------------------------------------------
+# --- one step -------------------------------------------------------------------------------------
 
 
 class Outcome(eqx.Module):
@@ -332,7 +334,7 @@ class Outcome(eqx.Module):
 
 
 def stick_speed(dtype: Any) -> float:
-    """Exit speed below which a chattering ball counts as stuck: 1e-9 in float64, scaled with the root of the precision."""
+    """Exit speed below which a chattering ball counts as stuck: 1e-9 in float64, else by the root of eps."""
     return 1e-9 * math.sqrt(jnp.finfo(dtype).eps / jnp.finfo(jnp.float64).eps)
 
 

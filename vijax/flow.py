@@ -7,6 +7,7 @@ exactly the digits that the naive forms lose.
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -14,6 +15,10 @@ from jaxtyping import Array, Float
 from vijax.model import ImpactPair
 
 PI = math.pi
+
+once = jax.jit
+"""Marks a building block that one program contains many times: tracing it once and reusing the trace cuts the time
+before a program compiles to a third. XLA sees through it."""
 
 share = lax.optimization_barrier
 """Store a value that several results need. XLA on CPU fuses one result at a time and would compute it again for each;
@@ -31,8 +36,8 @@ def _alternating(start: int, terms: int) -> tuple[float, ...]:
 class Membrane(eqx.Module):
     """What the contact closed form needs of a soft wall: natural frequency, decay rate, damped frequency (all > 0).
 
-    `rolled` keeps its Taylor series a loop: a program that is differentiated compiles in seconds instead of minutes; one
-    that is not runs three times faster unrolled.
+    `rolled` keeps its Taylor series a loop: a program that is differentiated compiles in seconds instead of minutes;
+    one that is not runs three times faster unrolled.
     """
 
     kappa: Scalar
@@ -69,7 +74,7 @@ class Force(eqx.Module):
 
 
 def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
-    """The soft wall of a pair, by the calibration of Eq. (19); omega1 from r, not from kappa^2 - zeta^2, which cancels."""
+    """The soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
     decrement = -jnp.log(pair.r)
     scale = pair.kappa / jnp.sqrt(PI**2 + decrement * decrement)
     return Membrane(pair.kappa, decrement * scale, PI * scale, rolled)
@@ -93,6 +98,7 @@ def horner(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Arr
     return total
 
 
+@once
 def half_turn(s: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
     """sin, cos, versine and lag of pi s: (sin, cos, 1 - cos, pi s - sin), each to full relative accuracy near s = 0.
 
@@ -127,6 +133,7 @@ def wrap_phase(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
     return t - 2 * periods, periods
 
 
+@once
 def flight(gamma: Scalar, t0: Scalar, v0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
     """Displacement from the start and velocity after flying for a time s from phase t0 at velocity v0.
 
@@ -166,6 +173,7 @@ def _contact_series(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar
     return start[0], start[1]
 
 
+@once
 def free_response(m: Membrane, s: Scalar) -> tuple[Scalar, Scalar]:
     """Impulse response h of the membrane and its derivative: h'' + mu h' + kappa^2 h = 0, h(0) = 0, h'(0) = 1.
 
@@ -220,6 +228,7 @@ def _contact_closed(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar
     return w, z
 
 
+@once
 def oscillate(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
     """(w, w') at time s of w'' + mu w' + kappa^2 w = force from (w0, z0) at s = 0.
 

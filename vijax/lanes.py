@@ -1,7 +1,7 @@
 """Run N independent cells on L lanes in one compiled loop of fixed shape; finished lanes take waiting cells.
 
-Knows no physics: a `Program` says what a cell is, what one quick trip does to every lane at once, and what the rare lane
-that declines needs instead. Memory is set by L and by the rows that go in and come out.
+Knows no physics: a `Program` says what a cell is, what one quick trip does to every lane at once, and what the rare
+lane that declines needs instead. Memory is set by L and by the rows that go in and come out.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,8 @@ _SHARE = 16  # a refill waits until one lane in so many is free
 _CPU_OPTIONS = {
     # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
     "xla_cpu_prefer_vector_width": 512,
-    # Keeps `lax.optimization_barrier` until fusion, so that a shared value is computed once (see flow.share). The second
-    # pass hands loops of a few bytes to an emitter that does not know the barrier, and crashes.
+    # Keeps `lax.optimization_barrier` until fusion, so that a shared value is computed once (see flow.share). The
+    # second pass hands loops of a few bytes to an emitter that does not know the barrier, and crashes.
     "xla_disable_hlo_passes": "cse_barrier_expander,small-while-loop-hoisting",
 }
 
@@ -41,8 +41,8 @@ class Program(NamedTuple):
     Attributes:
         load: Rows of the cell table -> fresh carry.
         trip: Carry -> carry after one quick trip; it may mark lanes as declined.
-        careful: Carry of declined lanes, patience -> carry after one careful trip; lanes that a limited patience did not
-            do for stay declined and are marked hard.
+        careful: Carry of declined lanes, patience -> carry after one careful trip; lanes that a limited patience did
+            not do for stay declined and are marked hard.
         review: Carry -> carry; what is too slow for every trip: decisions, ends.
         declined, hard, stopped, done: Carry -> which lanes are; a stopped lane waits for review.
         unload: Carry -> rows of the result table.
@@ -106,13 +106,13 @@ def run(
         outputs: Length of a result row.
         lanes: How many cells are worked on at once.
 
-    A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same elementwise
-    arithmetic wherever it sits.
+    A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same
+    elementwise arithmetic wherever it sits.
     """
     width = min(lanes, _WIDTH)  # how many lanes are served, or refilled, together
 
     def serve(cell, carry):
-        """Serve the easy lanes first; the hard ones, each of which may hold up a whole batch, in batches of their own."""
+        """Serve easy lanes together, and apart from them the hard ones, which would hold up a whole batch."""
         declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
         easy = (declined & ~hard).sum() >= jnp.minimum((declined & hard).sum(), width)
         members, place, chosen = _first(declined & (hard != easy), width)

@@ -267,7 +267,7 @@ def from_membrane_pair(pair: MembranePair) -> ImpactPair:
     return ImpactPair(pair.length_unit, 1 / pair.time_unit, r, pair.g_star / pair.A_star)
 
 
-# --- the door --------------------------------------------------------------------------------------------------------
+# --- the door -------------------------------------------------------------------------------------
 
 
 class _Rule(NamedTuple):

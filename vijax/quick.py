@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from vijax import energy
 from vijax.exact import stick_speed
-from vijax.flow import PI, horner, membrane, share
+from vijax.flow import PI, horner, membrane, once, share
 from vijax.model import ImpactPair
 
 Lane = Float[Array, "lane"]
@@ -152,6 +152,7 @@ def prepare(pair: ImpactPair) -> Wall:
     )
 
 
+@once
 def _sine_cosine(x: Lane) -> tuple[Lane, Lane]:
     """sin and cos on |x| <= _REACH."""
     square = x * x
@@ -159,6 +160,7 @@ def _sine_cosine(x: Lane) -> tuple[Lane, Lane]:
     return sine, 1 - square * (0.5 - square * horner(_COSINE, square))
 
 
+@once
 def _exp(x: Lane) -> Lane:
     """exp on |x| <= _EXP_REACH."""
     quarter = horner(_EXP, 0.25 * x)
@@ -186,7 +188,7 @@ def _arcsine(x: Lane) -> Lane:
 
 
 def _converged(eps: float) -> float:
-    """Largest last step, times the equation's stiffness, that a fourth-order iteration leaves an error of eps behind."""
+    """Largest last step, times the stiffness, after which a fourth-order iteration is off by eps."""
     return eps**0.25
 
 
@@ -199,7 +201,7 @@ def _householder(f: Lane, f1: Lane, f2: Lane, f3: Lane) -> Lane:
 
 
 class _Flight(eqx.Module):
-    """Arrival at a wall, in the frame where the ball starts downwards: sin and cos of the angle past the crossing's centre."""
+    """Arrival at a wall, in the frame where the ball starts downwards; sin and cos of the angle past its centre."""
 
     elapsed: Lane
     speed: Lane  # towards the wall
@@ -273,7 +275,7 @@ def _fly(half: Lane, lane: Lanes) -> _Flight:
     speed = (slope + cosine) * (1 / PI)
     elapsed = away + y * (1 / PI)
     # The iteration is of fourth order: what is left after the last step is (stiffness step)^3 step.
-    converged = stiffness * jnp.abs(step) < _converged(eps)
+    converged = stiffness * jnp.abs(step) < _converged(float(eps))
     # A short hop loses its leading digits in the phases.
     sure = converged & ~doubt & (speed > 0) & (elapsed > 1 / 256) & (lane.v != 0) & (jnp.abs(y) < 3.4)
     return _Flight(*share((elapsed, speed, flip, wall, sine, cosine, sure, never & (lane.v != 0))))
@@ -305,6 +307,7 @@ class _Course(eqx.Module):
     decay: Lane
 
 
+@once
 def _motion(wall: Wall, course: _Course, s: Lane) -> _Motion:
     """The contact at time s from the course's reference."""
     sine, cosine = _sine_cosine(wall.omega1 * s)
@@ -422,7 +425,7 @@ def _touch(wall: Wall, flight: _Flight) -> tuple[_Exit, Lane, Bool[Array, "lane"
     duration = reference + s
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.push / at.rate))
     # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
-    converged = reached & (stiffness * jnp.abs(step) < _converged(eps)) & (wall.omega1 * duration > 0.25)
+    converged = reached & (stiffness * jnp.abs(step) < _converged(float(eps))) & (wall.omega1 * duration > 0.25)
     depth, certain = _deepest(wall, speed, parts, (short, rise), duration, at.drive, at.force)
     sure = wall.usable & converged & (out > 0) & certain
     turn = wall.omega1 * step
@@ -447,7 +450,7 @@ def _deepest(
     """Greatest depth, sought from the free contact's, and certainty that w has no other extremum before the exit.
 
     w' is an oscillator too, driven by the derivative f' of the forcing. Write e^(zeta s) w' = phi q with phi the free
-    solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero only.
+    solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero.
     Beyond it -w' > 0 has no zero while f' < 0, and where f' ends positive at most one, so none if -w' > 0 at the exit.
     Moreover a minimum of w needs a positive forcing. Else by size: `Wall.steep` and `Wall.lift`.
     """
@@ -477,7 +480,7 @@ def _deepest(
     way = duration - when
     # The depth is stationary, and its Taylor polynomial of fifth order: a coarser time than the exit's will do.
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
-    converged = reached & (stiffness * jnp.abs(step) < 16 * _converged(eps)) & (at.push < 0)
+    converged = reached & (stiffness * jnp.abs(step) < 16 * _converged(float(eps))) & (at.push < 0)
     falls, pulled, one_change = at.drive <= 0, at.force <= 0, duration < 1
     first = falls & ((force_sin >= 0) | ((force_cos > 0) & (far.force_sin >= 0)))
     first = (one_change & (first | ((force_cos <= 0) & pulled))) | (speed > wall.steep)

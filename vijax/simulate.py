@@ -164,12 +164,12 @@ class _Event(eqx.Module):
     stuck: Mask
 
 
-# --- loading ------------------------------------------------------------------------------------------------------------
+# --- loading --------------------------------------------------------------------------------------
 
 
 def _tally(plan: Plan, like: Lane) -> Tally:
     zero = jnp.zeros_like(like)
-    wide = jnp.zeros(like.shape + (plan.variants,), like.dtype) if plan.energies else None
+    wide = jnp.zeros((*like.shape, plan.variants), like.dtype) if plan.energies else None
     stuck = jnp.zeros(like.shape, bool) if plan.rigid else None
     deepest = zero if plan.deep else None
     return Tally(zero, zero, zero, zero, zero, zero, deepest, wide, wide, wide, wide, stuck)
@@ -225,7 +225,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
 
 
 def _mode(plan: Plan, pair: ImpactPair, u: Lane, v: Lane) -> Lane:
-    """Contact side of a start at phase 0: inside a soft wall; on a wall by the velocity, at rest by the acceleration."""
+    """Contact side of a start: inside a soft wall; on a wall by the velocity, at rest by the acceleration."""
     side = jnp.where(u > 0, 1.0, -1.0).astype(u.dtype)
     gap = 0.5 * pair.d - side * u
     push = side * (1 - pair.gamma)
@@ -235,7 +235,7 @@ def _mode(plan: Plan, pair: ImpactPair, u: Lane, v: Lane) -> Lane:
     return jnp.where((gap < 0) | resting | ((gap == 0) & (side * v > 0)), side, 0.0)
 
 
-# --- trips ---------------------------------------------------------------------------------------------------------------
+# --- trips ----------------------------------------------------------------------------------------
 
 
 def _window_end(plan: Plan, settings: Settings) -> Float[Array, ""]:
@@ -276,13 +276,13 @@ def _careful_trip(plan: Plan, settings: Settings, cell: Cell, patience: Int[Arra
     after = out.state
     hit = Hit(
         onset_t=out.impact.t,
-        onset_n=ball.n + out.impact.n,
+        onset_n=ball.n + out.impact.n.astype(ball.n.dtype),
         side=jnp.where(out.impact.side < 0, -1.0, 1.0).astype(ball.u.dtype),
         v_in=out.impact.v_in,
         v_out=out.impact.v_out,
         flight=out.flight,
         duration=out.stay,
-        after=Lanes(after.u, after.v, after.t, ball.n + after.n),
+        after=Lanes(after.u, after.v, after.t, ball.n + after.n.astype(ball.n.dtype)),
         depth=out.impact.depth if plan.deep else None,
         work=out.impact.work if plan.deep else None,
         tangent=matrix,
@@ -404,7 +404,7 @@ def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, traci
 
 
 def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
-    """Compare the impact with the anchor, an earlier one that moves forward by a quarter of the count; end of a round."""
+    """Compare the impact with the anchor, an earlier one moved on by a quarter of the count; end rounds."""
     c = cell.candidate
     if c is None:
         return None, jnp.zeros_like(kept)
@@ -443,7 +443,7 @@ def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
     )
 
 
-# --- review --------------------------------------------------------------------------------------------------------------
+# --- review ---------------------------------------------------------------------------------------
 
 
 def _review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
@@ -558,7 +558,7 @@ def _back_to_search(plan: Plan, cell: Cell, bad: Mask) -> Cell:
     )
 
 
-# --- results -------------------------------------------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------
 
 
 def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:

@@ -1,4 +1,4 @@
-"""The motion of single starts, impact by impact: recorded, sampled at phase 0, and differentiable in both directions."""
+"""The motion of single starts, impact by impact: recorded, sampled at phase 0, differentiable both ways."""
 
 from collections.abc import Callable
 from functools import lru_cache, partial

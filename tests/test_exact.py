@@ -1,0 +1,357 @@
+"""The exact engine: 50-digit sequences, answers chosen first, invariants, and an audit for missed events."""
+
+import jax
+import mpmath as mp
+import numpy as np
+import pytest
+from helpers import (
+    DIGITS,
+    EPS,
+    TILE,
+    audit_contacts,
+    audit_flights,
+    grazing_contacts,
+    grazing_flights,
+    long_contact,
+    long_flight,
+    march,
+    mp_contact,
+    newton,
+    pairs,
+    random_cells,
+    reference_trajectories,
+    start,
+)
+
+from vijax.model import State
+
+CASES = reference_trajectories()
+SOFT = [case for case in CASES if not case["case"].get("hard")]
+RIGID = [case for case in CASES if case["case"].get("hard")]
+
+
+def sensitive(case) -> bool:
+    """Whether float64 loses more than a rounding a step on it: chaotic, or the rigid wall's slow impacts."""
+    return case["float64_max_err"]["t"] > 1e-14
+
+
+def compare(cases) -> list[tuple[dict, dict[str, np.ndarray]]]:
+    """Relative errors per impact of the reference sequences."""
+    given = [[float(case["case"][name]) for case in cases] for name in ("d", "kappa", "r", "gamma")]
+    rigid = bool(cases[0]["case"].get("hard"))
+    begin = [[float(case[name]) for case in cases] for name in ("u0", "v0", "t0")]
+    ran = march(pairs(given[0], None if rigid else given[1], *given[2:]), start(*begin))
+    result = []
+    for k, case in enumerate(cases):
+        truth = case["impacts"]
+        count = len(truth)
+        hit = jax.tree.map(lambda x, k=k, count=count: x[k, :count], ran.out.impact)
+        assert [int(side) for side in hit.side] == [row["side"] for row in truth]
+        got = {"t": (hit.n, hit.t), "vin": hit.v_in, "vout": hit.v_out}
+        got |= {} if rigid else {"tc": hit.duration, "dmax": hit.depth}
+        errors = {}
+        with mp.workdps(DIGITS):
+            for name, values in got.items():
+                rows = [mp.mpf(row[name]) for row in truth]
+                values = [2 * int(n) + mp.mpf(t) for n, t in zip(*values, strict=True)] if name == "t" else values
+                errors[name] = np.array([float(abs(mp.mpf(v) / row - 1)) for v, row in zip(values, rows, strict=True)])
+        result.append((case, errors))
+    return result
+
+
+@pytest.mark.parametrize("cases", [SOFT, RIGID], ids=["soft", "rigid"])
+def test_reference_trajectories(cases):
+    for case, errors in compare(cases):
+        for name, error in errors.items():
+            assert error[:4].max() < 1e-13, (case["case"], name)
+            if not sensitive(case):
+                assert error.max() < 1e-11, (case["case"], name)
+            assert error.max() < 1e-9, (case["case"], name)
+
+
+# --- answers first ------------------------------------------------------------------------------------------------------
+
+
+def starts_before_an_impact(rng, count, gamma_size):
+    """Impacts chosen (side, phase, speed) and the starts that lead there in a time s without touching a wall."""
+    many = 20 * count
+    d = np.exp(rng.uniform(np.log(0.01), np.log(2), many))
+    gamma = gamma_size * rng.uniform(-1, 1, many)
+    side, t, s = rng.choice([-1.0, 1.0], many), rng.uniform(2, 4, many), rng.uniform(0.01, 1.5, many)
+    v_in = side * 10.0 ** rng.uniform(-3, 0, many)
+    back, v0 = long_flight(gamma, t, v_in, -s)
+    u0 = side * d / 2 + back
+    rise, _ = long_flight(*(x[:, None] for x in (gamma, t - s, v0)), s[:, None] * np.linspace(0, 1, 200)[:-1])
+    good = np.nonzero((np.abs(u0[:, None] + rise) < d[:, None] / 2).all(axis=1))[0][:count]
+    assert len(good) == count
+    return tuple(np.asarray(x, float)[good] for x in (d, gamma, side, t, s, v_in, u0, v0))
+
+
+@pytest.mark.parametrize("gamma_size", [0.0, 0.5, 2.0])
+def test_chosen_impacts_are_found(gamma_size):
+    rng = np.random.default_rng(11)
+    d, gamma, side, t, s, v_in, u0, v0 = starts_before_an_impact(rng, TILE, gamma_size)
+    begin = np.mod(t - s, 2)
+    for kappa in (np.full(TILE, 40.0), None):
+        ran = march(pairs(d, kappa, 0.5, gamma), start(u0, v0, begin))
+        assert np.array_equal(ran.out.impact.side[:, 0], side)
+        # Rounding the start moves the crossing by about eps over the speed.
+        moved = 16 * EPS * (1 + np.abs(v0) + s) / np.abs(v_in)
+        assert np.max(np.abs(ran.out.flight[:, 0] - s) / moved) < 1
+        assert np.max(np.abs(ran.out.impact.v_in[:, 0] - v_in) / (moved * (1 + gamma_size))) < 1
+
+
+def contact_errors(kappa, r, gamma, side, t, v, got) -> tuple[float, float, float]:
+    """Errors of duration, exit speed (relative) and depth (relative), and that w > 0 until the exit, in 50 digits."""
+    with mp.workdps(DIGITS):
+        numbers = [mp.mpf(x) for x in (kappa, r, gamma, side, t, v)]
+        course = lambda s: mp_contact(*numbers, s)  # noqa: E731  a function of one line, used below
+        stay = newton(lambda s: course(s)[:2], mp.mpf(got.duration))
+        samples = int(200 + 40 * kappa * float(stay) / np.pi)
+        inside = [course(stay * k / samples)[0] for k in range(1, samples)]
+        assert min(inside) > 0, "w was back at zero before the reported exit"
+        deepest = newton(lambda s: course(s)[1:], stay * (inside.index(max(inside)) + 1) / samples)
+        depth, v_out = course(deepest)[0], -course(stay)[1]
+        return (
+            abs(float(got.duration / stay - 1)),
+            abs(float(-side * got.v_out / v_out - 1)),
+            abs(float(got.depth / depth - 1)),
+        )
+
+
+# kappa, r, gamma, phase, speed: into the wall against the forcing or with it, slow and fast, over the ends of the range.
+CONTACTS = [
+    (400.0, 0.5, 0.0, 0.0, 1e-3),  # nine extrema
+    (400.0, 0.9, 0.0, 0.0, 1e-3),
+    (40.0, 0.8, 0.3, 1.9, 1e-2),
+    (400.0, 0.5, 0.0, 0.3, 1e-8),
+    (400.0, 0.5, 0.0, 0.9, 1e-8),
+    (4.0, 0.1, 0.0, 0.7, 1e-8),
+    (0.5, 0.5, 0.0, 0.3, 0.4),
+    (0.5, 0.5, 0.0, 0.9, 1e-8),
+    (0.5, 1.0, 0.2, 1.3, 0.2),
+    (1e5, 0.5, 0.0, 0.3, 0.4),
+    (1e5, 0.5, 0.0, 0.8, 1e-8),
+    (1e5, 1.0, 0.2, 1.3, 0.2),
+    (np.pi, 1.0, 0.0, 0.3, 0.4),
+    (np.pi, 0.999, 0.0, 0.3, 0.4),
+    (np.pi, 1.0, 0.0, 1.1, 1e-3),
+    (12.0, 1e-8, 0.1, 0.4, 0.3),
+    (12.0, 0.5, 1.4, 0.4, 0.3),  # |gamma| > 1, thrown back
+]
+
+
+@pytest.fixture(scope="module")
+def contacts():
+    """Entries on the right wall, begun on it."""
+    kappa, r, gamma, t, v = np.array(CONTACTS).T
+    return march(pairs(0.1, kappa, r, gamma), start(0.05, v, t, 1))
+
+
+@pytest.mark.parametrize("k", range(len(CONTACTS)), ids=lambda k: " ".join(f"{x:g}" for x in CONTACTS[k]))
+def test_contacts_against_fifty_digits(contacts, k):
+    kappa, r, gamma, t, v = CONTACTS[k]
+    impact = jax.tree.map(lambda x: x[k, 0], contacts.out.impact)
+    assert impact.v_in == v
+    errors = contact_errors(kappa, r, gamma, 1, t, v, impact)
+    # Beyond many half cycles omega1 s has lost digits: the engine's own clock has, too.
+    limit = 1e-13 * max(1, 0.1 * kappa * impact.duration)
+    assert errors[0] < limit
+    assert errors[1] < 10 * limit
+    assert errors[2] < limit
+
+
+def test_a_slow_entry_at_the_top_of_the_forcing_stays_sixty_times_longer(contacts):
+    free = np.pi / (400 * np.pi / np.hypot(np.pi, np.log(0.5)))
+    assert 50 < contacts.out.stay[0, 0] / free < 70
+
+
+def test_a_start_inside_a_soft_wall_is_no_impact(contacts):
+    assert np.all(contacts.out.impact.side[:, 0] == 0)
+    assert np.all(contacts.out.impact.side[:, 1] != 0)
+    ran = march(pairs(0.2, 40.0, 0.5, 0.0), start([0.11, -0.13], [0.1, -0.2], 0.3, [1, -1]))
+    assert np.all(ran.out.impact.side[:, 0] == 0)
+    assert np.all(ran.out.stay[:, 0] > 0)
+    assert np.array_equal(ran.out.state.u[:, 0], [0.1, -0.1])
+
+
+@pytest.mark.parametrize("speed", [1e-8, 1e-6, 1e-3])
+def test_slow_bounces_return(speed):
+    """Away from a wall that the forcing pushes towards: back at the same speed after 2 v/a, and its corrections."""
+    count, side = 20, 1.0
+    t = np.linspace(-0.3, 0.3, count) % 2
+    for kappa in (40.0, None):
+        ran = march(pairs(0.2, kappa, 0.5, 0.0), start(0.1, np.full(count, -speed), t))
+        for k in range(count):
+            with mp.workdps(DIGITS):
+                phase, v0 = mp.mpf(t[k]), mp.mpf(-speed)
+                s = mp.mpf(ran.out.flight[k, 0])
+
+                def away(s, phase=phase, v0=v0):
+                    rise = v0 * s + (mp.cospi(phase) - mp.cospi(phase + s) - mp.pi * s * mp.sinpi(phase)) / mp.pi**2
+                    return rise, v0 + (mp.sinpi(phase + s) - mp.sinpi(phase)) / mp.pi
+
+                true = newton(away, s)
+                assert abs(float(s / true - 1)) < 1e-13
+                assert abs(float(ran.out.impact.v_in[k, 0] / away(true)[1] - 1)) < 1e-12
+        assert np.all(ran.out.impact.side[:, 0] == side)
+
+
+# --- rigid walls: sticking ------------------------------------------------------------------------------------------------
+
+
+def test_a_chattering_ball_sticks_and_leaves_when_the_forcing_turns():
+    """Released at cos(pi t) = gamma, at rest, whatever the speed that it came with."""
+    gamma = np.array([0.0, 0.2, -0.5, 0.0])
+    side = np.array([1.0, 1.0, 1.0, -1.0])
+    t = np.where(side > 0, 1.6, 0.6)
+    ran = march(pairs(0.2, None, 0.3, gamma), start(side * 0.1, -side * 1e-4, t))
+    for k in range(4):
+        stuck = np.nonzero(ran.out.stuck[k])[0]
+        assert len(stuck)
+        first = stuck[0]
+        release = np.arccos(side[k] * side[k] * gamma[k]) / np.pi
+        release = release if side[k] > 0 else 2 - release
+        assert ran.out.state.t[k, first] == pytest.approx(release, abs=4 * EPS * 2)
+        assert ran.out.state.v[k, first] == 0
+        assert ran.out.state.u[k, first] == side[k] * 0.1
+        # Then it leaves: the next impact is at the other wall or after a flight of some length.
+        assert ran.out.flight[k, first + 1] > 0.1
+        onset = 2 * ran.out.impact.n[k, first] + ran.out.impact.t[k, first]
+        assert 2 * ran.out.state.n[k, first] + ran.out.state.t[k, first] == pytest.approx(
+            onset + ran.out.stay[k, first], abs=1e-14
+        )
+
+
+def test_the_chatter_time_does_not_depend_on_the_sticking_rule():
+    """The geometric series 2 v r/(a (1 - r)) of the last bounces is below the rule's share of the stretch."""
+    ran = march(pairs(0.2, None, 0.3, 0.0), start(0.1, -1e-4, 1.6))
+    first = int(np.nonzero(ran.out.stuck[0])[0][0])
+    speeds = np.abs(ran.out.impact.v_in[0, :first])
+    assert np.allclose(speeds[1:] / speeds[:-1], 0.3, rtol=1e-2)
+    assert np.abs(ran.out.impact.v_in[0, first]) * 0.3 < 1e-9
+
+
+# --- gravity beyond the forcing ------------------------------------------------------------------------------------------
+
+
+def test_beyond_unit_gravity_the_ball_falls_and_rests():
+    """gamma 1.5 pulls left for ever: a start at rest on the left wall stays, one on the right wall falls across."""
+    for kappa in (20.0, None):
+        on_left = march(pairs(0.2, kappa, 0.5, 1.5), start(-0.1, 0.0, 0.4, -1))
+        assert on_left.out.permanent[0, 0] or kappa is not None
+        fall = march(pairs(0.2, kappa, 0.5, 1.5), start(0.1, 0.0, 0.4, 0))
+        assert fall.out.impact.side[0, 0] == -1
+        assert fall.out.impact.v_in[0, 0] < 0
+        # The engine's time of the fall solves d = fall of the flight.
+        rise, _ = long_flight(1.5, 0.4, 0.0, fall.out.flight[0, 0])
+        assert abs(float(rise) + 0.2) < 4 * EPS
+        assert fall.out.permanent[0].any()
+        assert not fall.out.quiet[0].any()
+
+
+def test_permanent_contact_is_said_only_where_w_never_returns():
+    kappa = np.array([20.0, 20.0, 3.0, 400.0])
+    gamma = np.array([3.0, 1.2, 8.0, 1.01])
+    ran = march(pairs(0.2, kappa, 0.5, gamma), start(-0.1, -0.01, 0.4, -1))
+    for k in range(4):
+        end = np.inf if ran.out.permanent[k, 0] else ran.out.stay[k, 0]
+        s = np.linspace(0, min(30.0, end), 400001)[1:-1]
+        w, _ = long_contact(kappa[k], 0.5, gamma[k], -1, 0.4, 0.0, 0.01, s)
+        assert np.all(w > 0)
+    assert ran.out.permanent[:, 0].any()
+
+
+# --- invariants -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def soft_runs():
+    pair, state = random_cells(np.random.default_rng(21), 3 * TILE, soft=True)
+    return pair, march(pair, state)
+
+
+@pytest.fixture(scope="module")
+def rigid_runs():
+    pair, state = random_cells(np.random.default_rng(22), 3 * TILE, soft=False)
+    return pair, march(pair, state)
+
+
+def test_mirror_symmetry(soft_runs, rigid_runs):
+    """(u, t, gamma) -> (-u, t + 1, -gamma). The phase is rounded anew, so the first impacts only."""
+    for pair, ran in (soft_runs, rigid_runs):
+        before = jax.tree.map(lambda x: x[:, 0], ran.before)
+        # A phase on a coarse grid stays itself when it is turned by one.
+        t = np.round(before.t * 2**40) / 2**40
+        plain = march(pair, State(before.u, before.v, t, before.n, before.mode))
+        turned = march(
+            pairs(pair.d, pair.kappa, pair.r, -pair.gamma), start(-before.u, -before.v, np.mod(t + 1, 2), -before.mode)
+        )
+        one, other = plain.out.impact, turned.out.impact
+        sure = np.abs(one.v_in[:, 0]) > 1e-3
+        assert np.array_equal(one.side[sure, 0], -other.side[sure, 0])
+        for name in ("v_in", "v_out"):
+            a, b = getattr(one, name)[sure, 0], -getattr(other, name)[sure, 0]
+            assert np.allclose(a, b, rtol=1e-11, atol=1e-12, equal_nan=True)
+        for a, b in ((plain.out.flight, turned.out.flight), (plain.out.stay, turned.out.stay)):
+            assert np.allclose(a[sure, 0], b[sure, 0], rtol=1e-11, atol=1e-11, equal_nan=True)
+
+
+def determinants(pair, ran, steps: int) -> np.ndarray:
+    """|det - expected|/max(1, |M|^2) of the first steps' monodromy, NaN where a step was no plain impact."""
+    plain = ((ran.out.impact.side != 0) & ~ran.out.permanent & ~ran.out.stuck & np.isfinite(ran.out.stay))[:, :steps]
+    matrix = np.eye(2)
+    for k in range(steps):
+        matrix = ran.tangent[:, k] @ matrix
+    if pair.kappa is None:
+        expected = pair.r ** (2 * steps)
+    else:
+        expected = np.exp(-np.asarray(pair.mu) * ran.out.stay[:, :steps].sum(axis=1))
+    error = np.abs(np.linalg.det(matrix) - expected) / np.maximum(1, np.linalg.norm(matrix, 2, axis=(1, 2)) ** 2)
+    return np.where(plain.all(axis=1), error, np.nan)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_determinant_of_the_monodromy(soft_runs, rigid_runs, steps):
+    for pair, ran in (soft_runs, rigid_runs):
+        with np.errstate(invalid="ignore", over="ignore"):
+            error = determinants(pair, ran, steps)
+        assert np.isfinite(error).sum() > TILE
+        assert np.nanmax(error) < 1e-11
+
+
+def test_the_ball_stays_between_rigid_walls(rigid_runs):
+    pair, ran = rigid_runs
+    assert np.all(np.abs(ran.out.state.u) <= 0.5 * pair.d[:, None])
+
+
+def test_energy_of_a_soft_contact_is_positive_and_balances(soft_runs):
+    _, ran = soft_runs
+    plain = (ran.out.impact.side != 0) & np.isfinite(ran.out.stay)
+    assert np.all(ran.out.impact.work[plain] >= 0)
+    assert np.all(ran.out.impact.depth[plain] > 0)
+    assert np.all(ran.out.impact.v_out[plain] * ran.out.impact.side[plain] <= 0)
+
+
+# --- no missed event ------------------------------------------------------------------------------------------------------
+
+
+def test_no_wall_is_crossed_before_the_one_reported(soft_runs, rigid_runs):
+    for pair, ran in (soft_runs, rigid_runs):
+        beyond = audit_flights(pair, ran)
+        assert len(beyond) > 1000
+        assert np.max(beyond) < 4 * EPS
+
+
+def test_no_contact_ends_before_the_exit_reported(soft_runs):
+    below = audit_contacts(*soft_runs)
+    assert len(below) > 1000
+    assert np.max(below) < 64 * EPS
+
+
+@pytest.mark.parametrize("build", [grazing_flights, grazing_contacts])
+def test_extrema_near_a_wall_fall_on_the_right_side(build):
+    extrema = build(np.random.default_rng(31), 4 * TILE)
+    assert len(extrema.height) == 4 * TILE
+    assert np.abs(extrema.height).min() < 1e-13
+    assert extrema.wrong() == 0
