@@ -133,8 +133,7 @@ def accuracy(side: int) -> None:
 
     d, kappa = cells(side)
     _, u, v = rk4(d, kappa, R, U0, V0, ACCURACY_PERIODS, PEER_STEPS)
-    start = np.full(d.size, U0), np.full(d.size, V0)
-    run = vijax.trajectory(vijax.impact_pair(d, kappa, R, 0.0), *start, ACCURACY_PERIODS, max_impacts=64)
+    run = vijax.trajectory(vijax.impact_pair(d, kappa, R, 0.0), U0, V0, ACCURACY_PERIODS, max_impacts=64)
     error = np.hypot(u - np.asarray(run.states.u)[:, -1], v - np.asarray(run.states.v)[:, -1])
     print(f"peer: error of the state after {ACCURACY_PERIODS} periods: median {np.median(error):.1e}")
 

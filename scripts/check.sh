@@ -8,4 +8,5 @@ python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 ruff check .
 ruff format --check .
 mypy
-pytest -n 2 "$@"
+# A file to a process: the programs that its tests share are compiled once.
+pytest -n 2 --dist loadfile "$@"

@@ -117,7 +117,9 @@ def results(cells, width, count=None):
 
 
 @pytest.mark.parametrize(
-    "kinds", [[EASY], [EASY, DECLINES], [HARD], [EASY, EASY, DECLINES, HARD]], ids=["easy", "declining", "hard", "mixed"]
+    "kinds",
+    [[EASY], [EASY, DECLINES], [HARD], [EASY, EASY, DECLINES, HARD]],
+    ids=["easy", "declining", "hard", "mixed"],
 )
 def test_every_cell_ends_as_in_a_plain_loop_of_its_own(kinds):
     cells = draw(1500, kinds)

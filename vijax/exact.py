@@ -167,9 +167,9 @@ def first_return(
     inf if there is none; NaN if `patience` stages do not decide it.
 
     Write e^(zeta s) w = phi q with phi the free solution through the present state. While the forcing is positive q
-    only grows: no zero before phi's own. While it is negative q only falls: at most one zero before phi's, and certainly
-    one by then. So stage by stage either a stretch is certified free of zeros or a bracket holds exactly one. Where the
-    oscillation has decayed, the steady response carries many free half cycles at once.
+    only grows: no zero before phi's own. While it is negative q only falls: at most one zero before phi's, and
+    certainly one by then. So stage by stage either a stretch is certified free of zeros or a bracket holds exactly
+    one. Where the oscillation has decayed, the steady response carries many free half cycles at once.
     """
     steady = flow.steady_response(m, force)
 

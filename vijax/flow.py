@@ -5,6 +5,7 @@ exactly the digits that the naive forms lose.
 """
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -90,7 +91,7 @@ _CONTACT_TERMS = 20
 _SERIES_REACH = 1.0
 
 
-def horner(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+def horner(coefficients: tuple[Any, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
     """Polynomial with the given ascending coefficients at x."""
     total = x * coefficients[-1] + coefficients[-2]
     for coefficient in coefficients[-3::-1]:

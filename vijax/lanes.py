@@ -19,7 +19,6 @@ Carry = Any
 TRIPS = 16  # quick trips between two rounds of serving, reviewing and refilling
 FIRST_PATIENCE = 6  # stages that a careful trip may take before its lane is set aside as hard
 LAST_PATIENCE = 2**30
-_WIDTH = 128
 _SHARE = 16  # a refill waits until one lane in so many is free
 _CPU_OPTIONS = {
     # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
@@ -95,7 +94,7 @@ def _put(carry: Carry, part: Carry, place: Int[Array, "lane"], chosen: Bool[Arra
 
 
 def run(
-    program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int
+    program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int, width: int = 128
 ) -> Float[Array, "cell out"]:
     """Run the first `count` cells to their end; rows past `count` come back as zeros.
 
@@ -105,11 +104,12 @@ def run(
         count: How many are real; the table may be padded.
         outputs: Length of a result row.
         lanes: How many cells are worked on at once.
+        width: How many lanes are served, or refilled, together.
 
     A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same
     elementwise arithmetic wherever it sits.
     """
-    width = min(lanes, _WIDTH)  # how many lanes are served, or refilled, together
+    width = min(lanes, width)
 
     def serve(cell, carry):
         """Serve easy lanes together, and apart from them the hard ones, which would hold up a whole batch."""

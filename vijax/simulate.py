@@ -24,6 +24,7 @@ Mask = Bool[Array, "lane"]
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
 TRANSIENT_SHARE = 0.25  # of the periods that a cell without an orbit leaves out of its averages
 _BATCHES = 24  # batch means behind a standard error
+_SERVED = 128  # lanes of a careful trip; with gravity, where every impact is careful, all of them
 _BUDGET = 512  # impacts per period before a cell is stopped
 _ROUNDS = 8  # Newton rounds on one candidate
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
@@ -717,7 +718,9 @@ def _compiled(plan: Plan, width: int):
     """The jitted program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
-        table = lanes.run(_program(plan, settings), cells, count, _columns(plan), width)
+        table = lanes.run(
+            _program(plan, settings), cells, count, _columns(plan), width, _SERVED if plan.level else width
+        )
         return _unpack(plan, table)
 
     return jax.jit(tile, compiler_options=lanes.compiler_options())

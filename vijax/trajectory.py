@@ -40,6 +40,11 @@ def _begin(pair: ImpactPair, u0, v0, t0) -> State:
     return State(u0, v0, t, n.astype(jnp.int32), jnp.where(held, side, 0.0).astype(jnp.int32))
 
 
+def _time(state: State) -> Float[Array, "..."]:
+    """Time since phase 0 of period 0."""
+    return 2.0 * state.n.astype(state.t.dtype) + state.t
+
+
 def _at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Array, ""]) -> tuple:
     """Displacement, velocity and mode at a time `when` after the start of a step."""
     aloft = (when <= out.flight) | out.quiet
@@ -63,7 +68,7 @@ def _one(periods: int, max_impacts: int, pair: ImpactPair, u0, v0, t0) -> Trajec
 
     def advance(carry, _):
         state, over = carry
-        horizon = jnp.where(over, 0.0, 2.0 * (periods - state.n) - state.t)
+        horizon = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(u0.dtype) - state.t)
         out = exact.step(pair, state, horizon, rolled=True)
         ends = over | out.quiet | out.permanent | (horizon <= 0)
         after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
@@ -82,15 +87,16 @@ def _one(periods: int, max_impacts: int, pair: ImpactPair, u0, v0, t0) -> Trajec
         blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
         return jnp.where(there, leaf[order], blank)
 
-    clock = jnp.where(idle, jnp.inf, 2.0 * begun.n + begun.t)
+    clock = jnp.where(idle, jnp.inf, _time(begun))
     ended = out.quiet | out.permanent
-    until = jnp.where(idle | ended, jnp.inf, 2.0 * out.state.n + out.state.t)
+    until = jnp.where(idle | ended, jnp.inf, _time(out.state))
 
     def strobe(k):
-        index = jnp.clip(jnp.searchsorted(clock, 2.0 * k, side="right") - 1, 0, steps - 1)
+        now = 2.0 * k.astype(u0.dtype)
+        index = jnp.clip(jnp.searchsorted(clock, now, side="right") - 1, 0, steps - 1)
         first, happened = jax.tree.map(lambda leaf: leaf[index], (begun, out))
-        known = 2.0 * k <= until[index]
-        when = jnp.where(known, 2.0 * (k - first.n) - first.t, 0.0)
+        known = now <= until[index]
+        when = jnp.where(known, 2.0 * (k - first.n).astype(u0.dtype) - first.t, 0.0)
         u, v, mode = _at(pair, first, happened, when)
         blank = jnp.where(known, 0.0, jnp.nan)
         return State(u + blank, v + blank, jnp.zeros_like(u), k, mode)

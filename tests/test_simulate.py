@@ -1,0 +1,287 @@
+"""Cells from start to summary: attractors of the reference plane, averages, statuses, symmetries, independence."""
+
+import json
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vijax import simulate, trajectory
+from vijax.energy import harvested_energy
+from vijax.model import Harvester, ImpactPair, Status
+
+DATA = Path(__file__).parent / "data"
+PLANE = json.loads((DATA / "plane_cells.json").read_text())["cells"]
+ORBITS = json.loads((DATA / "gradients.json").read_text())["orbits"]
+DEVICE = Harvester()
+TILE = 256  # one size of tile and one number of variants: every program here is compiled once
+VARIANTS = np.array([1.0, 0.5])
+ALL = frozenset({"P", "energy_ratio", "deepest", "lyapunov"})
+START = (0.05853, -0.47898)
+PAIR, MOTION = ("d", "kappa", "r", "gamma"), ("u0", "v0")
+
+
+def cell(d, kappa=None, r=0.5, gamma=0.0, u0=None, v0=START[1]):
+    return dict(d=d, kappa=kappa, r=r, gamma=gamma, u0=min(START[0], 0.49 * d) if u0 is None else u0, v0=v0)
+
+
+def summarise(cells, periods=400, *, dtype="float64", length=1.0, outputs=ALL, order=None, **settings):
+    """The summary of some cells as NumPy arrays, padded to the tile, in the order given or in another."""
+    index = np.resize(np.arange(len(cells)) if order is None else order, TILE)
+
+    def column(name):
+        return jnp.asarray(np.array([cells[i][name] for i in index], dtype))
+
+    rigid = cells[0]["kappa"] is None
+    factor = jnp.asarray(VARIANTS.astype(dtype))
+    found = simulate.summarise(
+        ImpactPair(column("d"), None if rigid else column("kappa"), column("r"), column("gamma")),
+        column("u0"),
+        column("v0"),
+        simulate.Scale(jnp.full(TILE, length, dtype), jnp.full(TILE, length, dtype), factor, factor),
+        DEVICE,
+        periods=periods,
+        outputs=outputs,
+        count=len(cells),
+        **settings,
+    )
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(cells)], found)
+
+
+# --- the reference plane ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return summarise(PLANE)
+
+
+PERIODIC = np.array([known["p"] > 0 for known in PLANE])
+
+
+def known(name):
+    return np.array([cell[name] for cell in PLANE])
+
+
+def test_periodic_cells_have_the_known_period_counts_and_power(plane):
+    slow = plane.status == Status.SLOW
+    assert not np.any(PERIODIC & (plane.period == 0)), "a periodic cell was called aperiodic"
+    assert np.sum(PERIODIC & slow) <= 1
+    sure = PERIODIC & ~slow
+    assert np.all(plane.status[sure] == Status.OK)
+    assert np.array_equal(plane.period[sure], known("p")[sure])
+    assert np.array_equal(plane.impacts_left[sure], known("left")[sure])
+    assert np.array_equal(plane.impacts_right[sure], known("right")[sure])
+    np.testing.assert_allclose(plane.P[sure, 0], known("P_J")[sure], rtol=1e-9)
+    assert np.all(plane.P_stderr[sure] == 0)
+
+
+def test_orbits_have_the_known_impact_speeds(plane):
+    sure = np.flatnonzero(PERIODIC & (plane.status == Status.OK))
+    fastest = [np.max(np.abs(PLANE[i]["impact_velocities"])) for i in sure]
+    number = [len(PLANE[i]["impact_velocities"]) / PLANE[i]["p"] for i in sure]
+    np.testing.assert_allclose(plane.fastest[sure], fastest, rtol=1e-9)
+    np.testing.assert_allclose(plane.impacts_per_period[sure], number, rtol=1e-12)
+
+
+def test_a_slow_cell_has_averages_near_the_orbit_it_creeps_to(plane):
+    slow = PERIODIC & (plane.status == Status.SLOW)
+    assert np.all(plane.period[slow] == -1)
+    assert np.all(plane.impacts_left[slow] == -1)
+    np.testing.assert_allclose(plane.P[slow, 0], known("P_J")[slow], rtol=1e-3)
+
+
+def test_aperiodic_cells_have_the_known_power_within_their_errors(plane):
+    chaos = ~PERIODIC
+    assert np.all(plane.period[chaos] == 0)
+    assert np.all(plane.status[chaos] == Status.OK)
+    # The reference's window is four times as long, and its error accordingly half as large.
+    error = plane.P_stderr[chaos, 0] * math.hypot(1, math.sqrt(300 / 1600))
+    z = np.abs(plane.P[chaos, 0] - known("P_J")[chaos]) / error
+    assert z.max() <= 4
+    assert np.median(z) <= 1.2
+
+
+def test_longer_windows_have_smaller_errors(plane):
+    aperiodic = [PLANE[i] for i in np.flatnonzero(~PERIODIC)]
+    longer = summarise(aperiodic, periods=2000)
+    short, long = plane.P_stderr[~PERIODIC, 0], longer.P_stderr[:, 0]
+    assert np.all(long < 0.03 * longer.P[:, 0])
+    assert 1.5 < np.median(short / long) < 3.5  # sqrt(5), as far as 24 batches tell
+    exponents = np.array([cell["lyapunov_per_period"] for cell in aperiodic])
+    np.testing.assert_allclose(longer.lyapunov, exponents, rtol=0.1, atol=0.03)
+
+
+def test_a_cells_result_does_not_depend_on_its_place_in_the_batch(plane):
+    order = np.random.default_rng(3).permutation(len(PLANE))
+    shuffled = summarise(PLANE, order=order)
+    for name in simulate.Summary.__dataclass_fields__:
+        there, here = getattr(shuffled, name), getattr(plane, name)[order]
+        assert np.array_equal(there, here, equal_nan=True), name
+
+
+def test_halved_units_and_a_variant_of_half_are_the_same(plane):
+    half = summarise(PLANE, length=0.5)
+    for name in ("P", "P_stderr", "energy_ratio"):
+        assert np.array_equal(getattr(half, name)[:, 0], getattr(plane, name)[:, 1]), name
+    assert np.array_equal(half.deepest, plane.deepest, equal_nan=True)
+
+
+def test_sides_are_means_of_their_own(plane):
+    count = plane.impacts_left + plane.impacts_right
+    both = plane.impacts_left * plane.restitution_left + plane.impacts_right * plane.restitution_right
+    sure = (plane.period > 0) & (plane.impacts_left > 0) & (plane.impacts_right > 0)
+    np.testing.assert_allclose(plane.restitution[sure], both[sure] / count[sure], rtol=1e-12)
+    np.testing.assert_allclose(plane.contact_fraction, plane.contact_time * plane.impacts_per_period / 2, rtol=1e-12)
+
+
+# --- tangent ---------------------------------------------------------------------------------------------------------
+
+
+def orbit_cell(orbit):
+    u0, v0 = orbit["strobe"]
+    return cell(orbit["d"], orbit["kappa"], orbit["r"], orbit["gamma"], u0, v0)
+
+
+def largest_exponent(orbit):
+    """log of the largest multiplier's modulus, per period of a 1:1 orbit."""
+    return max(math.log(math.hypot(*multiplier)) for multiplier in orbit["multipliers_strobe"])
+
+
+def test_exponent_and_power_of_the_50_digit_orbits():
+    level = [orbit for orbit in ORBITS if orbit["gamma"] == 0]
+    found = summarise([orbit_cell(orbit) for orbit in level])
+    assert np.all(found.period == 1)
+    np.testing.assert_allclose(found.lyapunov, [largest_exponent(orbit) for orbit in level], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.P[:, 0], [float(orbit["P_J"]) for orbit in level], rtol=1e-11)
+    np.testing.assert_allclose(found.deepest, [max(map(float, orbit["dmax"])) for orbit in level], rtol=1e-11)
+
+
+def test_exponent_of_a_rigid_orbit_follows_from_the_losses_where_its_multipliers_are_complex():
+    # det = r^(2 n) over a period: a complex pair has the modulus r^n each.
+    found = summarise([cell(0.5)])
+    assert (found.period[0], found.impacts_left[0], found.impacts_right[0]) == (1, 1, 1)
+    assert found.lyapunov[0] == pytest.approx(2 * math.log(0.5), abs=1e-9)
+
+
+# --- windows ---------------------------------------------------------------------------------------------------------
+
+WINDOW = dict(transient=10, periods=40)
+FEW = PLANE[:24]
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Impacts of some cells over the transient and the window, and of their mirrored starts half a period later."""
+    sign = np.repeat([1.0, -1.0], len(FEW))
+    d, kappa, r, gamma, u0, v0 = (np.tile([cell[name] for cell in FEW], 2) for name in PAIR + MOTION)
+    pair = ImpactPair(*(jnp.asarray(x) for x in (d, kappa, r, gamma)))
+    periods = WINDOW["transient"] + WINDOW["periods"]
+    begun = jnp.asarray(0.5 * (1 - sign))
+    found = trajectory(pair, jnp.asarray(sign * u0), jnp.asarray(sign * v0), periods, begun, max_impacts=350)
+    assert np.all(np.asarray(found.status) == Status.OK)
+    return jax.tree.map(np.asarray, found)
+
+
+def test_window_counts_the_impacts_with_their_onset_in_it(recorded):
+    found = summarise(FEW, until="window", outputs=frozenset({"P", "deepest"}), **WINDOW)
+    for i in range(len(FEW)):
+        hit = jax.tree.map(lambda leaf, i=i: leaf[i], recorded.impacts)
+        inside = (hit.side != 0) & (hit.n >= WINDOW["transient"])
+        joules = np.asarray(harvested_energy(DEVICE, jnp.asarray(hit.depth[inside]))).sum()
+        # A trip of chaos apart, that is rounding grown over 50 periods.
+        loose = PLANE[i]["p"] == 0
+        if loose:
+            continue
+        assert found.impacts_per_period[i] == inside.sum() / WINDOW["periods"]
+        np.testing.assert_allclose(found.contact_fraction[i], hit.duration[inside].sum() / 80, rtol=1e-7)
+        np.testing.assert_allclose(found.fastest[i], np.abs(hit.v_in[inside]).max(), rtol=1e-7)
+        np.testing.assert_allclose(found.deepest[i], hit.depth[inside].max(), rtol=1e-7)
+        np.testing.assert_allclose(found.P[i, 0], joules / 80, rtol=1e-7)
+    assert np.all(found.periods_run == 50)
+    assert np.all(found.period == -1)
+
+
+def test_a_mirrored_start_half_a_period_later_ends_on_the_mirrored_attractor(plane, recorded):
+    calm = [i for i, known in enumerate(FEW) if known["p"] and known["converged_after"] < 50]
+    state = recorded.states
+    row = [len(FEW) + i for i in calm]  # mirrored starts, at phase 0 of the next period
+    starts = [FEW[i] | {"u0": state.u[j, 0], "v0": state.v[j, 0]} for i, j in zip(calm, row, strict=True)]
+    mirrored = summarise(starts)
+    assert np.array_equal(mirrored.period, plane.period[calm])
+    assert np.array_equal(mirrored.impacts_left, plane.impacts_right[calm])
+    assert np.array_equal(mirrored.impacts_right, plane.impacts_left[calm])
+    np.testing.assert_allclose(mirrored.P, plane.P[calm], rtol=1e-10)
+    np.testing.assert_allclose(mirrored.restitution_left, plane.restitution_right[calm], rtol=1e-9)
+
+
+# --- how cells end ---------------------------------------------------------------------------------------------------
+
+
+def test_motion_that_fits_between_the_walls_has_no_impact():
+    # u = -cos(pi t)/pi^2, the centred orbit of the neutral family, and a neighbour of it.
+    ball = dict(v0=0.0, u0=-1 / math.pi**2)
+    found = summarise([cell(0.3, 12.65, **ball), cell(0.21, 400.0, **ball), cell(0.3, 4.0, u0=-0.1, v0=0.0)])
+    assert np.all(found.status == Status.NO_IMPACT)
+    for name in ("P", "P_stderr", "energy_ratio", "deepest", "fastest", "impacts_per_period", "contact_fraction"):
+        assert np.all(getattr(found, name) == 0), name
+    assert np.all(found.impacts_left == 0)
+    assert np.all(np.isnan(found.restitution))
+    assert np.all(np.isnan(found.lyapunov))
+
+
+def test_gravity_beyond_the_forcing_ends_in_permanent_contact():
+    cells = [cell(0.3, 40.0, gamma=-2.0, u0=0.0, v0=0.1), cell(0.3, 40.0, gamma=2.0, u0=0.0, v0=0.1)]
+    for found in (summarise(cells, 60), summarise([c | {"kappa": None} for c in cells], 60)):
+        assert np.all(found.status == Status.PERMANENT_CONTACT)
+        assert np.all(found.P == 0)
+        assert np.all(found.contact_fraction == 1)
+        assert np.all(found.impacts_per_period == 0)
+
+
+def test_chatter_on_rigid_walls_ends_in_sticking():
+    found = summarise([cell(0.02), cell(0.01), cell(0.3)])
+    assert list(found.status) == [Status.STICKING, Status.STICKING, Status.OK]
+    assert np.array_equal(found.period, [1, 1, 1])
+    assert np.array_equal(found.impacts_left, found.impacts_right)
+    assert np.all(found.contact_fraction[:2] > 0.2)
+    assert np.all(found.lyapunov[:2] == -np.inf)  # what sticks forgets its start
+
+
+def test_more_impacts_than_the_budget_end_a_cell_alone():
+    # An elastic wall keeps the speed: 2 |v|/d = 4000 impacts a period.
+    found = summarise([cell(0.005, r=1.0, u0=0.0, v0=10.0), cell(0.3)], 20)
+    assert list(found.status) == [Status.EVENT_BUDGET, Status.OK]
+    assert np.all(np.isnan(found.P[0]))
+    assert found.period[0] == -1
+    assert np.all(found.P[1] > 0)
+
+
+def test_a_start_inside_a_soft_wall_is_a_contact_without_onset():
+    inside, outside = cell(0.2, 12.65, u0=0.11, v0=-0.1), cell(0.2, 12.65)
+    found = summarise([inside, outside])
+    np.testing.assert_allclose(found.P[0], found.P[1], rtol=1e-10)
+
+
+# --- other programs --------------------------------------------------------------------------------------------------
+
+
+def test_float32_agrees_as_far_as_it_reaches(plane):
+    sharp = np.flatnonzero(PERIODIC & (known("p") == 1) & (known("attractors_found") == 1))
+    rough = summarise([PLANE[i] for i in sharp], dtype="float32")
+    assert rough.P.dtype == np.float32
+    agree = (rough.period == 1) & (rough.impacts_left == plane.impacts_left[sharp])
+    assert agree.mean() > 0.9
+    np.testing.assert_allclose(rough.P[agree, 0], plane.P[sharp[agree], 0], rtol=3e-3)
+
+
+def test_inclined_cells_know_the_50_digit_orbit_and_run_into_attractors():
+    orbit = next(orbit for orbit in ORBITS if orbit["gamma"] != 0)
+    found = summarise([orbit_cell(orbit), cell(0.3, 12.65, gamma=0.1), cell(0.2, 400.0, gamma=0.1)], 60)
+    assert np.all(found.status == Status.OK)
+    assert np.all(found.period == 1)
+    assert found.lyapunov[0] == pytest.approx(largest_exponent(orbit), abs=1e-8)
+    np.testing.assert_allclose(found.P[0, 0], float(orbit["P_J"]), rtol=1e-11)
