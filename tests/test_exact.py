@@ -240,7 +240,7 @@ def test_beyond_unit_gravity_the_ball_falls_and_rests():
     for kappa in (20.0, None):
         on_left = march(pairs(0.2, kappa, 0.5, 1.5), start(-0.1, 0.0, 0.4, -1))
         assert on_left.out.permanent[0, 0] or kappa is not None
-        fall = march(pairs(0.2, kappa, 0.5, 1.5), start(0.1, 0.0, 0.4, 0))
+        fall = march(pairs(0.2, kappa, 0.1, 1.5), start(0.1, 0.0, 0.4, 0))
         assert fall.out.impact.side[0, 0] == -1
         assert fall.out.impact.v_in[0, 0] < 0
         # The engine's time of the fall solves d = fall of the flight.

@@ -111,6 +111,9 @@ def run(
     """
     width = min(lanes, width)
 
+    def able(cell, carry):
+        return ((cell >= 0) & ~program.declined(carry) & ~program.stopped(carry)).sum()
+
     def serve(cell, carry):
         """Serve easy lanes together, and apart from them the hard ones, which would hold up a whole batch."""
         declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
@@ -123,12 +126,17 @@ def run(
         """Whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
         declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
         full = ((declined & ~hard).sum() >= width) | ((declined & hard).sum() >= width)
-        return full | (declined.any() & (declined.sum() >= able(carry)))
+        return full | (declined.any() & (declined.sum() >= able(cell, carry)))
+
+    def free(queue: _Queue) -> Bool[Array, "lane"]:
+        """Lanes whose cell is done, or that wait for their first."""
+        return jnp.where(queue.cell >= 0, program.done(queue.carry), queue.waiting < count)
 
     def refill(queue: _Queue) -> _Queue:
-        members, place, chosen = _first(program.done(queue.carry) & (queue.cell >= 0), width)
+        members, place, chosen = _first(free(queue), width)
         ready = jnp.arange(width, dtype=jnp.int32) < chosen.sum(dtype=jnp.int32)
-        rows = jnp.where(ready, queue.cell[members], cells.shape[0])  # past the end: dropped
+        rows = queue.cell[members]
+        rows = jnp.where(ready & (rows >= 0), rows, cells.shape[0])  # past the end: dropped
         results = queue.results.at[rows].set(program.unload(_take(queue.carry, members)), mode="drop")
         start = queue.waiting + jnp.arange(width, dtype=jnp.int32)
         fresh = program.load(cells[jnp.minimum(start, cells.shape[0] - 1)])
@@ -137,33 +145,31 @@ def run(
         cell = jnp.where(chosen, begun[jnp.minimum(place, width - 1)], queue.cell)
         return _Queue(carry, cell, queue.waiting + ready.sum(dtype=jnp.int32), results)
 
-    def idle(queue: _Queue) -> Int[Array, ""]:
-        return (program.done(queue.carry) & (queue.cell >= 0)).sum(dtype=jnp.int32)
+    def to_refill(queue: _Queue) -> Bool[Array, ""]:
+        # With cells waiting a refill is worth its price only for several lanes; at the end nobody waits for it.
+        enough = jnp.where(queue.waiting < count, max(lanes // _SHARE, 1), 1)
+        return free(queue).sum() >= enough
 
-    def able(carry):
-        return (~program.declined(carry) & ~program.stopped(carry)).sum()
-
-    def keeps_on(at_first, state):
+    def keeps_on(cell, at_first, state):
         """Up to `TRIPS` trips, fewer once half the lanes that set out wait for something else."""
         trip, carry = state
-        return (trip < TRIPS) & (2 * able(carry) > at_first)
+        return (trip < TRIPS) & (2 * able(cell, carry) > at_first)
 
     def one_trip(state):
         return state[0] + 1, program.trip(state[1])
 
     def round_trip(queue: _Queue) -> _Queue:
-        _, carry = lax.while_loop(partial(keeps_on, able(queue.carry)), one_trip, (0, queue.carry))
+        queue = lax.while_loop(to_refill, refill, queue)
+        going = partial(keeps_on, queue.cell, able(queue.cell, queue.carry))
+        _, carry = lax.while_loop(going, one_trip, (0, queue.carry))
         carry = lax.while_loop(partial(to_serve, queue.cell), partial(serve, queue.cell), carry)
-        queue = queue._replace(carry=program.review(carry))
-        # With cells waiting a refill is worth its price only for several lanes; at the end nobody waits for it.
-        enough = jnp.where(queue.waiting < count, max(lanes // _SHARE, 1), 1)
-        return lax.while_loop(lambda q: idle(q) >= enough, refill, queue)
+        return queue._replace(carry=program.review(carry))
 
-    first = jnp.arange(lanes, dtype=jnp.int32)
+    # Every cell is loaded by `refill`, the first ones too: another compiled copy of `load` may round otherwise.
     queue = _Queue(
-        carry=program.load(cells[jnp.minimum(first, cells.shape[0] - 1)]),
-        cell=jnp.where(first < count, first, -1),
-        waiting=jnp.asarray(lanes, jnp.int32),
+        carry=program.load(jnp.broadcast_to(cells[0], (lanes, cells.shape[1]))),
+        cell=jnp.full(lanes, -1, jnp.int32),
+        waiting=jnp.asarray(0, jnp.int32),
         results=jnp.zeros((cells.shape[0], outputs), cells.dtype),
     )
-    return lax.while_loop(lambda q: (q.cell >= 0).any(), round_trip, queue).results
+    return lax.while_loop(lambda q: (q.cell >= 0).any() | (q.waiting < count), round_trip, queue).results

@@ -81,7 +81,7 @@ def _one(periods: int, max_impacts: int, pair: ImpactPair, u0, v0, t0) -> Trajec
     real = real & (jnp.cumsum(real) <= max_impacts) & (out.impact.n < periods)
     order = jnp.argsort(~real, stable=True)[:max_impacts]
     filled = real.sum(dtype=jnp.int32)
-    there = jnp.arange(max_impacts) < filled
+    there = jnp.arange(max_impacts, dtype=jnp.int32) < filled
 
     def keep(leaf):
         blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
