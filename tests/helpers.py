@@ -161,20 +161,22 @@ def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
     w0 = np.where(mode != 0, side * ran.before.u[index] - d / 2, 0.0)
     z0, t = side * ran.out.impact.v_in[index], ran.out.impact.t[index]
     length = np.where(np.isfinite(ran.out.stay[index]), ran.out.stay[index], HORIZON)
-    need = 40 * np.maximum(kappa, np.pi) * length / np.pi
-    # Long after the oscillation has decayed only the steady response moves.
+    # Long after the oscillation has decayed only the steady response moves: a grid of its own.
     zeta = -np.log(r) / np.hypot(np.pi, np.log(r)) * kappa
-    need = np.where(zeta * length > 60, 40 * (60 / zeta * kappa + 40 * length) / np.pi, need)
+    early = np.minimum(length, 60 / np.maximum(zeta, 1e-9))
+    need = 40 * np.maximum(np.maximum(kappa, np.pi) * early, np.pi * length) / np.pi
     worst = np.empty(len(d))
     for low, high in zip((0, *_WIDTHS[:-1]), (*_WIDTHS[:-1], np.inf), strict=True):
         chosen = np.nonzero((need >= low) & (need < high))[0]
         width = int(min(high, _WIDTHS[-1]))
         for first in range(0, len(chosen), 2**19 // width):
             k = chosen[first : first + 2**19 // width]
-            s = length[k, None] * np.linspace(0, 1, width)[1:]
-            w, _ = long_contact(*(x[k, None] for x in (kappa, r, gamma, side, t, w0, z0)), s)
-            scale = np.abs(w).max(axis=-1)
-            worst[k] = (_peak(-w) / np.where(scale > 0, scale, 1)).astype(float)
+            grid = np.linspace(0, 1, width)
+            spans = (early[k, None] * grid[1:], early[k, None] + (length - early)[k, None] * grid)
+            both = [long_contact(*(x[k, None] for x in (kappa, r, gamma, side, t, w0, z0)), s)[0] for s in spans]
+            scale = np.maximum(*(np.abs(w).max(axis=-1) for w in both))
+            below = np.maximum(*(_peak(-w) for w in both))
+            worst[k] = (below / np.where(scale > 0, scale, 1)).astype(float)
     return worst
 
 

@@ -267,7 +267,7 @@ def test_permanent_contact_is_said_only_where_w_never_returns():
 
 @pytest.fixture(scope="module")
 def soft_runs():
-    pair, state = random_cells(np.random.default_rng(21), 3 * TILE, soft=True)
+    pair, state = random_cells(np.random.default_rng(21), TILE, soft=True)
     return pair, march(pair, state)
 
 
@@ -316,7 +316,7 @@ def test_determinant_of_the_monodromy(soft_runs, rigid_runs, steps):
     for pair, ran in (soft_runs, rigid_runs):
         with np.errstate(invalid="ignore", over="ignore"):
             error = determinants(pair, ran, steps)
-        assert np.isfinite(error).sum() > TILE
+        assert np.isfinite(error).sum() > TILE // 3
         assert np.nanmax(error) < 1e-11
 
 
@@ -339,13 +339,13 @@ def test_energy_of_a_soft_contact_is_positive_and_balances(soft_runs):
 def test_no_wall_is_crossed_before_the_one_reported(soft_runs, rigid_runs):
     for pair, ran in (soft_runs, rigid_runs):
         beyond = audit_flights(pair, ran)
-        assert len(beyond) > 1000
+        assert len(beyond) > 500
         assert np.max(beyond) < 4 * EPS
 
 
 def test_no_contact_ends_before_the_exit_reported(soft_runs):
     below = audit_contacts(*soft_runs)
-    assert len(below) > 1000
+    assert len(below) > 500
     assert np.max(below) < 64 * EPS
 
 

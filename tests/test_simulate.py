@@ -73,9 +73,9 @@ def test_periodic_cells_have_the_known_period_counts_and_power(plane):
     sure = PERIODIC & ~slow
     assert np.all(plane.status[sure] == Status.OK)
     counts = [(cell["p"], cell.get("left"), cell.get("right")) for cell in PLANE]
-    assert [
-        (i, *counts[i]) for i in np.flatnonzero(sure)
-    ] == [(i, plane.period[i], plane.impacts_left[i], plane.impacts_right[i]) for i in np.flatnonzero(sure)]
+    assert [(i, *counts[i]) for i in np.flatnonzero(sure)] == [
+        (i, plane.period[i], plane.impacts_left[i], plane.impacts_right[i]) for i in np.flatnonzero(sure)
+    ]
     np.testing.assert_allclose(plane.P[sure, 0], known("P_J")[sure], rtol=1e-9)
     assert np.all(plane.P_stderr[sure] == 0)
 

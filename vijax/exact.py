@@ -230,7 +230,7 @@ def deepest_time(
 
     def visit(carry):
         """From s, where sign w' is about to be positive (sign = +1: w rises), on to the next zero of w'."""
-        cycle, s, sign, best, best_w, _ = carry
+        cycle, s, sign, best, best_w, _, _ = carry
         w, z = flow.oscillate(m, force, w0, z0, s)
         settled = _amplitude(m, steady, w, z, s) <= eps * (jnp.abs(steady.c) + jnp.abs(steady.q) + jnp.abs(w))
         better = (w > best_w) & (s > 0)
@@ -241,18 +241,19 @@ def deepest_time(
         jerk = Force(sign * jerk.c, sign * jerk.q, sign * jerk.g)
         z = jnp.where(s == 0, z, 0.0)  # at an extremum w' is zero, not its rounding error
         ahead = s + first_return(m, jerk, sign * z, sign * rate, going, patience, end - s)
+        lost = going & jnp.isnan(ahead)
         going = going & (ahead < end)
-        return cycle + 1, jnp.where(going, ahead, s), -sign, best, best_w, going
+        return cycle + 1, jnp.where(going, ahead, s), -sign, best, best_w, going, lost
 
     # A start at rest or already falling inside the wall is deepest where it begins.
     rising = (z0 > 0) | ((z0 == 0) & (force.at(zero) > m.kappa * m.kappa * w0))
-    start = (jnp.int32(0), zero, jnp.ones_like(w0), zero, w0, wanted & rising)
-    _, _, _, best, best_w, left = lax.while_loop(lambda c: c[5] & (c[0] < patience), visit, start)
+    start = (jnp.int32(0), zero, jnp.ones_like(w0), zero, w0, wanted & rising, jnp.zeros_like(wanted))
+    _, _, _, best, best_w, left, lost = lax.while_loop(lambda c: c[5] & (c[0] < patience), visit, start)
     crest = -jnp.arctan2(steady.q, steady.c) / PI
     crest = jnp.where(crest < 0, crest + 2, crest)
     known = jnp.isfinite(crest) & (crest < end)
     w, _ = flow.oscillate(m, force, w0, z0, jnp.where(known, crest, 0.0))
-    return jnp.where(left, jnp.nan, jnp.where(known & (w > best_w), crest, best))
+    return jnp.where(left | lost, jnp.nan, jnp.where(known & (w > best_w), crest, best))
 
 
 # --- the next wall crossing of a flight -----------------------------------------------------------

@@ -254,12 +254,15 @@ def contact_force(gamma: Scalar, side: Scalar, t: Scalar) -> Force:
 
 
 def steady_response(m: Membrane, force: Force) -> Force:
-    """Steady response of the membrane to `force`, in the same form; infinite at the undamped resonance."""
+    """Steady response of the membrane to `force`, in the same form; infinite at the undamped resonance.
+
+    The forcing is the real part of (c + i q) e^(i pi s): divide by kappa^2 - pi^2 + i mu pi.
+    """
     stiffness, loss = (m.kappa - PI) * (m.kappa + PI), m.mu * PI
     square = stiffness * stiffness + loss * loss
     return Force(
-        (stiffness * force.c - loss * force.q) / square,
-        (stiffness * force.q + loss * force.c) / square,
+        (stiffness * force.c + loss * force.q) / square,
+        (stiffness * force.q - loss * force.c) / square,
         force.g / (m.kappa * m.kappa),
     )
 

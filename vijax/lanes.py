@@ -18,7 +18,7 @@ Carry = Any
 
 TRIPS = 16  # quick trips between two rounds of serving, reviewing and refilling
 FIRST_PATIENCE = 6  # stages that a careful trip may take before its lane is set aside as hard
-LAST_PATIENCE = 2**30
+LAST_PATIENCE = 20_000
 _SHARE = 16  # a refill waits until one lane in so many is free
 _CPU_OPTIONS = {
     # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.

@@ -1,0 +1,85 @@
+"""The quick step: where it is sure it is right, and on the planes it was made for it is nearly always sure."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import EPS, TILE, march, pairs, start
+
+from vijax import quick
+
+COUNT = 16 * TILE
+
+
+def drawn(rng, r):
+    """Cells of the plane d 0.05..0.3 x kappa 3..400 (log) and starts somewhere on their trajectories."""
+    d, kappa = rng.uniform(0.05, 0.3, TILE), np.exp(rng.uniform(np.log(3), np.log(400), TILE))
+    return d, kappa, np.full(TILE, r), rng.uniform(-0.45, 0.45, TILE) * d, rng.uniform(-0.7, 0.7, TILE)
+
+
+@pytest.fixture(scope="module", params=["soft", "rigid"])
+def both(request):
+    """The exact steps of drawn trajectories, and the quick step from each of their states."""
+    rng = np.random.default_rng(5)
+    d, kappa, r, u, v = drawn(rng, 0.5)
+    pair = pairs(d, kappa if request.param == "soft" else None, r, 0.0)
+    ran = march(pair, start(u, v, rng.uniform(0, 2, TILE)))
+    pair = jax.tree.map(lambda x: jnp.asarray(np.repeat(x, ran.out.flight.shape[1])), pair)
+    flat = jax.tree.map(lambda x: x.reshape(COUNT, *x.shape[2:]), ran)
+    lane = quick.Lanes(*(jnp.asarray(getattr(flat.before, name), float) for name in ("u", "v", "t", "n")))
+
+    def program(pair, lane):
+        return quick.quick_step(quick.prepare(pair), jnp.zeros_like(lane.u), lane, deep=True, tangent=True)
+
+    hit, sure, never = jax.tree.map(np.asarray, jax.jit(program)(pair, lane))
+    return request.param, flat, hit, sure, never
+
+
+def test_where_sure_it_agrees_with_the_exact_step(both):
+    kind, exact, hit, sure, never = both
+    out, impact = exact.out, exact.out.impact
+    plain = sure & (impact.side != 0)
+    assert np.array_equal(sure & ~out.stuck, plain)
+    assert not np.any(never & (impact.side != 0))
+    assert np.array_equal(hit.side[plain], impact.side[plain])
+    speed = np.abs(impact.v_in[plain])
+    # A rounding of the place moves the crossing by eps over the speed.
+    moved = 1e-15 + 100 * EPS * 0.01 / speed
+    clock = 2 * hit.onset_n + hit.onset_t - 2 * impact.n - impact.t
+    assert np.max(np.abs(clock[plain]) / moved) < 1e3
+    close = {
+        "flight": (hit.flight, out.flight),
+        "duration": (hit.duration, out.stay),
+        "v_in": (hit.v_in, impact.v_in),
+        "v_out": (hit.v_out, impact.v_out),
+        "depth": (hit.depth, impact.depth),
+        "work": (hit.work, impact.work),
+        "u": (hit.after.u, out.state.u),
+        "v": (hit.after.v, out.state.v),
+    }
+    for name, (got, want) in close.items():
+        assert np.max(np.abs(got - want)[plain] * speed) < 1e-12, (kind, name)
+    got, want = np.stack(hit.tangent, axis=1), exact.tangent.reshape(COUNT, 4)
+    size = np.linalg.norm(want, axis=1)
+    assert np.max((np.abs(got - want).max(axis=1) / np.maximum(1, size) * np.abs(impact.v_in))[plain]) < 1e-12
+
+
+def test_it_is_sure_of_nearly_every_step(both):
+    _, exact, _, sure, _ = both
+    impacts = exact.out.impact.side != 0
+    assert sure[impacts].mean() > 0.95
+
+
+def test_polynomials_are_good_to_rounding():
+    x = np.linspace(-quick._REACH, quick._REACH, 20001)
+    sine, cosine = quick._sine_cosine(jnp.asarray(x))
+    assert np.max(np.abs(sine - np.sin(x))) < 2.5 * EPS
+    assert np.max(np.abs(cosine - np.cos(x))) < 2.5 * EPS
+    x = np.linspace(-quick._EXP_REACH, quick._EXP_REACH, 20001)
+    assert np.max(np.abs(np.asarray(quick._exp(jnp.asarray(x))) / np.exp(x) - 1)) < 8 * EPS
+    x = np.linspace(-1, 1, 20001)
+    assert np.max(np.abs(np.asarray(quick._arcsine(jnp.asarray(x))) - np.arcsin(x))) < 4 * EPS
+    t = np.linspace(0, 2, 20001)
+    sine, cosine = quick._phase(jnp.asarray(t))
+    assert np.max(np.abs(sine - np.sin(np.pi * t))) < 5 * EPS
+    assert np.max(np.abs(cosine - np.cos(np.pi * t))) < 5 * EPS

@@ -1,0 +1,133 @@
+"""Derivatives of impacts against 50-digit differences, stroboscopic states, and errors at the door."""
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+from helpers import DIGITS, mp_march
+
+import vijax
+from vijax.model import ImpactPair, Status, impact_pair
+
+IMPACTS, PERIODS = 3, 4
+H = "1e-9"
+NAMES = ("t", "v_in", "v_out", "depth", "duration")
+# d, kappa, r, gamma, u0, v0
+SOFT = [(0.2, 4.0, 0.5, 0.0, 0.02, 0.3), (0.2, 40.0, 0.5, 0.05, 0.02, 0.3), (0.15, 12.0, 0.1, 0.1, 0.02, 0.3)]
+RIGID = [(0.12, None, 0.5, 0.0, 0.02, 0.3), (0.25, None, 0.8, 0.1, 0.02, 0.3)]
+
+
+def events(rigid: bool):
+    """Impacts as one array [impact, name] of the parameters as one vector."""
+
+    def run(x):
+        pair = ImpactPair(x[0], None if rigid else x[1], x[2], x[3])
+        hits = vijax.trajectory(pair, x[4], x[5], PERIODS, max_impacts=IMPACTS).impacts
+        time = 2.0 * hits.n.astype(x.dtype) + hits.t
+        zero = jnp.zeros_like(time)
+        return jnp.stack([time, hits.v_in, hits.v_out, zero if rigid else hits.depth, hits.duration], axis=-1)
+
+    return run
+
+
+def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
+    """First and second derivative along a direction by central differences in 50 digits, [impact, name]."""
+    with mp.workdps(DIGITS):
+        h = mp.mpf(H)
+        middle, guesses = mp_march(case, IMPACTS)
+
+        def at(factor):
+            moved = [None if x is None else mp.mpf(x) + factor * h * mp.mpf(w) for x, w in zip(case, direction)]
+            return mp_march(moved, IMPACTS, guesses)[0]
+
+        ahead, behind = at(1), at(-1)
+        table = [[[getattr(row, name) for name in NAMES] for row in rows] for rows in (behind, middle, ahead)]
+        first, second = np.empty((2, IMPACTS, len(NAMES)))
+        for i in range(IMPACTS):
+            for j in range(len(NAMES)):
+                low, here, high = (rows[i][j] for rows in table)
+                first[i, j], second[i, j] = (high - low) / (2 * h), (high - 2 * here + low) / h**2
+        return first, second
+
+
+@pytest.fixture(scope="module", params=["soft", "rigid"])
+def jets(request):
+    """Cases, directions, first and second derivatives by forward mode, and the reverse-mode Jacobian."""
+    rigid = request.param == "rigid"
+    cases = RIGID if rigid else SOFT
+    directions = np.eye(6) if not rigid else np.delete(np.eye(6), 1, axis=0)
+    mixed = np.random.default_rng(0).uniform(-1, 1, 6) * (1 - rigid * np.eye(6)[1])
+    directions = np.vstack([directions, mixed])
+    run = events(rigid)
+
+    def jet(x, w):
+        first = lambda y: jax.jvp(run, (y,), (w,))[1]  # noqa: E731  one line, twice differentiated
+        return jax.jvp(first, (x,), (w,))
+
+    points = jnp.asarray([[0.0 if x is None else x for x in case] for case in cases])
+    first, second = jax.jit(jax.vmap(jax.vmap(jet, (None, 0)), (0, None)))(points, jnp.asarray(directions))
+    reverse = jax.jit(jax.vmap(jax.jacrev(run)))(points)
+    return cases, directions, np.asarray(first), np.asarray(second), np.asarray(reverse)
+
+
+def test_first_and_second_derivatives(jets):
+    cases, directions, first, second, _ = jets
+    for i, case in enumerate(cases):
+        for j, direction in enumerate(directions):
+            true_first, true_second = differences(case, direction)
+            for got, want, limit in ((first, true_first, 1e-9), (second, true_second, 1e-6)):
+                # Relative to the largest of the event's derivatives where one happens to vanish.
+                size = np.maximum(np.abs(want), 1e-3 * np.abs(want).max(axis=0, keepdims=True) + 1e-6)
+                assert np.max(np.abs(got[i, j] - want) / size) < limit, (case, direction)
+
+
+def test_reverse_is_forward(jets):
+    _, directions, first, _, reverse = jets
+    pushed = np.einsum("cinp,wp->cwin", reverse, directions)
+    assert np.allclose(pushed, first, rtol=1e-11, atol=1e-11)
+
+
+def test_restarting_from_a_stroboscopic_state_goes_on_the_same():
+    pair = impact_pair([0.2, 0.2, 0.15], [4.0, 40.0, 12.0], [0.5, 0.5, 0.1], [0.0, 0.05, 0.1])
+    whole = vijax.trajectory(pair, 0.02, 0.3, 6)
+    flying = np.asarray(whole.states.mode[:, 2] == 0)
+    again = vijax.trajectory(pair, whole.states.u[:, 2], whole.states.v[:, 2], 3)
+    assert np.allclose(again.states.u[flying], whole.states.u[flying, 3:], rtol=0, atol=1e-11)
+    assert np.allclose(again.states.v[flying], whole.states.v[flying, 3:], rtol=0, atol=1e-10)
+    # In a contact the position and the velocity are the state as well.
+    assert np.allclose(again.states.u, whole.states.u[:, 3:], rtol=0, atol=1e-10)
+    assert np.all(np.asarray(whole.status) == Status.OK)
+
+
+def test_too_few_impacts_are_said():
+    pair = impact_pair(0.2, 40.0, 0.5)
+    short = vijax.trajectory(pair, 0.02, 0.3, 4, max_impacts=2)
+    assert int(short.status) == Status.EVENT_BUDGET
+    assert int(short.filled) == 2
+    assert np.isnan(np.asarray(short.states.u))[-1]
+
+
+def test_a_ball_that_touches_nothing():
+    quiet = vijax.trajectory(impact_pair(1.0, 40.0, 0.5), -1 / np.pi**2, 0.0, 4)
+    assert int(quiet.status) == Status.NO_IMPACT
+    assert int(quiet.filled) == 0
+    assert np.allclose(quiet.states.u, -1 / np.pi**2, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"periods": 0}, "periods"),
+        ({"max_impacts": 0}, "max_impacts"),
+        ({"pair": ImpactPair(0.2, 40.0, 1.2, 0.0)}, "r must"),
+        ({"pair": ImpactPair(-0.2, 40.0, 0.5, 0.0)}, "d must"),
+        ({"pair": ImpactPair(0.2, np.inf, 0.5, 0.0)}, "kappa must"),
+        ({"u0": np.nan}, "u0"),
+        ({"pair": ImpactPair(0.2, None, 0.5, 0.0), "u0": 0.3}, "u0"),
+    ],
+)
+def test_bad_input_is_named(arguments, says):
+    given = {"pair": ImpactPair(0.2, 40.0, 0.5, 0.0), "u0": 0.0, "v0": 0.3, "periods": 4} | arguments
+    with pytest.raises(ValueError, match=says):
+        vijax.trajectory(**given)
