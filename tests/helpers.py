@@ -1,4 +1,4 @@
-"""Cases and independent arithmetic of the engine's tests: the flow in 40 digits, in long double, a small event simulator.
+"""Cases and independent arithmetic of the engine's tests: the flow in 40 digits, in long double, and a small simulator.
 
 Nothing here calls the engine but `march`, which runs many starts in one compiled shape.
 """
@@ -29,7 +29,7 @@ def reference_trajectories() -> list[dict[str, Any]]:
     return json.loads((DATA / "trajectories.json").read_text())["cases"]
 
 
-# --- the exact engine on many starts -----------------------------------------------------------------------------------
+# --- the exact engine on many starts -------------------------------------------------------------------------------
 
 
 class March(NamedTuple):
@@ -91,7 +91,7 @@ def random_cells(rng: np.random.Generator, count: int, soft: bool) -> tuple[Impa
     return pairs(d, kappa if soft else None, r, gamma), start(u, v, rng.uniform(0, 2, count))
 
 
-# --- the flow in long double ---------------------------------------------------------------------------------------------
+# --- the flow in long double ---------------------------------------------------------------------------------------
 
 
 def long_flight(gamma, t0, v0, s):
@@ -148,7 +148,12 @@ def audit_flights(pair: ImpactPair, ran: March, samples: int = 400) -> np.ndarra
     return np.concatenate(worst)
 
 
-_WIDTHS = (256, 4096, 65536, 262144)  # samples of a contact: 40 a half cycle of the faster oscillation, as far as that goes
+_WIDTHS = (
+    256,
+    4096,
+    65536,
+    262144,
+)  # samples of a contact: 40 a half cycle of the faster oscillation, as far as that goes
 
 
 def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
@@ -252,7 +257,7 @@ def grazing_contacts(rng: np.random.Generator, count: int, steps: int = STEPS, t
     return Extrema(-w.astype(float), s.astype(float), ran)
 
 
-# --- the flow and a small event simulator in 50 digits -----------------------------------------------------------------
+# --- the flow and a small event simulator in 50 digits -------------------------------------------------------------
 
 
 def mp_flight(gamma, t0, v0, s):

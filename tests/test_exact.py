@@ -69,7 +69,7 @@ def test_reference_trajectories(cases):
             assert error.max() < 1e-9, (case["case"], name)
 
 
-# --- answers first ------------------------------------------------------------------------------------------------------
+# --- answers first -------------------------------------------------------------------------------------------------
 
 
 def starts_before_an_impact(rng, count, gamma_size):
@@ -119,7 +119,7 @@ def contact_errors(kappa, r, gamma, side, t, v, got) -> tuple[float, float, floa
         )
 
 
-# kappa, r, gamma, phase, speed: into the wall against the forcing or with it, slow and fast, over the ends of the range.
+# kappa, r, gamma, phase, speed: into the wall against the forcing or with it, slow and fast, at both ends of the range.
 CONTACTS = [
     (400.0, 0.5, 0.0, 0.0, 1e-3),  # nine extrema
     (400.0, 0.9, 0.0, 0.0, 1e-3),
@@ -197,7 +197,7 @@ def test_slow_bounces_return(speed):
         assert np.all(ran.out.impact.side[:, 0] == side)
 
 
-# --- rigid walls: sticking ------------------------------------------------------------------------------------------------
+# --- rigid walls: sticking -----------------------------------------------------------------------------------------
 
 
 def test_a_chattering_ball_sticks_and_leaves_when_the_forcing_turns():
@@ -232,7 +232,7 @@ def test_the_chatter_time_does_not_depend_on_the_sticking_rule():
     assert np.abs(ran.out.impact.v_in[0, first]) * 0.3 < 1e-9
 
 
-# --- gravity beyond the forcing ------------------------------------------------------------------------------------------
+# --- gravity beyond the forcing ------------------------------------------------------------------------------------
 
 
 def test_beyond_unit_gravity_the_ball_falls_and_rests():
@@ -262,7 +262,7 @@ def test_permanent_contact_is_said_only_where_w_never_returns():
     assert ran.out.permanent[:, 0].any()
 
 
-# --- invariants -----------------------------------------------------------------------------------------------------------
+# --- invariants ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -333,7 +333,7 @@ def test_energy_of_a_soft_contact_is_positive_and_balances(soft_runs):
     assert np.all(ran.out.impact.v_out[plain] * ran.out.impact.side[plain] <= 0)
 
 
-# --- no missed event ------------------------------------------------------------------------------------------------------
+# --- no missed event -----------------------------------------------------------------------------------------------
 
 
 def test_no_wall_is_crossed_before_the_one_reported(soft_runs, rigid_runs):

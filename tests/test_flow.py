@@ -72,7 +72,9 @@ def test_a_contact_from_rest_keeps_its_digits():
 
     def one(kappa, r, s):
         one, zero = jnp.ones_like(s), jnp.zeros_like(s)
-        return flow.oscillate(flow.membrane(ImpactPair(one, kappa, r, zero)), flow.Force(one, zero, zero), zero, zero, s)
+        return flow.oscillate(
+            flow.membrane(ImpactPair(one, kappa, r, zero)), flow.Force(one, zero, zero), zero, zero, s
+        )
 
     w, z = jax.vmap(one)(kappa, r, s)
     with mp.workdps(DIGITS):
@@ -114,7 +116,12 @@ def test_half_turn_is_relative_near_zero_and_exact_at_quadrants():
         for k, x in enumerate(map(mp.mpf, s)):
             truth = (mp.sinpi(x), mp.cospi(x), 2 * mp.sinpi(x / 2) ** 2, mp.pi * x - mp.sinpi(x))
             near = abs(s[k]) < 0.25
-            sizes = (abs(truth[0]) if near else 1, 1, truth[2] if near else 1, abs(truth[3]) if near else 1 + abs(x) * 4)
+            sizes = (
+                abs(truth[0]) if near else 1,
+                1,
+                truth[2] if near else 1,
+                abs(truth[3]) if near else 1 + abs(x) * 4,
+            )
             for value, true, size in zip(values[:, k], truth, sizes, strict=True):
                 assert abs(value - true) <= 3 * EPS * size, (s[k], value)
     sine, cosine, _, _ = flow.half_turn(jnp.arange(-8, 9) / 2)

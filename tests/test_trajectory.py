@@ -38,7 +38,9 @@ def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
         middle, guesses = mp_march(case, IMPACTS)
 
         def at(factor):
-            moved = [None if x is None else mp.mpf(x) + factor * h * mp.mpf(w) for x, w in zip(case, direction)]
+            moved = [
+                None if x is None else mp.mpf(x) + factor * h * mp.mpf(w) for x, w in zip(case, direction, strict=True)
+            ]
             return mp_march(moved, IMPACTS, guesses)[0]
 
         ahead, behind = at(1), at(-1)
@@ -51,39 +53,53 @@ def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
         return first, second
 
 
-@pytest.fixture(scope="module", params=["soft", "rigid"])
-def jets(request):
-    """Cases, directions, first and second derivatives by forward mode, and the reverse-mode Jacobian."""
-    rigid = request.param == "rigid"
+def derivatives(rigid: bool):
+    """Cases, directions, first and second derivatives along them by forward mode, and the parameters' points."""
     cases = RIGID if rigid else SOFT
-    directions = np.eye(6) if not rigid else np.delete(np.eye(6), 1, axis=0)
-    mixed = np.random.default_rng(0).uniform(-1, 1, 6) * (1 - rigid * np.eye(6)[1])
+    directions = np.delete(np.eye(6), 1, axis=0) if rigid else np.eye(6)
+    mixed = np.random.default_rng(0).uniform(-1, 1, 6)
+    mixed[1] *= not rigid
     directions = np.vstack([directions, mixed])
     run = events(rigid)
 
     def jet(x, w):
-        first = lambda y: jax.jvp(run, (y,), (w,))[1]  # noqa: E731  one line, twice differentiated
-        return jax.jvp(first, (x,), (w,))
+        def slope(y):
+            return jax.jvp(run, (y,), (w,))[1]
+
+        return jax.jvp(slope, (x,), (w,))
 
     points = jnp.asarray([[0.0 if x is None else x for x in case] for case in cases])
     first, second = jax.jit(jax.vmap(jax.vmap(jet, (None, 0)), (0, None)))(points, jnp.asarray(directions))
-    reverse = jax.jit(jax.vmap(jax.jacrev(run)))(points)
-    return cases, directions, np.asarray(first), np.asarray(second), np.asarray(reverse)
+    return cases, directions, np.asarray(first), np.asarray(second), points
+
+
+def relative(got, want) -> tuple[float, float]:
+    """Largest errors of first and second derivatives, over the larger ones where one vanishes."""
+    worst = []
+    for value, true in zip(got, want, strict=True):
+        size = np.maximum(np.abs(true), 1e-3 * np.abs(true).max(axis=0, keepdims=True) + 1e-6)
+        worst.append(float(np.max(np.abs(value - true) / size)))
+    return tuple(worst)
+
+
+@pytest.fixture(scope="module", params=["soft", "rigid"])
+def jets(request):
+    rigid = request.param == "rigid"
+    return rigid, *derivatives(rigid)
 
 
 def test_first_and_second_derivatives(jets):
-    cases, directions, first, second, _ = jets
+    _, cases, directions, first, second, _ = jets
     for i, case in enumerate(cases):
         for j, direction in enumerate(directions):
-            true_first, true_second = differences(case, direction)
-            for got, want, limit in ((first, true_first, 1e-9), (second, true_second, 1e-6)):
-                # Relative to the largest of the event's derivatives where one happens to vanish.
-                size = np.maximum(np.abs(want), 1e-3 * np.abs(want).max(axis=0, keepdims=True) + 1e-6)
-                assert np.max(np.abs(got[i, j] - want) / size) < limit, (case, direction)
+            errors = relative((first[i, j], second[i, j]), differences(case, direction))
+            assert errors[0] < 1e-9, (case, direction)
+            assert errors[1] < 1e-6, (case, direction)
 
 
 def test_reverse_is_forward(jets):
-    _, directions, first, _, reverse = jets
+    rigid, _, directions, first, _, points = jets
+    reverse = jax.jit(jax.vmap(jax.jacrev(events(rigid))))(points)
     pushed = np.einsum("cinp,wp->cwin", reverse, directions)
     assert np.allclose(pushed, first, rtol=1e-11, atol=1e-11)
 

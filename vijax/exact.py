@@ -133,7 +133,11 @@ class _Search(eqx.Module):
 
 
 def _free_end(m: Membrane, w: Scalar, z: Scalar) -> Scalar:
-    """Time until the unforced oscillator at (w, z) would return to zero: less than half a free cycle."""
+    """Time until the unforced oscillator at (w, z) would return to zero: less than half a free cycle.
+
+    At the root itself w may come out below zero by rounding: that is zero, not the beginning of another cycle.
+    """
+    w = jnp.maximum(w, 0.0)
     return (PI - jnp.arctan2(m.omega1 * w, z + m.zeta * w)) / m.omega1
 
 

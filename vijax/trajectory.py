@@ -6,11 +6,12 @@ from functools import lru_cache, partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vijax import exact, flow
-from vijax.model import Impact, ImpactPair, State, Status, check
+from vijax.model import Impact, ImpactPair, State, Status, check, is_concrete
 
 
 class Trajectory(eqx.Module):
@@ -147,6 +148,11 @@ def trajectory(
             raise ValueError(f"{name} must be at least 1; got {value}")
     for name in ("d", "r", "gamma") + (() if pair.kappa is None else ("kappa",)):
         check(name, getattr(pair, name))
+    for name, value in (("u0", u0), ("v0", v0), ("t0", t0)):
+        if is_concrete(value) and not np.isfinite(np.asarray(value)).all():
+            raise ValueError(f"{name} must be finite; got {value}")
+    if pair.kappa is None and is_concrete(pair.d, u0) and (np.abs(np.asarray(u0)) > 0.5 * np.asarray(pair.d)).any():
+        raise ValueError(f"u0 must lie within the gap of a rigid wall, |u0| <= d/2; got u0 = {u0} at d = {pair.d}")
     dtype = jnp.result_type(pair.d)
     numbers = [jnp.asarray(x, dtype) for x in (u0, v0, t0)]
     shape = jnp.broadcast_shapes(*(x.shape for x in numbers), *(jnp.shape(x) for x in jax.tree.leaves(pair)))
