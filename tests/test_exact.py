@@ -253,7 +253,7 @@ def test_beyond_unit_gravity_the_ball_falls_and_rests():
 def test_permanent_contact_is_said_only_where_w_never_returns():
     kappa = np.array([20.0, 20.0, 3.0, 400.0])
     gamma = np.array([3.0, 1.2, 8.0, 1.01])
-    ran = march(pairs(0.2, kappa, 0.5, gamma), start(-0.1, -0.01, 0.4, -1))
+    ran = march(pairs(np.full(4, 0.2), kappa, 0.5, gamma), start(np.full(4, -0.1), -0.01, 0.4, -1))
     for k in range(4):
         end = np.inf if ran.out.permanent[k, 0] else ran.out.stay[k, 0]
         s = np.linspace(0, min(30.0, end), 400001)[1:-1]
@@ -307,6 +307,7 @@ def determinants(pair, ran, steps: int) -> np.ndarray:
         expected = pair.r ** (2 * steps)
     else:
         expected = np.exp(-np.asarray(pair.mu) * ran.out.stay[:, :steps].sum(axis=1))
+    matrix = np.where(plain.all(axis=1)[:, None, None], matrix, np.eye(2))
     error = np.abs(np.linalg.det(matrix) - expected) / np.maximum(1, np.linalg.norm(matrix, 2, axis=(1, 2)) ** 2)
     return np.where(plain.all(axis=1), error, np.nan)
 

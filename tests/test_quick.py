@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import EPS, TILE, march, pairs, start
+from helpers import EPS, HORIZON, TILE, march, pairs, start
 
-from vijax import quick
+from vijax import exact, quick
 
 COUNT = 16 * TILE
 
@@ -83,3 +83,24 @@ def test_polynomials_are_good_to_rounding():
     sine, cosine = quick._phase(jnp.asarray(t))
     assert np.max(np.abs(sine - np.sin(np.pi * t))) < 5 * EPS
     assert np.max(np.abs(cosine - np.cos(np.pi * t))) < 5 * EPS
+
+
+def test_patience_decides_or_says_that_it_did_not():
+    """A limited patience gives the unlimited answer or NaN, never something in between (it once gave a smaller depth)."""
+    rng = np.random.default_rng(5)
+    count = 256
+    d, kappa = rng.uniform(0.05, 0.3, count), np.exp(rng.uniform(np.log(3), np.log(400), count))
+    pair = jax.tree.map(jnp.asarray, pairs(d, kappa, 0.5, 0.0))
+    before = start(0.5 * d, -(10.0 ** rng.uniform(-3, 0, count)), rng.uniform(0, 2, count))
+    state = jax.tree.map(jnp.asarray, before)
+
+    @jax.jit
+    def step(patience):
+        return jax.vmap(lambda p, s: exact.step(p, s, jnp.asarray(HORIZON), patience=patience))(pair, state)
+
+    short, full = step(jnp.int32(6)), step(jnp.int32(exact.PATIENCE))
+    stay, depth = np.asarray(short.stay), np.asarray(short.impact.depth)
+    decided = np.isfinite(stay) & np.isfinite(depth)
+    assert 0.3 * count < decided.sum() < count
+    assert np.array_equal(stay[decided], np.asarray(full.stay)[decided])
+    assert np.array_equal(depth[decided], np.asarray(full.impact.depth)[decided])
