@@ -86,7 +86,7 @@ def test_polynomials_are_good_to_rounding():
 
 
 def test_patience_decides_or_says_that_it_did_not():
-    """A limited patience gives the unlimited answer or NaN, never something in between (it once gave a smaller depth)."""
+    """A limited patience gives the unlimited answer or NaN (it once gave the depth found so far)."""
     rng = np.random.default_rng(5)
     count = 256
     d, kappa = rng.uniform(0.05, 0.3, count), np.exp(rng.uniform(np.log(3), np.log(400), count))
