@@ -58,10 +58,10 @@ def plane(periods: int) -> None:
     cells = json.loads((TESTS / "data" / "plane_cells.json").read_text())["cells"]
     count = len(cells)
     pair = ImpactPair(*(jnp.asarray([c[k] for c in cells], float) for k in ("d", "kappa", "r", "gamma")))
-    begin = [jnp.asarray([c[k] for c in cells], float) for k in ("u0", "v0")]
+    u0, v0 = (jnp.asarray([c[k] for c in cells], float) for k in ("u0", "v0"))
     one = jnp.ones(count)
     scale = simulate.Scale(one, one, jnp.ones(1), jnp.ones(1))
-    got = simulate.summarise(pair, *begin, scale, Harvester(), periods=periods, outputs=frozenset({"P"}))
+    got = simulate.summarise(pair, u0, v0, scale, Harvester(), periods=periods, outputs=frozenset({"P"}))
     got = jax.tree.map(np.asarray, got)
     wrong = called = slow = 0
     worst, z, spread = 0.0, [], []

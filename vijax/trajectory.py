@@ -148,9 +148,9 @@ def trajectory(
             raise ValueError(f"{name} must be at least 1; got {value}")
     for name in ("d", "r", "gamma") + (() if pair.kappa is None else ("kappa",)):
         check(name, getattr(pair, name))
-    for name, value in (("u0", u0), ("v0", v0), ("t0", t0)):
-        if is_concrete(value) and not np.isfinite(np.asarray(value)).all():
-            raise ValueError(f"{name} must be finite; got {value}")
+    for name, start in (("u0", u0), ("v0", v0), ("t0", t0)):
+        if is_concrete(start) and not np.isfinite(np.asarray(start)).all():
+            raise ValueError(f"{name} must be finite; got {start}")
     if pair.kappa is None and is_concrete(pair.d, u0) and (np.abs(np.asarray(u0)) > 0.5 * np.asarray(pair.d)).any():
         raise ValueError(f"u0 must lie within the gap of a rigid wall, |u0| <= d/2; got u0 = {u0} at d = {pair.d}")
     dtype = jnp.result_type(pair.d)
