@@ -6,7 +6,20 @@
 One line a figure: what, the value, the limit, PASS or FAIL. Everything is measured against 50-digit arithmetic, long
 double or the reference cells; nothing against the engine itself. Typical printout:
 
-    (to be filled in from a run)
+    PASS  reference trajectories, first 4 impacts, relative error          1.15e-15  (at most 1e-13)
+    PASS  the same, all 16 of the non-chaotic cases                         1.1e-15  (at most 1e-11)
+    PASS  periodic cells with another period or impact counts                     0  (at most 0) 120 periodic ce
+    PASS  periodic cells called aperiodic                                         0  (at most 0)
+    PASS  largest relative error of P in them                              6.53e-12  (at most 1e-09)
+    PASS  aperiodic cells: largest |z|                                        0.868  (at most 4) 15 cells
+    PASS  aperiodic cells: median |z|                                         0.374  (at most 1.2)
+    PASS  aperiodic cells: largest relative standard error of P              0.0112  (at most 0.03)
+    PASS  missed wall crossings                                                   0  (at most 0) 3,120 flights o
+    PASS  missed exits                                                            0  (at most 0) 2,072 contacts
+    PASS  constructed extrema on the wrong side                                   0  (at most 0) 500 from 1e-14
+    PASS  |det - expected|/max(1, |M|^2) over four impacts                 3.94e-16  (at most 1e-11)
+
+(with --quick)
 """
 
 import argparse
