@@ -467,6 +467,18 @@ def step(
     return Outcome(after, impact, flight, stay, stuck & ends, wanted & ~hit, permanent)
 
 
+def start_mode(pair: ImpactPair, u: Scalar, v: Scalar, t: Scalar) -> Scalar:
+    """Contact side (0: none) of a start: inside a soft wall; on a wall by the velocity, at rest by the acceleration.
+
+    A rigid wall holds only a ball that rests on it and is pushed against it.
+    """
+    side = jnp.where(u > 0, 1.0, -1.0).astype(u.dtype)
+    gap = 0.5 * pair.d - side * u
+    resting = (gap == 0) & (v == 0) & (side * flow.acceleration(pair.gamma, t) > 0)
+    held = resting if pair.kappa is None else (gap < 0) | resting | ((gap == 0) & (side * v > 0))
+    return jnp.where(held, side, 0.0)
+
+
 def tangent(pair: ImpactPair, outcome: Outcome) -> Float[Array, "2 2"]:
     """Tangent map of one step in (du, du') at fixed times, from flight to flight, saltations included.
 

@@ -33,7 +33,6 @@ _SCALE = 2.0**40  # the tangent map is kept between 1/_SCALE and _SCALE, the res
 
 ENERGY = frozenset({"P", "P_stderr", "energy_ratio"})
 DEEP = ENERGY | {"deepest"}
-ORBIT = frozenset({"period", "lyapunov"})
 
 
 class Scale(eqx.Module):
@@ -208,7 +207,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
         length=length,
         speed=speed,
         ball=ball,
-        held=_mode(plan, pair, u, v),
+        held=exact.start_mode(pair, u, v, zero),
         running=~no,
         declined=no,
         hard=no,
@@ -223,17 +222,6 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
         exponent=zero if plan.tangent else None,
         multiplier=zero if plan.tangent else None,
     )
-
-
-def _mode(plan: Plan, pair: ImpactPair, u: Lane, v: Lane) -> Lane:
-    """Contact side of a start: inside a soft wall; on a wall by the velocity, at rest by the acceleration."""
-    side = jnp.where(u > 0, 1.0, -1.0).astype(u.dtype)
-    gap = 0.5 * pair.d - side * u
-    push = side * (1 - pair.gamma)
-    resting = (gap == 0) & (v == 0) & (push > 0)
-    if plan.rigid:
-        return jnp.where(resting, side, 0.0)
-    return jnp.where((gap < 0) | resting | ((gap == 0) & (side * v > 0)), side, 0.0)
 
 
 # --- trips ----------------------------------------------------------------------------------------

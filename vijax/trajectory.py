@@ -31,14 +31,9 @@ class Trajectory(eqx.Module):
 
 
 def _begin(pair: ImpactPair, u0, v0, t0) -> State:
-    """The start with its mode: in a soft wall the contact; on a wall by the velocity, at rest by the acceleration."""
+    """The start as a state, in contact or in flight."""
     t, n = flow.wrap_phase(t0)
-    side = jnp.where(u0 > 0, 1.0, -1.0)
-    gap = 0.5 * pair.d - side * u0
-    push = side * flow.acceleration(pair.gamma, t)
-    resting = (gap == 0) & (v0 == 0) & (push > 0)
-    held = resting if pair.kappa is None else (gap < 0) | resting | ((gap == 0) & (side * v0 > 0))
-    return State(u0, v0, t, n.astype(jnp.int32), jnp.where(held, side, 0.0).astype(jnp.int32))
+    return State(u0, v0, t, n.astype(jnp.int32), exact.start_mode(pair, u0, v0, t).astype(jnp.int32))
 
 
 def _time(state: State) -> Float[Array, "..."]:
