@@ -54,15 +54,31 @@ def trip(toy):
     )
 
 
-def careful(toy, patience):
-    hard = (toy.kind == HARD) & (patience < lanes.LAST_PATIENCE)
-    moves = ~hard
+class Answer(NamedTuple):
+    """What a second or a careful try makes of a lane."""
+
+    hash: Lane
+    sure: Bool[Array, "lane"]
+
+
+def careful(toy):
+    return Answer((5 * toy.hash + toy.left) % 1009, jnp.ones_like(toy.done))
+
+
+def second(toy):
+    """What it is not sure of it gets wrong."""
+    sure = toy.kind != HARD
+    return Answer(jnp.where(sure, careful(toy).hash, -1.0), sure)
+
+
+def settle(toy, answer, served):
+    moves = served & answer.sure
     return toy._replace(
-        hash=jnp.where(moves, (5 * toy.hash + toy.left) % 1009, toy.hash),
+        hash=jnp.where(moves, answer.hash, toy.hash),
         left=toy.left - moves.astype(toy.left.dtype),
         careful=toy.careful + moves.astype(toy.left.dtype),
-        declined=hard,
-        hard=hard,
+        declined=toy.declined & ~moves,
+        hard=(toy.hard | served) & ~moves,
     )
 
 
@@ -79,7 +95,10 @@ def review(toy):
 PROGRAM = lanes.Program(
     load=load,
     trip=trip,
+    request=lambda toy: toy,
+    second=second,
     careful=careful,
+    settle=settle,
     review=review,
     declined=lambda toy: toy.declined,
     stopped=lambda toy: toy.left <= 0,

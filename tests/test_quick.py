@@ -70,21 +70,6 @@ def test_it_is_sure_of_nearly_every_step(both):
     assert sure[impacts].mean() > 0.95
 
 
-def test_polynomials_are_good_to_rounding():
-    x = np.linspace(-quick._REACH, quick._REACH, 20001)
-    sine, cosine = quick._sine_cosine(jnp.asarray(x))
-    assert np.max(np.abs(sine - np.sin(x))) < 4 * EPS
-    assert np.max(np.abs(cosine - np.cos(x))) < 4 * EPS
-    x = np.linspace(-quick._EXP_REACH, quick._EXP_REACH, 20001)
-    assert np.max(np.abs(np.asarray(quick._exp(jnp.asarray(x))) / np.exp(x) - 1)) < 8 * EPS
-    x = np.linspace(-1, 1, 20001)
-    assert np.max(np.abs(np.asarray(quick._arcsine(jnp.asarray(x))) - np.arcsin(x))) < 4 * EPS
-    t = np.linspace(0, 2, 20001)
-    sine, cosine = quick._phase(jnp.asarray(t))
-    assert np.max(np.abs(sine - np.sin(np.pi * t))) < 5 * EPS
-    assert np.max(np.abs(cosine - np.cos(np.pi * t))) < 5 * EPS
-
-
 def test_patience_decides_or_says_that_it_did_not():
     """A limited patience gives the unlimited answer or NaN (it once gave the depth found so far)."""
     rng = np.random.default_rng(5)

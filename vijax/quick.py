@@ -5,47 +5,26 @@ whose impact is not certified to be the first and converged to rounding is decli
 """
 
 import math
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vijax import energy
 from vijax.exact import stick_speed
 from vijax.flow import PI, horner, membrane, once, share
 from vijax.model import ImpactPair
+from vijax.polynomial import EXP_REACH, REACH, arcsine, exp, phase, sine_cosine
 
 Lane = Float[Array, "lane"]
 
-_FLIGHT_TRIPS = 4
-_CONTACT_TRIPS = 2
+_FLIGHT_TRIPS = 3  # in single precision, before the one in double
+_EXIT_TRIPS = 2
 _CREST_TRIPS = 2
-_REACH = 1.65  # of sine and cosine below, in radians
-_EXP_REACH = 2.4
+_DOUBT = 1e-3  # a sign or a bound that is closer is not trusted to single precision
 _DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
-
-
-def _economised(series: list[float], reach: float, terms: int) -> tuple[float, ...]:
-    """The polynomial of few terms that interpolates a power series at the Chebyshev points of [0, reach]."""
-    nodes = 0.5 * reach * (1 + np.cos(np.pi * (np.arange(terms) + 0.5) / terms))
-    values = np.polynomial.polynomial.polyval(nodes, series)
-    fit = np.polynomial.chebyshev.Chebyshev.fit(nodes, values, terms - 1, domain=[0, reach])
-    return tuple(fit.convert(kind=np.polynomial.Polynomial).coef.tolist())
-
-
-def _series(start: int, sign: float) -> list[float]:
-    """Coefficients sign^k/(start + 2k)! of the tail of a sine or cosine in x^2."""
-    return [sign**k / math.factorial(start + 2 * k) for k in range(16)]
-
-
-# Tails beyond the leading terms, so that the fit's rounding is scaled down: worst errors 7e-16 of one
-# (test_quick.py), with four to six terms fewer than Taylor's.
-_SINE = _economised(_series(3, -1.0), _REACH**2, 10)  # (x - sin x)/x^3
-_COSINE = _economised(_series(4, -1.0), _REACH**2, 9)  # (cos x - 1 + x^2/2)/x^4
-_EXP = tuple(1.0 / math.factorial(k) for k in range(16))  # on |x| <= 0.6
-_ARCSINE = _economised([math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(1, 60)], 0.25, 12)
 
 
 class Lanes(eqx.Module):
@@ -145,59 +124,51 @@ def prepare(pair: ImpactPair) -> Wall:
         cos_crest=jnp.cos(PI * crest),
         sin_crest=jnp.sin(PI * crest),
         crest_decay=jnp.exp(-zeta * crest),
-        steep=jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a),
-        lift=static_d / h_d,
+        steep=(1 + _DOUBT) * jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a),
+        lift=(1 + _DOUBT) * static_d / h_d,
         # Near the resonance the steady response is large and cancels.
         usable=(size > 1.0) & (pair.r > 1e-2),
     )
 
 
-@once
-def _sine_cosine(x: Lane) -> tuple[Lane, Lane]:
-    """sin and cos on |x| <= _REACH."""
-    square = x * x
-    sine = x - x * square * horner(_SINE, square)
-    return sine, 1 - square * (0.5 - square * horner(_COSINE, square))
-
-
-@once
-def _exp(x: Lane) -> Lane:
-    """exp on |x| <= _EXP_REACH."""
-    quarter = horner(_EXP, 0.25 * x)
-    half = quarter * quarter
-    return half * half
-
-
-def _phase(t: Lane) -> tuple[Lane, Lane]:
-    """sin(pi t) and cos(pi t) for t in [0, 2]."""
-    quadrant = jnp.round(2 * t)
-    sine, cosine = _sine_cosine(PI * (t - 0.5 * quadrant))
-    odd, back = (quadrant == 1) | (quadrant == 3), (quadrant == 2) | (quadrant == 3)
-    sine, cosine = jnp.where(odd, cosine, sine), jnp.where(odd, -sine, cosine)
-    return jnp.where(back, -sine, sine), jnp.where(back, -cosine, cosine)
-
-
-def _arcsine(x: Lane) -> Lane:
-    """asin on [-1, 1], by asin(x) = pi/2 - 2 asin(sqrt((1 - x)/2)) beyond 1/2."""
-    size = jnp.abs(x)
-    outer = size > 0.5
-    square = jnp.where(outer, 0.5 * (1 - size), size * size)
-    root = jnp.where(outer, jnp.sqrt(jnp.where(outer, square, 1.0)), size)
-    inner = root + root * square * horner(_ARCSINE, square)
-    return jnp.where(x < 0, -1.0, 1.0) * jnp.where(outer, 0.5 * PI - 2 * inner, inner)
-
-
-def _converged(eps: float) -> float:
+def converged_step(eps: Any) -> float:
     """Largest last step, times the stiffness, after which a fourth-order iteration is off by eps."""
-    return eps**0.25
+    return float(eps) ** 0.25
 
 
-def _householder(f: Lane, f1: Lane, f2: Lane, f3: Lane) -> Lane:
-    """Step of the fourth-order root iteration from f and its first three derivatives."""
-    inverse = 1 / f1
-    h = -f * inverse
-    b, c = f2 * inverse, f3 * inverse
-    return h * (1 + 0.5 * b * h) / (1 + h * (b + c * h * (1 / 6)))
+def householder(f: Lane, f1: Lane, f2: Lane, f3: Lane) -> Lane:
+    """Step of the fourth-order root iteration from f and its first three derivatives; one division."""
+    slope, bent = f1 * f1, f * f2
+    return -f * (6 * slope - 3 * bent) / (6 * f1 * (slope - bent) + f * f * f3)
+
+
+def _single(tree: Any) -> Any:
+    """Floating leaves in single precision.
+
+    An iteration of fourth order needs double precision in its last trip alone: the others cost a quarter as much.
+    """
+    return share(jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != jnp.bool_ else x, tree))
+
+
+def _kepler(slope: Lane, goal: Lane) -> tuple[Lane, Lane, Lane, Lane]:
+    """Root y of sin y + slope y = goal nearest 0, the last step towards it, and sin and cos of y before that step."""
+    p, g = _single((slope, goal))
+    y = jnp.clip(g / (1 + p), -2.6, 2.6)
+    for _ in range(_FLIGHT_TRIPS):
+        sine, cosine = _reflected(y)
+        y = share(y + householder(sine + p * y - g, p + cosine, -sine, -cosine))
+    y = share(y.astype(slope.dtype))
+    sine, cosine = _reflected(y)
+    step = share(householder(sine + slope * y - goal, slope + cosine, -sine, -cosine))
+    return y + step, step, sine, cosine
+
+
+def _reflected(y: Lane) -> tuple[Lane, Lane]:
+    """sin and cos on |y| <= pi + 0.08."""
+    size = jnp.abs(y)
+    beyond = size > 0.5 * PI
+    sine, cosine = sine_cosine(jnp.where(beyond, PI - size, size))
+    return share((jnp.where(y < 0, -sine, sine), jnp.where(beyond, -cosine, cosine)))
 
 
 class _Flight(eqx.Module):
@@ -223,14 +194,14 @@ def _fly(half: Lane, lane: Lanes) -> _Flight:
     """
     eps = jnp.finfo(half.dtype).eps
     flip = jnp.where(lane.v < 0, 1.0, -1.0).astype(half.dtype)
-    sine, cosine = _phase(lane.t)
+    sine, cosine = phase(lane.t)
     sine, cosine = flip * sine, flip * cosine
     t = jnp.where(flip > 0, lane.t, jnp.where(lane.t >= 1, lane.t - 1, lane.t + 1))
     u = flip * lane.u
     p = flip * PI * lane.v - sine
     u, t, p, cosine = share((u, t, p, cosine))
     inside = jnp.clip(p, -1.0, 1.0)
-    angle = _arcsine(inside) * (1 / PI)
+    angle = arcsine(inside) * (1 / PI)
     swing = jnp.sqrt((1 - inside) * (1 + inside)) * (1 / PI**2)
     drift = p * (1 / PI)
     centre = jnp.where(t < 0.5, -0.5, 1.5)
@@ -260,14 +231,7 @@ def _fly(half: Lane, lane: Lanes) -> _Flight:
     goal = PI**2 * (half - wall * (u + drift * away + cosine * (1 / PI**2)))
     never = periods > 1e7
     slope, goal, away, doubt = share((slope, goal, away, (near | before | passed) & ~falls))
-    y = jnp.clip(goal / (1 + slope), -2.6, 2.6)
-    for _ in range(_FLIGHT_TRIPS):
-        size = jnp.abs(y)
-        beyond = size > 0.5 * PI
-        sine, cosine = _sine_cosine(jnp.where(beyond, PI - size, size))
-        sine, cosine = jnp.where(y < 0, -sine, sine), jnp.where(beyond, -cosine, cosine)
-        step = _householder(sine + slope * y - goal, slope + cosine, -sine, -cosine)
-        y, step, sine, cosine = share((y + step, step, sine, cosine))
+    y, step, sine, cosine = _kepler(slope, goal)
     square = step * step
     turn_sine, turn_cosine = step * (1 - square * (1 / 6)), 1 - square * (0.5 - square * (1 / 24))
     stiffness = jnp.maximum(1.0, jnp.abs(sine / (slope + cosine)))
@@ -275,7 +239,7 @@ def _fly(half: Lane, lane: Lanes) -> _Flight:
     speed = (slope + cosine) * (1 / PI)
     elapsed = away + y * (1 / PI)
     # The iteration is of fourth order: what is left after the last step is (stiffness step)^3 step.
-    converged = stiffness * jnp.abs(step) < _converged(float(eps))
+    converged = stiffness * jnp.abs(step) < converged_step(eps)
     # A short hop loses its leading digits in the phases.
     sure = converged & ~doubt & (speed > 0) & (elapsed > 1 / 256) & (lane.v != 0) & (jnp.abs(y) < 3.4)
     return _Flight(*share((elapsed, speed, flip, wall, sine, cosine, sure, never & (lane.v != 0))))
@@ -310,9 +274,9 @@ class _Course(eqx.Module):
 @once
 def _motion(wall: Wall, course: _Course, s: Lane) -> _Motion:
     """The contact at time s from the course's reference."""
-    sine, cosine = _sine_cosine(wall.omega1 * s)
-    drive_sine, drive_cosine = _sine_cosine(PI * s)
-    decay = course.decay * _exp(-wall.zeta * s)
+    sine, cosine = sine_cosine(wall.omega1 * s)
+    drive_sine, drive_cosine = sine_cosine(PI * s)
+    decay = course.decay * exp(-wall.zeta * s)
     along = course.free_cos * cosine + course.free_sin * sine
     across = course.free_sin * cosine - course.free_cos * sine
     steady = course.steady_cos * drive_cosine + course.steady_sin * drive_sine
@@ -340,12 +304,12 @@ def _at_reference(wall: Wall, course: _Course) -> _Motion:
 
 def _in_reach(wall: Wall, s: Lane) -> Bool[Array, "lane"]:
     """Whether the polynomials of `_motion` hold at s."""
-    return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < _REACH) & (wall.zeta * jnp.abs(s) < _EXP_REACH)
+    return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
 
 
 def _course(parts: tuple[Lane, ...], cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> _Course:
     """The contact rotated to a reference time with the given cos and sin of pi s; `free` is its free part there."""
-    steady_cos, steady_sin, force_cos, force_sin, _, _ = parts
+    steady_cos, steady_sin, force_cos, force_sin = parts
     return _Course(
         steady_cos * cosine + steady_sin * sine,
         steady_sin * cosine - steady_cos * sine,
@@ -375,120 +339,195 @@ class _Exit(eqx.Module):
     decay: Lane
 
 
-def _touch(wall: Wall, flight: _Flight) -> tuple[_Exit, Lane, Bool[Array, "lane"]]:
-    """Exit and greatest depth of the contact, and certainty that w rises once and falls once between onset and exit.
+class _Entry(eqx.Module):
+    """A contact at its onset: speed into the wall, forcing and steady response in phase and a quarter turn behind."""
 
-    The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
-    nothing has to be evaluated there; that of a slow entry against the forcing, from the root of its cubic Taylor
-    polynomial, about half of pi/omega1.
-    """
-    eps = jnp.finfo(wall.half.dtype).eps
-    speed = flight.speed
+    speed: Lane
+    force_cos: Lane
+    force_sin: Lane
+    steady_cos: Lane
+    steady_sin: Lane
+    free_cos: Lane
+    free_sin: Lane
+
+    @property
+    def parts(self) -> tuple[Lane, ...]:
+        """What `_course` rotates."""
+        return self.steady_cos, self.steady_sin, self.force_cos, self.force_sin
+
+
+def _entry(wall: Wall, flight: _Flight) -> _Entry:
+    """The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin."""
     force_cos, force_sin = -flight.sine, flight.cosine
     steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
     steady_sin = wall.gain_out * force_cos - wall.gain_in * force_sin
-    # The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin.
-    free_cos = -steady_cos
-    free_sin = (speed - PI * steady_sin + wall.zeta * free_cos) / wall.omega1
-    push = force_cos - 2 * wall.zeta * speed
-    square = wall.kappa * wall.kappa
-    jerk = -PI * force_sin - 2 * wall.zeta * push - square * speed
-    parts = share((steady_cos, steady_sin, force_cos, force_sin, free_cos, free_sin))
-    steady_cos, steady_sin, force_cos, force_sin, free_cos, free_sin = parts
+    free_sin = (flight.speed - PI * steady_sin - wall.zeta * steady_cos) / wall.omega1
+    return share(_Entry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady_cos, free_sin))
+
+
+class _Guess(eqx.Module):
+    """Where to look for crest and exit of a contact that ends long before pi/omega1."""
+
+    short: Bool[Array, "lane"]
+    hop: Lane
+    rise: Lane
+
+
+def _guess(wall: Wall, entry: _Entry) -> _Guess:
+    """From the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
+    speed, square = entry.speed, wall.kappa * wall.kappa
+    push = entry.force_cos - 2 * wall.zeta * speed
+    jerk = -PI * entry.force_sin - 2 * wall.zeta * push - square * speed
     bend = 0.25 * push * push - (2 / 3) * jerk * speed
     hop = 2 * speed / (jnp.sqrt(jnp.maximum(bend, 0.0)) - 0.5 * push)
     short = (bend > 0) & (hop > 0) & (hop < wall.hop)
-    # One Newton step on the Taylor polynomial of degree six brings the guess within reach of two trips.
-    snap = -(PI**2) * force_cos - 2 * wall.zeta * jerk - square * push
-    fifth = PI**3 * force_sin - 2 * wall.zeta * snap - square * jerk
-    sixth = PI**4 * force_cos - 2 * wall.zeta * fifth - square * snap
+    snap = -(PI**2) * entry.force_cos - 2 * wall.zeta * jerk - square * push
+    fifth = PI**3 * entry.force_sin - 2 * wall.zeta * snap - square * jerk
+    sixth = PI**4 * entry.force_cos - 2 * wall.zeta * fifth - square * snap
     derivatives = (speed, push, jerk, snap, fifth, sixth)
     value = _taylor(derivatives, 1, hop) * hop
     slope = _taylor(derivatives, 0, hop)
     hop = jnp.where(slope < 0, hop - value / slope, hop)
     rise = 2 * speed / (jnp.sqrt(jnp.maximum(push * push - 2 * jerk * speed, 0.0)) - push)
     rise = rise - _taylor(derivatives, 0, rise) / _taylor(derivatives[1:], 0, rise)
-    hop, rise, short = share((hop, rise, short))
-    middle = _course(parts, wall.cos_middle, wall.sin_middle, (free_sin, -free_cos), wall.root_r)
-    far = share(_course(parts, wall.cos_span, wall.sin_span, (-free_cos, -free_sin), wall.r))
-    free = share(_at_reference(wall, far))
-    course = _either(short, middle, far)
-    reference = jnp.where(short, 0.5 * wall.span, wall.span)
-    s = jnp.where(short, hop - reference, _householder(free.w, free.rate, free.push, free.jerk))
-    reached = jnp.ones_like(flight.sure)
-    for _ in range(_CONTACT_TRIPS):
-        reached = reached & _in_reach(wall, s)
-        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
-        step = _householder(at.w, at.rate, at.push, at.jerk)
-        s, step, reached = share((s + step, step, reached))
+    return share(_Guess(short, hop, rise))
+
+
+def _touch(wall: Wall, flight: _Flight, deep: bool) -> tuple[_Exit, Lane | None, Bool[Array, "lane"]]:
+    """Exit of the contact, its greatest depth if asked for, and certainty that w rises once and falls once until then.
+
+    The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
+    nothing has to be evaluated there; that of a slow entry against the forcing, from the root of its cubic Taylor
+    polynomial, about half of pi/omega1.
+    """
+    eps = jnp.finfo(wall.half.dtype).eps
+    entry = _entry(wall, flight)
+    rough, begun = _single((wall, entry))
+    guess = _guess(rough, begun)
+    middle = _course(entry.parts, wall.cos_middle, wall.sin_middle, (entry.free_sin, -entry.free_cos), wall.root_r)
+    far = _course(entry.parts, wall.cos_span, wall.sin_span, (-entry.free_cos, -entry.free_sin), wall.r)
+    course = _either(guess.short, middle, far)
+    reference = jnp.where(guess.short, 0.5 * wall.span, wall.span)
+    s, reached = _rough_exit(rough, begun, guess, _single(course))
+    s = share(s.astype(reference.dtype))
+    at = share(_motion(wall, course, s))
+    step = share(householder(at.w, at.rate, at.push, at.jerk))
     out = -(at.rate + step * (at.push + step * (0.5 * at.jerk)))
-    duration = reference + s
+    duration = reference + s + step
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.push / at.rate))
     # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
-    converged = reached & (stiffness * jnp.abs(step) < _converged(float(eps))) & (wall.omega1 * duration > 0.25)
-    depth, certain = _deepest(wall, speed, parts, (short, rise), duration, at.drive, at.force)
+    converged = reached & (stiffness * jnp.abs(step) < converged_step(eps)) & (wall.omega1 * duration > 0.25)
+    crest, certain = _rough_crest(rough, begun, guess, _single((duration, at.drive, at.force)))
+    depth = None
+    if deep:
+        depth, exact = _deepest(wall, entry, crest)
+        certain = certain & exact
     sure = wall.usable & converged & (out > 0) & certain
     turn = wall.omega1 * step
     twist = turn * turn
     turn_sine, turn_cosine = turn * (1 - twist * (1 / 6)), 1 - twist * (0.5 - twist * (1 / 24))
     sine, cosine = at.sine * turn_cosine + at.cosine * turn_sine, at.cosine * turn_cosine - at.sine * turn_sine
+    short = guess.short
     sine, cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)  # from the reference to the onset
     rot = wall.zeta * step
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
     return share((_Exit(duration, out, sine, cosine, decay), depth, sure))
 
 
-def _deepest(
-    wall: Wall,
-    speed: Lane,
-    parts: tuple[Lane, ...],
-    slow: tuple[Bool[Array, "lane"], Lane],
-    duration: Lane,
-    exit_drive: Lane,
-    exit_force: Lane,
+def _rough_exit(wall: Wall, entry: _Entry, guess: _Guess, course: _Course) -> tuple[Lane, Bool[Array, "lane"]]:
+    """Time of the exit from the course's reference in single precision, and whether the polynomials held on the way."""
+    free = _at_reference(wall, course)
+    near = guess.hop - 0.5 * wall.span
+    s = share(jnp.where(guess.short, near, householder(free.w, free.rate, free.push, free.jerk)))
+    reached = _in_reach(wall, s)
+    for _ in range(_EXIT_TRIPS):
+        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
+        s = share(s + householder(at.w, at.rate, at.push, at.jerk))
+        reached = reached & _in_reach(wall, s)
+    return share((jnp.where(reached, s, 0.0), reached))
+
+
+def _crest_course(wall: Wall, entry: _Entry) -> _Course:
+    """The contact rotated to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
+    cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
+    free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
+    return share(_course(entry.parts, wall.cos_crest, wall.sin_crest, free, wall.crest_decay))
+
+
+def _snap(wall: Wall, at: _Motion) -> Lane:
+    """Fourth derivative of w."""
+    return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
+
+
+def _rough_crest(
+    wall: Wall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]
 ) -> tuple[Lane, Bool[Array, "lane"]]:
-    """Greatest depth, sought from the free contact's, and certainty that w has no other extremum before the exit.
+    """Time of greatest depth from the free contact's, and certainty that w has no other extremum before the exit.
+
+    In single precision, with what is close called uncertain. `end` holds the duration and f' and f at the exit.
 
     w' is an oscillator too, driven by the derivative f' of the forcing. Write e^(zeta s) w' = phi q with phi the free
     solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero.
     Beyond it -w' > 0 has no zero while f' < 0, and where f' ends positive at most one, so none if -w' > 0 at the exit.
     Moreover a minimum of w needs a positive forcing. Else by size: `Wall.steep` and `Wall.lift`.
     """
-    eps = jnp.finfo(wall.half.dtype).eps
-    _, _, force_cos, force_sin, free_cos, free_sin = parts
-    short, rise = slow
-    # At the free crest cos and sin of omega1 s are zeta/kappa and omega1/kappa.
-    cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
-    turned = (free_cos * cosine + free_sin * sine, free_sin * cosine - free_cos * sine)
-    far = share(_course(parts, wall.cos_crest, wall.sin_crest, turned, wall.crest_decay))
-    square = wall.kappa * wall.kappa
-
-    def snap(at: _Motion) -> Lane:
-        return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - square * at.push
-
-    free = share(_at_reference(wall, far))
-    s = jnp.where(short, rise - wall.crest, _householder(free.rate, free.push, free.jerk, snap(free)))
-    reached = jnp.ones_like(short)
+    duration, exit_drive, exit_force = end
+    course = _crest_course(wall, entry)
+    free = _at_reference(wall, course)
+    near = guess.rise - wall.crest
+    s = share(jnp.where(guess.short, near, householder(free.rate, free.push, free.jerk, _snap(wall, free))))
+    reached = _in_reach(wall, s)
     for _ in range(_CREST_TRIPS):
+        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
+        step = householder(at.rate, at.push, at.jerk, _snap(wall, at))
+        s, step = share((s + step, step))
         reached = reached & _in_reach(wall, s)
-        at = share(_motion(wall, far, jnp.where(reached, s, 0.0)))
-        fourth = snap(at)
-        step = _householder(at.rate, at.push, at.jerk, fourth)
-        s, step, fourth, reached = share((s + step, step, fourth, reached))
-    depth = at.w + step * (at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth)))
+    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
+    converged = reached & (stiffness * jnp.abs(step) < _DOUBT) & (at.push < 0)
     when = wall.crest + s
     way = duration - when
+    falls, pulled, one_change = at.drive <= -_DOUBT, at.force <= -_DOUBT, duration < 1 - _DOUBT
+    first = falls & ((entry.force_sin >= 0) | ((entry.force_cos > 0) & (course.force_sin >= _DOUBT)))
+    first = (one_change & (first | ((entry.force_cos <= 0) & pulled))) | (entry.speed > wall.steep)
+    only = one_change & (falls | (exit_drive > _DOUBT) | (pulled & (exit_force <= -_DOUBT)))
+    # While the forcing is positive f' falls, so its value at the crest bounds it.
+    positive = (at.force > _DOUBT) & (exit_force > _DOUBT) & one_change
+    most = jnp.where(positive, jnp.maximum(at.drive, 0.0) + _DOUBT, PI)
+    only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < _DEEP_REACH))
+    inside = (wall.omega1 * when > _DOUBT) & (wall.omega1 * way > _DOUBT) & (way < (1 - _DOUBT) * wall.span)
+    return share((jnp.where(reached, s, 0.0), converged & first & only & inside))
+
+
+def _deepest(wall: Wall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
+    """Greatest depth, and whether `crest`, its rough time from the free contact's, was close enough to tell."""
+    at = share(_motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
+    fourth = _snap(wall, at)
+    step = share(householder(at.rate, at.push, at.jerk, fourth))
+    depth = at.w + step * (at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth)))
     # The depth is stationary, and its Taylor polynomial of fifth order: a coarser time than the exit's will do.
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
-    converged = reached & (stiffness * jnp.abs(step) < 16 * _converged(float(eps))) & (at.push < 0)
-    falls, pulled, one_change = at.drive <= 0, at.force <= 0, duration < 1
-    first = falls & ((force_sin >= 0) | ((force_cos > 0) & (far.force_sin >= 0)))
-    first = (one_change & (first | ((force_cos <= 0) & pulled))) | (speed > wall.steep)
-    only = one_change & (falls | (exit_drive > 0) | (pulled & (exit_force <= 0)))
-    # While the forcing is positive f' falls, so its value at the crest bounds it.
-    most = jnp.where((at.force > 0) & (exit_force > 0) & one_change, jnp.maximum(at.drive, 0.0), PI)
-    only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < _DEEP_REACH))
-    return depth, converged & first & only & (when > 0) & (way > 0) & (way < wall.span)
+    return depth, stiffness * jnp.abs(step) < 16 * converged_step(jnp.finfo(depth.dtype).eps)
+
+
+def through(contact: tuple[Lane, ...], elapsed: Lane) -> tuple[Lane, Lane, Lane, Lane]:
+    """Tangent map (row by row) of a flight and the contact after it."""
+    a, b, c, d = contact
+    return a, a * elapsed + b, c, c * elapsed + d
+
+
+class Arrival(NamedTuple):
+    """A flight's end: its length, the speed into the wall, the wall's side, and whether all that is certain."""
+
+    flight: Lane
+    speed: Lane
+    side: Lane
+    sure: Bool[Array, "lane"]
+
+
+def arrive(half: Lane, lane: Lanes) -> Arrival:
+    """The end of a level flight in a gap of twice `half`."""
+    flight = _fly(half, lane)
+    return Arrival(flight.elapsed, flight.speed, flight.flip * flight.wall, flight.sure & ~flight.never)
 
 
 def quick_step(
@@ -520,7 +559,7 @@ def quick_step(
             # In the frame of the wall the acceleration there is -sine.
             contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * flight.sine / flight.speed, -wall.r)
     else:
-        left, depth, sure = _touch(wall, flight)
+        left, depth, sure = _touch(wall, flight, deep)
         duration, out = left.duration, left.speed
         sure = sure & flight.sure
         leave = onset_t + duration
@@ -532,9 +571,7 @@ def quick_step(
             h = left.decay * left.sine / wall.omega1
             slope = left.decay * left.cosine - wall.zeta * h
             contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)
-    if contact is not None:
-        a, b, c, d = contact
-        contact = (a, a * flight.elapsed + b, c, c * flight.elapsed + d)
+    matrix = None if contact is None else through(contact, flight.elapsed)
     after = Lanes(side * wall.half, -side * out, leave_t, leave_n)
-    hit = Hit(onset_t, onset_n, side, v_in, -side * out, flight.elapsed, duration, after, depth, work, contact)
+    hit = Hit(onset_t, onset_n, side, v_in, -side * out, flight.elapsed, duration, after, depth, work, matrix)
     return hit, sure & ~flight.never, flight.never & flight.sure

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax import energy, exact, flow, lanes, quick
+from vijax import energy, exact, flow, lanes, quick, sampled
 from vijax.model import Harvester, ImpactPair, State, Status
 from vijax.quick import Hit, Lanes, Wall
 
@@ -24,7 +24,6 @@ Mask = Bool[Array, "lane"]
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
 TRANSIENT_SHARE = 0.25  # of the periods that a cell without an orbit leaves out of its averages
 _BATCHES = 24  # batch means behind a standard error
-_SERVED = 128  # lanes of a careful trip; with gravity, where every impact is careful, all of them
 _BUDGET = 512  # impacts per period before a cell is stopped
 _ROUNDS = 8  # Newton rounds on one candidate
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
@@ -141,7 +140,7 @@ class Cell(eqx.Module):
     held: Lane  # mode of a start in contact
     running: Mask
     declined: Mask
-    hard: Mask  # declined by the first careful trip too
+    hard: Mask  # declined by sampling too
     done: Mask
     status: Int[Array, "lane"]
     count: Lane  # impacts so far
@@ -236,31 +235,63 @@ def _batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
     return jnp.maximum(jnp.floor(window / _BATCHES), 1.0)
 
 
-def _quick_trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+def _trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """One impact of every lane: by the quick step on level cells, by certified sampling with gravity."""
+    pair, ball = cell.pair, cell.ball
+    if plan.level:
+        hit, sure, never = quick.quick_step(cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
+    else:
+        hit, sure = sampled.sampled_step(pair, ball, deep=plan.deep, tangent=plan.tangent)
+        never = jnp.zeros_like(sure)
     active = cell.running & ~cell.declined
-    hit, sure, never = quick.quick_step(cell.wall, cell.pair.gamma, cell.ball, deep=plan.deep, tangent=plan.tangent)
     free = active & (cell.held == 0)
     no = jnp.zeros_like(active)
     event = _Event(hit, free & sure, free & never, no, no)
-    cell = eqx.tree_at(lambda c: c.declined, cell, cell.declined | (active & ~(free & (sure | never))))
+    declined = active & ~(free & (sure | never))
+    hard = cell.hard | declined if not plan.level else cell.hard  # sampling will not do better a second time
+    cell = eqx.tree_at(lambda c: (c.declined, c.hard), cell, (cell.declined | declined, hard))
     return _fold(plan, settings, cell, event)
 
 
-def _careful_trip(plan: Plan, settings: Settings, cell: Cell, patience: Int[Array, ""]) -> Cell:
-    """`exact.step` on every lane; those that need more patience stay declined, and are marked hard."""
-    active = cell.running
-    ball = cell.ball
-    # A lane with nothing to do gets no horizon, and its searches end at once.
-    horizon = jnp.where(active, 2 * (jnp.maximum(_window_end(plan, settings) - ball.n, 0.0) + _QUIET), 0.0)
-    state = State(ball.u, ball.v, ball.t, jnp.zeros(ball.n.shape, jnp.int32), cell.held.astype(jnp.int32))
-    step = partial(exact.step, deep=plan.deep, patience=patience)
-    out = jax.vmap(step)(cell.pair, state, horizon)
-    undecided = jnp.isnan(out.stay) | (jnp.isnan(out.impact.depth) & plan.deep)
-    hard = active & undecided & (patience < lanes.LAST_PATIENCE)
-    active = active & ~hard
+class _Request(eqx.Module):
+    """What a lane that the quick step declined hands over to be served."""
+
+    pair: ImpactPair
+    ball: Lanes
+    held: Lane
+
+
+class _Answer(eqx.Module):
+    """What became of a request; a lane whose answer is not sure asks again, for the careful step."""
+
+    event: _Event
+    left: Mask  # a contact that had no onset: the ball moves and nothing is counted
+    sure: Mask
+
+
+def _request(cell: Cell) -> _Request:
+    return _Request(cell.pair, cell.ball, cell.held)
+
+
+def _sampled_answer(plan: Plan, request: _Request) -> _Answer:
+    arrival = None
+    if plan.level and not plan.rigid:
+        arrival = quick.arrive(0.5 * request.pair.d, request.ball)
+    hit, sure = sampled.sampled_step(request.pair, request.ball, arrival, deep=plan.deep, tangent=plan.tangent)
+    no = jnp.zeros_like(sure)
+    sure = sure & (request.held == 0)
+    return _Answer(_Event(hit, sure, no, no, no), no, sure)
+
+
+def _careful_answer(plan: Plan, settings: Settings, request: _Request) -> _Answer:
+    """`exact.step` on every lane."""
+    pair, ball, held = request.pair, request.ball, request.held
+    horizon = 2 * (jnp.maximum(_window_end(plan, settings) - ball.n, 0.0) + _QUIET)
+    state = State(ball.u, ball.v, ball.t, jnp.zeros(ball.n.shape, jnp.int32), held.astype(jnp.int32))
+    out = jax.vmap(partial(exact.step, deep=plan.deep))(pair, state, horizon)
     matrix = None
     if plan.tangent:
-        rows = jax.vmap(exact.tangent)(cell.pair, out)
+        rows = jax.vmap(exact.tangent)(pair, out)
         matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
     after = out.state
     hit = Hit(
@@ -276,16 +307,22 @@ def _careful_trip(plan: Plan, settings: Settings, cell: Cell, patience: Int[Arra
         work=out.impact.work if plan.deep else None,
         tangent=matrix,
     )
-    event = _Event(hit, active & (out.impact.side != 0), active & out.quiet, active & out.permanent, out.stuck)
-    # Leaving a contact that had no onset moves the ball and counts nothing.
-    left = active & (cell.held != 0) & ~out.permanent
+    event = _Event(hit, out.impact.side != 0, out.quiet, out.permanent, out.stuck)
+    return _Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
+
+
+def _settle(plan: Plan, settings: Settings, cell: Cell, answer: _Answer, served: Mask) -> Cell:
+    """The cells with the answers of those that were served."""
+    event, left = answer.event, answer.left & served
+    ours = served & answer.sure
+    event = _Event(event.hit, event.real & ours, event.quiet & ours, event.permanent & ours, event.stuck & ours)
     cell = eqx.tree_at(
         lambda c: (c.declined, c.hard, c.ball, c.held),
         cell,
         (
-            hard,
-            hard,
-            _where(left, hit.after, ball),
+            cell.declined & ~ours,
+            (cell.hard | served) & ~ours,
+            _where(left, event.hit.after, cell.ball),
             jnp.where(left, 0.0, cell.held),
         ),
     )
@@ -634,21 +671,16 @@ def _power(plan, settings, cell: Cell, periodic: Mask, still: Mask, window: Lane
     return jnp.where(none, 0.0, power), jnp.where(none | periodic[:, None], 0.0, error)
 
 
-def _declined(cell: Cell) -> Mask:
-    return cell.declined
-
-
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
-    # With gravity the quick step does not apply: every lane waits for the careful one.
-    trip = (
-        partial(_quick_trip, plan, settings) if plan.level else lambda cell: eqx.tree_at(_declined, cell, cell.running)
-    )
     return lanes.Program(
         load=partial(_load, plan, settings),
-        trip=trip,
-        careful=partial(_careful_trip, plan, settings),
+        trip=partial(_trip, plan, settings),
+        request=_request,
+        second=partial(_sampled_answer, plan),
+        careful=partial(_careful_answer, plan, settings),
+        settle=partial(_settle, plan, settings),
         review=partial(_review, plan, settings),
-        declined=_declined,
+        declined=lambda cell: cell.declined,
         stopped=lambda cell: ~cell.running,
         hard=lambda cell: cell.hard,
         done=lambda cell: cell.done,
@@ -706,17 +738,18 @@ def _compiled(plan: Plan, width: int):
     """The jitted program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
-        table = lanes.run(
-            _program(plan, settings), cells, count, _columns(plan), width, _SERVED if plan.level else width
-        )
+        table = lanes.run(_program(plan, settings), cells, count, _columns(plan), width)
         return _unpack(plan, table)
 
     return jax.jit(tile, compiler_options=lanes.compiler_options())
 
 
-def _width(cells: int) -> int:
-    """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill."""
-    return max(min(cells // 8, 2048), 128)
+def _width(cells: int, level: bool) -> int:
+    """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill.
+
+    A sampled step holds some dozens of samples a lane.
+    """
+    return max(min(cells // 8, 512 if level else 256), 128)
 
 
 def tolerances(dtype: str) -> dict[str, float]:
@@ -779,4 +812,4 @@ def summarise(
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
     )
-    return _compiled(plan, _width(pair.d.shape[0]))(cells, number, settings)
+    return _compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)
