@@ -255,8 +255,8 @@ def _comparison_summary(dataset: "xr.Dataset", count: int, seconds: float) -> st
     if "rigid_from" in dataset:
         onset = dataset["rigid_from"]
         found = onset.values[onset.notnull().values]
-        span = f"{onset.axis} = {found.min():.6g} to {found.max():.6g} on" if found.size else f"no {onset.axis} on"
-        lines.append(f"rigid is enough within {within} from {span}, in {found.size} of {onset.size} cases")
+        span = f"{found.min():.4g} to {found.max():.4g}, median {onset.median():.4g}" if found.size else "none"
+        lines.append(f"least {onset.axis} from which on it is rigid: {span} ({found.size} of {onset.size} found)")
     return "\n".join(lines)
 
 

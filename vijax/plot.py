@@ -99,12 +99,13 @@ class _Mark(NamedTuple):
 
 
 class _Kind(NamedTuple):
-    """A kind of picture: what it colours, the variables it needs and those it can do without, and its marks."""
+    """A kind of picture: what it colours and how, the variables it needs and those it can do without, its marks."""
 
     coloured: str
     label: str
     needs: tuple[str, ...]
     optional: tuple[str, ...]
+    colours: "Callable[[xr.Dataset], LogNorm]"
     marks: "Callable[[xr.Dataset], list[_Mark]]"
 
 
@@ -166,7 +167,7 @@ def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str], rows: int, column
     size = (5.2, 4.6) if rows * columns == 1 else (1.6 + 2.1 * columns, 1.6 + 1.9 * rows)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    norm, peak = _norm(dataset, kind), _peak(dataset)
+    norm, peak = kind.colours(dataset), _peak(dataset)
     # Panels by rows, cells by y: the dimensions backwards.
     dataset = dataset.sortby(dims[:2]).transpose(*dims[::-1])
     outer = dims[:1:-1]
@@ -244,6 +245,16 @@ def _mark_curve(axes: Axes, marks: list[_Mark], places: np.ndarray, across: np.n
             axes.plot(places[mask], values[mask], **style | _SINGLE, zorder=2)
 
 
+def _power_colours(dataset: "xr.Dataset") -> LogNorm:
+    """Colours for the admissible cells: outside, the formula may give any number of times more."""
+    power = dataset["P"].values
+    trusted = power[(power > 0) & dataset["admissible"].values]
+    shown = trusted if trusted.size else power[power > 0]
+    if not shown.size:
+        return LogNorm(1e-9, 1e-6)
+    return LogNorm(max(shown.min(), shown.max() / 10**_DECADES), shown.max())
+
+
 def _power_marks(dataset: "xr.Dataset") -> list[_Mark]:
     period = dataset["period"].values
     return [
@@ -255,6 +266,11 @@ def _power_marks(dataset: "xr.Dataset") -> list[_Mark]:
     ]
 
 
+def _difference_colours(_: "xr.Dataset") -> LogNorm:
+    """One scale for all maps: beyond 1 it matters no more by how much."""
+    return LogNorm(10.0**-_DECADES, 1.0)
+
+
 def _difference_marks(dataset: "xr.Dataset") -> list[_Mark]:
     differs = dataset["label"].values == Label.DIFFERS
     marks = [_Mark(differs, "border", _LINE, "border of other labels")]
@@ -263,18 +279,19 @@ def _difference_marks(dataset: "xr.Dataset") -> list[_Mark]:
         within = f"{100 * verdict.attrs['tolerance']:.4g} %"
         marks += [
             _Mark(verdict.values == Model.RIGID, "border", _OUTLINE, f"rigid is enough within {within}"),
-            _Mark(verdict.values == Model.UNDECIDED, "any", _CROSS, "undecided"),
+            _Mark(verdict.values == Model.UNDECIDED, "any", _CROSS | {"color": "orange"}, "undecided"),
         ]
     bare = ~(dataset["relative_difference"].values > 0)
     return [*marks, _Mark(bare, "bare", _BARE, "no difference, or failed")]
 
 
-_POWER = _Kind("P", "$P$ [J per half period]", NEEDS, (), _power_marks)
+_POWER = _Kind("P", "$P$ [J per half period]", NEEDS, (), _power_colours, _power_marks)
 _DIFFERENCE = _Kind(
     "relative_difference",
     r"$|P_\mathrm{rigid} - P_\mathrm{soft}| / P_\mathrm{soft}$",
     ("relative_difference", "label"),
     ("cheapest_model",),
+    _difference_colours,
     _difference_marks,
 )
 
@@ -296,17 +313,6 @@ def _handle(mark: _Mark) -> Patch | Line2D:
     if mark.how in ("veil", "bare"):
         return Patch(**mark.style)
     return Line2D([], [], **mark.style if mark.how == "border" else mark.style | _SINGLE)
-
-
-def _norm(dataset: "xr.Dataset", kind: _Kind) -> LogNorm:
-    """Colours for the admissible cells: outside, the formula may give any number of times more."""
-    values = dataset[kind.coloured].values
-    some = (values > 0) & np.isfinite(values)
-    trusted = some & dataset["admissible"].values if "admissible" in dataset else some
-    shown = values[trusted if trusted.any() else some]
-    if not shown.size:
-        return LogNorm(1e-9, 1e-6)
-    return LogNorm(max(shown.min(), shown.max() / 10**_DECADES), shown.max())
 
 
 def _edges(values: np.ndarray) -> tuple[np.ndarray, str]:
