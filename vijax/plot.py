@@ -192,7 +192,8 @@ def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str], rows: int, column
 def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: LogNorm) -> QuadMesh:
     (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in (x, y))
     axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_BARE["color"])
-    values = panel[kind.coloured].values
+    # matplotlib takes infinities for missing.
+    values = np.minimum(panel[kind.coloured].values, np.finfo(float).max)
     mesh = axes.pcolormesh(across, up, np.ma.masked_where(~(values > 0), values), norm=norm, rasterized=True)
     _mark_map(axes, kind.marks(panel), (panel[x].values, panel[y].values), (across, up))
     return mesh
