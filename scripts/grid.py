@@ -3,6 +3,7 @@
     python scripts/grid.py
     python scripts/grid.py --gamma 0.1 --out inclined.zarr --plot inclined.png
     python scripts/grid.py --omega pi:6pi:96 --omega0 20:400:96 --plot device.png
+    python scripts/grid.py --kappa 3:4000:128:log --compare rigid --tolerance 0.05
 
 An axis is a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE; arrays become dimensions in the order given: x, y and
 panels of the picture. Write a range that begins with a minus as --u0=-0.1:0.1:9.
@@ -22,6 +23,7 @@ import click
 if TYPE_CHECKING:
     import xarray as xr
 
+    from vijax.compare import Comparison
     from vijax.dataset import Plan
 
 _STARTED = time.perf_counter()
@@ -30,6 +32,7 @@ _DEFAULT_PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
 _PHYSICAL = {"s", "omega0", "k"}
 _LONG = 9  # periods from here on are counted together
 _DEFAULT_FILES = ("power_map.zarr", "power_map.png")
+_COMPARISON_FILES = ("comparison.zarr", "comparison.png")
 _AXES = {
     "d": "gap, dimensionless [0.05:0.3:128 unless --s, --omega0 or --k is given]",
     "kappa": "stiffness, dimensionless [3:400:128:log unless --s, --omega0 or --k is given]",
@@ -57,6 +60,8 @@ def _options() -> list[click.Parameter]:
         click.Option(["--until"], default="attractor", show_default=True, help="attractor or window"),
         click.Option(["--transient"], default=0, show_default=True, help="forcing periods to drop first"),
         click.Option(["--wall"], default="soft", show_default=True, help="soft or rigid"),
+        click.Option(["--compare"], metavar="rigid", help="map what rigid walls change instead: P and the label"),
+        click.Option(["--tolerance"], type=float, help="with --compare: part of P that they may change"),
         click.Option(["--dtype"], default="float64", show_default=True, help="float64 or float32"),
         click.Option(["--outputs"], metavar="NAME,NAME", help="variables wanted [all but lyapunov]"),
         click.Option(["--out"], metavar="FILE.zarr", help="store to write"),
@@ -66,15 +71,31 @@ def _options() -> list[click.Parameter]:
 
 
 @click.command(params=_options(), context_settings={"max_content_width": 120})
-def power_map(constants: tuple[str, ...], outputs: str | None, overwrite: bool, **given: Any) -> None:
+def power_map(
+    constants: tuple[str, ...],
+    outputs: str | None,
+    compare: str | None,
+    tolerance: float | None,
+    overwrite: bool,
+    **given: Any,
+) -> None:
     """Map the energy harvested over a plane of parameters.
 
     VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --u0=-0.1:0.1:9); a number may
-    be a multiple of pi, as in 6pi. With neither --out nor --plot, power_map.zarr and power_map.png are written.
+    be a multiple of pi, as in 6pi. With neither --out nor --plot, power_map.zarr and power_map.png are written, or
+    comparison.zarr and comparison.png.
     """
     try:
-        out, plot = _targets(given.pop("out"), given.pop("plot"), overwrite)
-        planned = _plan(constants, outputs, given)
+        defaults = _DEFAULT_FILES if compare is None else _COMPARISON_FILES
+        out, plot = _targets(given.pop("out"), given.pop("plot"), defaults, overwrite)
+        axes, device = _axes(given), _device(constants)
+        if compare is None and tolerance is not None:
+            raise ValueError(f"tolerance must come with compare; got {tolerance:g} alone; add --compare rigid")
+        planned: Plan | Comparison
+        if compare is None:
+            planned = _plan(axes, device, outputs, given)
+        else:
+            planned = _comparison(axes, device, outputs, compare, tolerance, given)
         if plot is not None:
             _check_picture(plot, planned)
     except (ValueError, TypeError, OSError) as error:
@@ -90,8 +111,8 @@ def power_map(constants: tuple[str, ...], outputs: str | None, overwrite: bool, 
     if plot is not None:
         from vijax import plot as pictures
 
-        pictures.power_map(dataset, plot)
-    click.echo(_summary(dataset, planned.cells.count, seconds))
+        (pictures.power_map if compare is None else pictures.difference_map)(dataset, plot)
+    click.echo((_summary if compare is None else _comparison_summary)(dataset, planned.count, seconds))
     click.echo(f"wrote {', '.join(str(path) for path in (out, plot) if path)}")
     click.echo(f"{time.perf_counter() - _STARTED:.1f} s from start to end")
 
@@ -106,11 +127,13 @@ def keep_compiled() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def _targets(out: str | None, plot: str | None, overwrite: bool) -> tuple[Path | None, Path | None]:
+def _targets(
+    out: str | None, plot: str | None, defaults: tuple[str, str], overwrite: bool
+) -> tuple[Path | None, Path | None]:
     from vijax.store import check_output
 
     if out is None and plot is None:
-        out, plot = _DEFAULT_FILES
+        out, plot = defaults
     if out is not None and not out.endswith(".zarr"):
         raise ValueError(f"out must end in .zarr; got {out!r}")
     return (
@@ -119,18 +142,42 @@ def _targets(out: str | None, plot: str | None, overwrite: bool) -> tuple[Path |
     )
 
 
-def _plan(constants: tuple[str, ...], outputs: str | None, given: dict[str, Any]) -> "Plan":
+def _axes(given: dict[str, Any]) -> dict[str, Any]:
+    """Values of the axes, taken out of what was given; the default plane where no physical name is among them."""
     from vijax.axes import parse_axis
-    from vijax.grid import plan
 
     axes = {name: given.pop(name) for name in list(given) if name in _AXES}
     texts = {name: text for name, text in axes.items() if text is not None}
     # A plane of the default ranges comes first, so that what is given besides makes panels of it.
     if not _PHYSICAL & set(texts):
         texts = {name: text for name, text in _DEFAULT_PLANE.items() if name not in texts} | texts
+    return {name: parse_axis(name, text) for name, text in texts.items()}
+
+
+def _plan(axes: dict[str, Any], device: Any, outputs: str | None, settings: dict[str, Any]) -> "Plan":
+    from vijax.grid import plan
+
     wanted = None if outputs is None else [name.strip() for name in outputs.split(",")]
-    values = {name: parse_axis(name, text) for name, text in texts.items()}
-    return plan(values, wanted, _device(constants), method="exact", **given)
+    return plan(axes, wanted, device, method="exact", **settings)
+
+
+def _comparison(
+    axes: dict[str, Any],
+    device: Any,
+    outputs: str | None,
+    other: str,
+    tolerance: float | None,
+    settings: dict[str, Any],
+) -> "Comparison":
+    from vijax.compare import plan
+
+    if other != "rigid":
+        raise ValueError(f'compare must be "rigid"; got {other!r}')
+    if (wall := settings.pop("wall")) != "soft":
+        raise ValueError(f"wall must not be chosen with compare, which runs soft and rigid ones; got {wall!r}")
+    if outputs is not None:
+        raise ValueError(f"outputs must not be chosen with compare; got {outputs!r}; leave them out")
+    return plan(axes, tolerance, device, **settings)
 
 
 def _device(constants: tuple[str, ...]) -> Any:
@@ -150,39 +197,41 @@ def _device(constants: tuple[str, ...]) -> Any:
     return with_constants(Harvester(), **values)
 
 
-def _check_picture(path: Path, planned: "Plan") -> None:
+def _check_picture(path: Path, planned: "Plan | Comparison") -> None:
     from vijax import plot as pictures
+    from vijax.compare import Comparison
 
     pictures.check_format(path)
+    if isinstance(planned, Comparison):
+        pictures.layout(planned.soft.cells.sizes)
+        return
     pictures.layout(planned.cells.sizes)
     missing = [name for name in pictures.NEEDS if name not in planned.outputs]
     if missing:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
 
 
-def _run(planned: "Plan") -> "xr.Dataset":
+def _run(planned: "Plan | Comparison") -> "xr.Dataset":
     from tqdm import tqdm
 
-    from vijax.grid import run
+    from vijax import grid
+    from vijax.compare import Comparison, run
 
-    with tqdm(total=planned.cells.count, desc="compiling", unit="cells", unit_scale=True) as bar:
+    with tqdm(total=planned.count, desc="compiling", unit="cells", unit_scale=True) as bar:
 
         def show(done: int, total: int) -> None:
             if done:
                 bar.set_description("cells", refresh=False)
             bar.update(done - bar.n)
 
-        return run(planned, show)
+        return run(planned, show) if isinstance(planned, Comparison) else grid.run(planned, show)
 
 
 def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
     """What the map holds, in a few lines: cells by status and by period, the best of them, the time."""
     from vijax.dataset import best
 
-    lines = [f"{count:,} cells in {seconds:.2f} s, {count / seconds:,.0f} cells/s"]
-    status = dataset["status"]
-    names = dict(zip(status.flag_values, status.flag_meanings.split(), strict=True))
-    lines.append(f"cells by status: {_tally(names[value] for value in status.values.flat)}")
+    lines = [_pace(count, seconds), f"cells by status: {_flags(dataset['status'])}"]
     if "period" in dataset:
         names = {-1: "undecided", 0: "aperiodic"} | {n: f"period {n}" for n in range(1, _LONG)}
         periods = sorted(dataset["period"].values.flat, key=lambda period: period if period > 0 else math.inf)
@@ -191,6 +240,33 @@ def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
         peak = best(dataset)
         lines.append(f"largest admissible P: {'none' if peak is None else _place(peak, dataset)}")
     return "\n".join(lines)
+
+
+def _comparison_summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
+    """What the comparison holds, in a few lines: how cells ended, labels, verdicts, from where rigid is enough."""
+    lines = [_pace(count, seconds)]
+    lines += [f"{wall} cells by status: {_flags(dataset[f'status_{wall}'])}" for wall in ("soft", "rigid")]
+    lines.append(f"label: {_flags(dataset['label'])}")
+    lines.append(f"median difference in P: {100 * float(dataset['relative_difference'].median()):.3g} %")
+    if "cheapest_model" in dataset:
+        verdict = dataset["cheapest_model"]
+        within = f"{100 * verdict.attrs['tolerance']:g} %"
+        lines.append(f"cheapest model within {within}: {_flags(verdict)}")
+    if "rigid_from" in dataset:
+        onset = dataset["rigid_from"]
+        found = onset.values[onset.notnull().values]
+        span = f"{found.min():.4g} to {found.max():.4g}, median {onset.median():.4g}" if found.size else "none"
+        lines.append(f"least {onset.axis} from which on it is rigid: {span} ({found.size} of {onset.size} found)")
+    return "\n".join(lines)
+
+
+def _pace(count: int, seconds: float) -> str:
+    return f"{count:,} cells in {seconds:.2f} s, {count / seconds:,.0f} cells/s"
+
+
+def _flags(variable: "xr.DataArray") -> str:
+    names = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
+    return _tally(names[value] for value in variable.values.flat)
 
 
 def _tally(words: Iterable[str]) -> str:

@@ -32,7 +32,8 @@ ROOMS: dict[str, set[str]] = {
     "dataset": {"model", "axes", "simulate"},
     "store": set(),
     "grid": {"model", "axes", "dataset", "store", "simulate"},
-    "plot": {"model", "axes", "dataset", "store", "grid"},
+    "compare": {"model", "dataset", "grid"},
+    "plot": {"model", "axes", "dataset", "store", "grid", "compare"},
 }
 ROOMS["__init__"] = set(ROOMS)
 

@@ -7,6 +7,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.legend import Legend
 
 from vijax import plot
+from vijax.compare import Label, Model
 from vijax.dataset import best
 
 SYMBOLS = {
@@ -144,6 +145,55 @@ def test_hatch_border_and_dots_lie_on_their_cells():
     for i, j in np.ndindex(6, 8):
         inside = any(path.contains_point((D[i], KAPPA[j])) for path in veil.get_paths())
         assert inside == (not bool(found["admissible"][i, j])), (i, j)
+
+
+def drawn_comparison(**axes) -> xr.Dataset:
+    """A comparison whose labels differ at small d, where rigid is enough at great kappa, and a cell is undecided."""
+    found = drawn_map(**axes).drop_vars(["P", "admissible", "period"])
+    row, column = np.indices([len(values) for values in axes.values()])
+    verdict = np.where(column > 4, Model.RIGID, Model.SOFT)
+    verdict[5, 2] = Model.UNDECIDED
+    found["relative_difference"] = (list(axes), 10.0 ** (1 - column))
+    found["relative_difference"][0, 0] = np.inf
+    found["label"] = (list(axes), np.where(row < 2, Label.DIFFERS, Label.AGREES))
+    found["cheapest_model"] = (list(axes), verdict, {"tolerance": 0.005})
+    return found
+
+
+def test_difference_map_explains_itself(tmp_path):
+    found = drawn_comparison(d=D, kappa=KAPPA)
+    figure = plot.difference_map(found, tmp_path / "map.png")
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    said = words(figure)
+    for part in ("other labels", "rigid is enough within 0.5 %", "undecided", "P_\\mathrm{soft}"):
+        assert part in said, part
+    assert "failed" not in said
+    mesh = figure.axes[0].collections[0]
+    assert not np.ma.getmaskarray(mesh.get_array()).any()  # infinitely different is not missing
+    norm = mesh.norm
+    assert (type(norm), norm.vmin, norm.vmax) == (LogNorm, 1e-4, 1.0)
+    said = words(plot.difference_map(found.drop_vars("cheapest_model")))
+    assert not [part for part in ("enough", "undecided") if part in said]
+
+
+def test_lines_go_around_other_labels_and_where_rigid_is_enough():
+    axes = plot.difference_map(drawn_comparison(d=D, kappa=KAPPA)).axes[0]
+    labels, enough = (piece.get_segments() for piece in axes.collections[1:3])
+    assert {round(x, 12) for segment in labels for x, _ in segment} == {0.125}
+    assert {round(y, 9) for segment in enough for _, y in segment} == {round(np.sqrt(KAPPA[4] * KAPPA[5]), 9)}
+    (cross,) = axes.lines
+    assert (cross.get_xdata().tolist(), cross.get_ydata().tolist()) == ([D[5]], [KAPPA[2]])
+
+
+def test_a_difference_over_one_axis_is_a_curve():
+    found = drawn_comparison(d=D, kappa=KAPPA)
+    found["relative_difference"][0, 7] = np.nan
+    figure = plot.difference_map(found.isel(d=[0]))
+    (axes,) = figure.axes
+    np.testing.assert_array_equal(axes.lines[0].get_ydata()[[0, 7]], [np.nan, np.nan])
+    edges = [line.get_xdata()[0] for line in axes.lines[1:] if line.get_color() == "red"]
+    assert edges == pytest.approx([np.sqrt(KAPPA[4] * KAPPA[5])])
+    assert "no difference, or failed" in words(figure)
 
 
 def test_borders_part_a_mask_from_the_rest():

@@ -1,28 +1,23 @@
 """`scripts/grid.py`: from its arguments to a store and a picture, and nothing at all after bad input or Ctrl-C."""
 
-import importlib.util
 import os
 import re
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import SCRIPT, grid_script
 
 from vijax import dataset, grid
 
-SCRIPT = Path(__file__).parent.parent / "scripts" / "grid.py"
 TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
 
 
 @pytest.fixture(scope="module")
 def script():
-    spec = importlib.util.spec_from_file_location("grid_script", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return grid_script()
 
 
 @pytest.fixture
@@ -72,6 +67,17 @@ BAD = [
     (["--plot", "map.doc"], "plot must end in"),
     (["--omega", "3:12:50"], "at most 36 panels; got 50 values of omega"),
     (["--d", "0.1", "--kappa", "30"], "single cell"),
+    (["--tolerance", "0.05"], "tolerance must come with compare; got 0.05 alone"),
+    (["--compare", "rigid", "--tolerance", "0"], "tolerance must be a positive number"),
+    (["--compare", "rigid", "--tolerance=-0.1"], "tolerance must be a positive number"),
+    (["--compare", "rigid", "--tolerance", "nan"], "tolerance must be a positive number"),
+    (["--compare", "rigid", "--tolerance", "5%"], "--tolerance"),
+    (["--compare", "soft"], "compare must be"),
+    (["--compare", "rigid", "--wall", "rigid"], "wall must not be chosen with compare"),
+    (["--compare", "rigid", "--outputs", "P"], "outputs must not be chosen with compare"),
+    (["--compare", "rigid", "--u0", "0.2", "--d", "0.1,0.2"], "u0 must lie in the gap"),
+    (["--compare", "rigid", "--d", "0.1", "--kappa", "30"], "single cell"),
+    (["--compare", "rigid", "--plot", "map.doc"], "plot must end in"),
     (["--gravity", "1"], "No such option"),
     (["more"], "unexpected extra argument"),
 ]

@@ -269,6 +269,12 @@ def test_a_start_inside_a_soft_wall_is_a_contact_without_onset():
 # --- other programs --------------------------------------------------------------------------------------------------
 
 
+def test_a_window_has_an_exponent_too():
+    orbit = next(orbit for orbit in ORBITS if orbit["gamma"] == 0)
+    window = summarise([orbit_cell(orbit)], 200, until="window", outputs=frozenset({"lyapunov"}))
+    assert window.lyapunov[0] == pytest.approx(largest_exponent(orbit), abs=0.05)
+
+
 def test_float32_agrees_as_far_as_it_reaches(plane):
     sharp = np.flatnonzero(PERIODIC & (known("p") == 1) & (known("attractors_found") == 1))
     rough = summarise([PLANE[i] for i in sharp], dtype="float32")

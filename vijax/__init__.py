@@ -7,6 +7,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from vijax.compare import compare
 from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
 from vijax.model import Harvester, Impact, ImpactPair, State, Status, impact_pair
@@ -19,6 +20,7 @@ __all__ = [
     "ImpactPair",
     "State",
     "Status",
+    "compare",
     "harvested_energy",
     "impact_pair",
     "load",

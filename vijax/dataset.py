@@ -31,6 +31,11 @@ class Plan:
     outputs: tuple[str, ...]
     device: Harvester
 
+    @property
+    def count(self) -> int:
+        """Number of simulations."""
+        return self.cells.count
+
 
 class Output(NamedTuple):
     """A variable of the map: what it is, the fields of `Summary` it needs, and how it follows from them."""

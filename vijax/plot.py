@@ -3,9 +3,9 @@
 import itertools
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import EngFormatter
 
+from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.store import replacing
 
@@ -36,10 +37,8 @@ _STYLE: Any = {
     "savefig.dpi": 250,
 }
 _ENDINGS = (".png", ".pdf", ".svg", ".eps")
-_POWER = "$P$ [J per half period]"
 # Worth a place in the title: neither the start, nor a quantity under a second name.
 _CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
-_NO_ENERGY = "0.75"
 # A wider scale would say more about its faintest cells than about those worth building.
 _DECADES = 4
 # Values count as evenly spaced if their steps differ by less than this part of their range.
@@ -54,7 +53,10 @@ _LINE: dict[str, Any] = {
 }
 _DOT: dict[str, Any] = {"marker": ".", "markersize": 1.3, "color": "black", "mew": 0, "linestyle": "none"}
 _CROSS: dict[str, Any] = {"marker": "x", "markersize": 3.0, "color": "red", "mew": 0.7, "linestyle": "none"}
+_OUTLINE: dict[str, Any] = _LINE | {"color": "red", "linewidth": 1.2}
+_SINGLE = {"markersize": 4.0}  # of a mark that is not one of thousands
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "red", "mec": "white", "linestyle": "none"}
+_BARE: dict[str, Any] = {"color": "0.75"}
 _VEIL: dict[str, Any] = {"facecolor": (1, 1, 1, 0.55), "edgecolor": "0.3", "hatch": "/////", "linewidth": 0}
 
 
@@ -87,6 +89,26 @@ def check_format(path: str | Path) -> None:
         raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {str(path)!r}")
 
 
+class _Mark(NamedTuple):
+    """Cells that carry a mark, and what it means: a veil, the border around them, a point on most or any, or none."""
+
+    mask: np.ndarray
+    how: Literal["veil", "border", "most", "any", "bare"]
+    style: dict[str, Any]
+    text: str
+
+
+class _Kind(NamedTuple):
+    """A kind of picture: what it colours and how, the variables it needs and those it can do without, its marks."""
+
+    coloured: str
+    label: str
+    needs: tuple[str, ...]
+    optional: tuple[str, ...]
+    colours: "Callable[[xr.Dataset], LogNorm]"
+    marks: "Callable[[xr.Dataset], list[_Mark]]"
+
+
 def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     """P on a log colour scale, with all that tells where to believe it.
 
@@ -101,29 +123,51 @@ def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     Raises:
         ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
-    missing = [name for name in NEEDS if name not in dataset]
+    return _picture(dataset, _POWER, path)
+
+
+def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """The relative difference in P between rigid and soft walls on a log colour scale.
+
+    A line parts cells whose labels differ from the others; another one, where the comparison was given a tolerance,
+    goes around the cells where the rigid model is enough, and crosses stand on those without a verdict.
+
+    Args:
+        dataset: What `compare` returned; dimensions as in `power_map`.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    return _picture(dataset, _DIFFERENCE, path)
+
+
+def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
+    missing = [name for name in kind.needs if name not in dataset]
     if missing:
-        raise ValueError(f"plot must have {', '.join(NEEDS)}; got a map without {', '.join(missing)}")
+        raise ValueError(f"plot must have {', '.join(kind.needs)}; got a map without {', '.join(missing)}")
     if path is not None:
         check_format(path)
-    rows, columns = layout({str(dim): size for dim, size in dataset["P"].sizes.items()})
+    whole = dataset[kind.coloured]
+    rows, columns = layout({str(dim): size for dim, size in whole.sizes.items()})
+    names = [*kind.needs, *(name for name in kind.optional if name in dataset)]
     # A variable lacks the dimensions that it does not depend on; the picture wants them all.
-    full = {name: dataset[name].broadcast_like(dataset["P"]).transpose(*dataset["P"].dims) for name in NEEDS}
-    dataset = dataset.assign(full)[list(NEEDS)].squeeze()
-    dims = [str(dim) for dim in dataset["P"].dims]
+    full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
+    dataset = dataset.assign(full)[names].squeeze()
+    dims = [str(dim) for dim in dataset[kind.coloured].dims]
     with mpl.rc_context(_STYLE):
-        figure = _curve(dataset) if len(dims) == 1 else _maps(dataset, dims, rows, columns)
+        figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims, rows, columns)
         if path is not None:
             with replacing(Path(path)) as part:
                 figure.savefig(part)
     return figure
 
 
-def _maps(dataset: "xr.Dataset", dims: list[str], rows: int, columns: int) -> Figure:
+def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str], rows: int, columns: int) -> Figure:
     size = (5.2, 4.6) if rows * columns == 1 else (1.6 + 2.1 * columns, 1.6 + 1.9 * rows)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    norm, peak = _norm(dataset), best(dataset)
+    norm, peak = kind.colours(dataset), _peak(dataset)
     # Panels by rows, cells by y: the dimensions backwards.
     dataset = dataset.sortby(dims[:2]).transpose(*dims[::-1])
     outer = dims[:1:-1]
@@ -132,7 +176,7 @@ def _maps(dataset: "xr.Dataset", dims: list[str], rows: int, columns: int) -> Fi
             axes.set_visible(False)
             continue
         panel = dataset.isel(dict(zip(outer, index, strict=True)))
-        mesh = _panel(axes, panel, dims[0], dims[1], norm)
+        mesh = _panel(axes, panel, kind, dims[0], dims[1], norm)
         axes.set_title(_values(panel, dims[2:]), fontsize="medium")
         if peak is not None and all(peak[dim] == panel[dim] for dim in outer):
             axes.plot(peak[dims[0]], peak[dims[1]], **_STAR, clip_on=False, zorder=5)
@@ -140,69 +184,69 @@ def _maps(dataset: "xr.Dataset", dims: list[str], rows: int, columns: int) -> Fi
         axes.set_xlabel(_label(dataset[dims[0]]))
     for axes in grid[:, 0]:
         axes.set_ylabel(_label(dataset[dims[1]]))
-    figure.colorbar(mesh, ax=grid, extend="both", label=_POWER)
-    _explain(figure, dataset, peak)
+    figure.colorbar(mesh, ax=grid, extend="both", label=kind.label)
+    _explain(figure, dataset, kind, peak)
     return figure
 
 
-def _panel(axes: Axes, panel: "xr.Dataset", x: str, y: str, norm: LogNorm) -> QuadMesh:
+def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: LogNorm) -> QuadMesh:
     (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in (x, y))
-    axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_NO_ENERGY)
-    power, period = panel["P"].values, panel["period"].values
-    mesh = axes.pcolormesh(across, up, np.ma.masked_where(~(power > 0), power), norm=norm, rasterized=True)
-    _hatch(axes, across, up, ~panel["admissible"].values)
-    axes.add_collection(LineCollection(_borders(across, up, period == 1), **_LINE))
-    axes.plot(*_marks(period == 0, panel[x].values, panel[y].values, most=True), **_DOT)
-    axes.plot(*_marks(period < 0, panel[x].values, panel[y].values, most=False), **_CROSS)
+    axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_BARE["color"])
+    # matplotlib takes infinities for missing.
+    values = np.minimum(panel[kind.coloured].values, np.finfo(float).max)
+    mesh = axes.pcolormesh(across, up, np.ma.masked_where(~(values > 0), values), norm=norm, rasterized=True)
+    _mark_map(axes, kind.marks(panel), (panel[x].values, panel[y].values), (across, up))
     return mesh
 
 
-def _curve(dataset: "xr.Dataset") -> Figure:
-    """P over a single axis, with the marks of a map."""
-    (x,) = (str(dim) for dim in dataset["P"].dims)
+def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
+    """The coloured variable over a single axis, with the marks of a map."""
+    (x,) = (str(dim) for dim in dataset[kind.coloured].dims)
     dataset = dataset.sortby(x)
-    places, power, period = dataset[x].values, dataset["P"].values, dataset["period"].values
+    places, values = dataset[x].values, dataset[kind.coloured].values
     figure = Figure(figsize=(5.2, 3.8), layout="constrained")
-    axes, peak = figure.subplots(), best(dataset)
+    axes, peak = figure.subplots(), _peak(dataset)
     across, xscale = _edges(places)
-    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=_label(dataset[x]), ylabel=_POWER)
-    axes.plot(places, np.where(power > 0, power, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
+    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=_label(dataset[x]), ylabel=kind.label)
+    drawn = (values > 0) & np.isfinite(values)
+    axes.plot(places, np.where(drawn, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
     axes.margins(y=0.05)
-    for start, end in _runs(~dataset["admissible"].values):
-        axes.axvspan(across[start], across[end], **_VEIL, zorder=0)
-    for border in _runs(period == 1):
-        for edge in set(border) - {0, places.size}:
-            axes.axvline(across[edge], **_LINE, zorder=0.5)
-    for mask, style in ((period == 0, _DOT | {"markersize": 4}), (period < 0, _CROSS)):
-        axes.plot(places[mask], power[mask], **style, zorder=2)
+    _mark_curve(axes, kind.marks(dataset), places, across, values)
     if peak is not None:
         axes.plot(peak[x], peak, **_STAR, zorder=5)
-    _explain(figure, dataset, peak)
+    _explain(figure, dataset, kind, peak)
     return figure
 
 
-def _explain(figure: Figure, dataset: "xr.Dataset", peak: "xr.DataArray | None") -> None:
-    """What the map holds constant above it, what its marks mean below; only the marks that it has."""
-    constants = [name for name in _CONSTANTS if name in dataset.coords and not dataset[name].ndim]
-    title = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
-    figure.suptitle(", ".join([*title, _values(dataset, constants)]), fontsize="medium")
-    period = dataset["period"].values
-    marks = [
-        (~dataset["admissible"].values, Patch(**_VEIL), "inadmissible"),
-        (period == 1, Line2D([], [], **_LINE), "border of period 1"),
-        (period == 0, Line2D([], [], **_DOT | {"markersize": 4}), "aperiodic"),
-        (period < 0, Line2D([], [], **_CROSS), "undecided"),
-        (dataset["P"].values == 0, Patch(color=_NO_ENERGY), "no impact"),
-    ]
-    shown = [(handle, text) for mask, handle, text in marks if mask.any()]
-    if peak is not None:
-        amount = EngFormatter("J", places=2)(float(peak))
-        shown.append((Line2D([], [], **_STAR), f"largest admissible $P$, {amount}"))
-    handles, texts = zip(*shown, strict=True) if shown else ((), ())
-    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
+def _peak(dataset: "xr.Dataset") -> "xr.DataArray | None":
+    return best(dataset) if {"P", "admissible"} <= set(dataset) else None
 
 
-def _norm(dataset: "xr.Dataset") -> LogNorm:
+def _mark_map(
+    axes: Axes, marks: list[_Mark], places: tuple[np.ndarray, np.ndarray], edges: tuple[np.ndarray, np.ndarray]
+) -> None:
+    for mask, how, style, _ in marks:
+        if how == "veil":
+            _hatch(axes, *edges, mask)
+        elif how == "border":
+            axes.add_collection(LineCollection(_borders(*edges, mask), **style))
+        elif how != "bare":
+            axes.plot(*_marks(mask, *places, most=how == "most"), **style)
+
+
+def _mark_curve(axes: Axes, marks: list[_Mark], places: np.ndarray, across: np.ndarray, values: np.ndarray) -> None:
+    for mask, how, style, _ in marks:
+        if how == "veil":
+            for start, end in _runs(mask):
+                axes.axvspan(across[start], across[end], **style, zorder=0)
+        elif how == "border":
+            for edge in set(_runs(mask).flat) - {0, places.size}:
+                axes.axvline(across[edge], **style, zorder=0.5)
+        elif how != "bare":
+            axes.plot(places[mask], values[mask], **style | _SINGLE, zorder=2)
+
+
+def _power_colours(dataset: "xr.Dataset") -> LogNorm:
     """Colours for the admissible cells: outside, the formula may give any number of times more."""
     power = dataset["P"].values
     trusted = power[(power > 0) & dataset["admissible"].values]
@@ -210,6 +254,66 @@ def _norm(dataset: "xr.Dataset") -> LogNorm:
     if not shown.size:
         return LogNorm(1e-9, 1e-6)
     return LogNorm(max(shown.min(), shown.max() / 10**_DECADES), shown.max())
+
+
+def _power_marks(dataset: "xr.Dataset") -> list[_Mark]:
+    period = dataset["period"].values
+    return [
+        _Mark(~dataset["admissible"].values, "veil", _VEIL, "inadmissible"),
+        _Mark(period == 1, "border", _LINE, "border of period 1"),
+        _Mark(period == 0, "most", _DOT, "aperiodic"),
+        _Mark(period < 0, "any", _CROSS, "undecided"),
+        _Mark(dataset["P"].values == 0, "bare", _BARE, "no impact"),
+    ]
+
+
+def _difference_colours(_: "xr.Dataset") -> LogNorm:
+    """One scale for all maps: beyond 1 it matters no more by how much."""
+    return LogNorm(10.0**-_DECADES, 1.0)
+
+
+def _difference_marks(dataset: "xr.Dataset") -> list[_Mark]:
+    differs = dataset["label"].values == Label.DIFFERS
+    marks = [_Mark(differs, "border", _LINE, "border of other labels")]
+    if "cheapest_model" in dataset:
+        verdict = dataset["cheapest_model"]
+        within = f"{100 * verdict.attrs['tolerance']:.4g} %"
+        marks += [
+            _Mark(verdict.values == Model.RIGID, "border", _OUTLINE, f"rigid is enough within {within}"),
+            _Mark(verdict.values == Model.UNDECIDED, "any", _CROSS | {"color": "orange"}, "undecided"),
+        ]
+    bare = ~(dataset["relative_difference"].values > 0)
+    return [*marks, _Mark(bare, "bare", _BARE, "no difference, or failed")]
+
+
+_POWER = _Kind("P", "$P$ [J per half period]", NEEDS, (), _power_colours, _power_marks)
+_DIFFERENCE = _Kind(
+    "relative_difference",
+    r"$|P_\mathrm{rigid} - P_\mathrm{soft}| / P_\mathrm{soft}$",
+    ("relative_difference", "label"),
+    ("cheapest_model",),
+    _difference_colours,
+    _difference_marks,
+)
+
+
+def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataArray | None") -> None:
+    """What the map holds constant above it, what its marks mean below; only the marks that it has."""
+    constants = [name for name in _CONSTANTS if name in dataset.coords and not dataset[name].ndim]
+    title = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
+    figure.suptitle(", ".join([*title, _values(dataset, constants)]), fontsize="medium")
+    shown = [(_handle(mark), mark.text) for mark in kind.marks(dataset) if mark.mask.any()]
+    if peak is not None:
+        amount = EngFormatter("J", places=2)(float(peak))
+        shown.append((Line2D([], [], **_STAR), f"largest admissible $P$, {amount}"))
+    handles, texts = zip(*shown, strict=True) if shown else ((), ())
+    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
+
+
+def _handle(mark: _Mark) -> Patch | Line2D:
+    if mark.how in ("veil", "bare"):
+        return Patch(**mark.style)
+    return Line2D([], [], **mark.style if mark.how == "border" else mark.style | _SINGLE)
 
 
 def _edges(values: np.ndarray) -> tuple[np.ndarray, str]:

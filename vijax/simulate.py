@@ -383,7 +383,9 @@ def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
     """Tangent map with the new step on the left; started afresh by the first impact of the window."""
     if cell.tangent is None:
         return None, None
-    fresh = counted & (cell.batch < 0) & ~cell.candidate.tracing
+    fresh = counted & (cell.batch < 0)
+    if cell.candidate is not None:
+        fresh = fresh & ~cell.candidate.tracing
     a, b, c, d = (jnp.where(fresh, unit, old) for unit, old in zip((1.0, 0.0, 0.0, 1.0), cell.tangent, strict=True))
     p, q, r, s = hit.tangent
     a, b, c, d = p * a + q * c, p * b + q * d, r * a + s * c, r * b + s * d

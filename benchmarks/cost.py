@@ -1,0 +1,139 @@
+"""What does each thing asked for cost, and is what was not asked for free?
+
+    python benchmarks/cost.py           # 128 x 128 cells, 100 periods
+    python benchmarks/cost.py --quick   # 32 x 32 cells, 10 periods: does it run?
+
+The planes: d 0.05..0.3 by kappa 3..400 (log), and d by v0 -0.6..0.6 at kappa 400, where rigid walls have as many cells
+to simulate as soft ones; r 0.5, start (0, 0.4), over a window. Microseconds are of whole warm calls of `vijax.sweep`
+for each cell of the plane and period, medians; ratios are against another row of the same round, median and range.
+Printout for 64 x 64 cells and 50 periods, two cores, on a busy machine:
+
+    counts             0.9646 us per cell-period
+    counts, again      0.8155 us per cell-period     0.95 times counts (0.80 to 1.34)
+    lyapunov           0.9172 us per cell-period     1.07 times counts (0.94 to 1.35)
+    P                  1.5345 us per cell-period     1.72 times counts (1.59 to 2.61)
+    P at 8 omega       1.6227 us per cell-period     1.09 times P (1.06 to 1.13)
+    gamma = 0 given    1.0239 us per cell-period     1.19 times counts (0.82 to 1.34)
+    gamma = 0.1       12.9800 us per cell-period    15.08 times counts (13.28 to 19.52)
+    soft, starts       0.7707 us per cell-period
+    rigid, starts      0.4817 us per cell-period     0.62 times soft, starts (0.52 to 0.64)
+    rigid map          0.2363 us per cell-period     0.12 times P (0.12 to 0.15)
+
+"""
+
+import argparse
+import csv
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from speed import HERE, U0, V0, R, axes
+
+import vijax
+
+FREQUENCIES = 8
+LEVEL, INCLINED = 0.0, 0.1
+STIFF = 400.0
+SPEEDS = 0.6  # starts of the second plane reach from minus to plus it
+
+
+class Contender(NamedTuple):
+    """A sweep, and the contender whose time it is a multiple of."""
+
+    call: Callable[[], Any]
+    against: str | None
+
+
+class Row(NamedTuple):
+    """One timed call, as it goes to the CSV file."""
+
+    what: str
+    cells: int
+    periods: int
+    repeat: int
+    seconds: float
+
+    @property
+    def cell_period(self) -> float:
+        """Microseconds per cell-period."""
+        return 1e6 * self.seconds / (self.cells * self.periods)
+
+
+def contenders(side: int, periods: int) -> dict[str, Contender]:
+    """What is timed, by name."""
+    d, kappa = axes(side)
+    sweep = partial(vijax.sweep, d=d, r=R, u0=U0, until="window", periods=periods)
+    plane = partial(sweep, kappa=kappa, v0=V0)
+    starts = partial(sweep, kappa=STIFF, v0=np.linspace(-SPEEDS, SPEEDS, side))
+    counts, power = ("impacts_per_period",), ("impacts_per_period", "P")
+    omega = np.pi * np.geomspace(1, 12, FREQUENCIES)
+    return {
+        "counts": Contender(partial(plane, outputs=counts), None),
+        "counts, again": Contender(partial(plane, outputs=counts), "counts"),
+        "lyapunov": Contender(partial(plane, outputs=("impacts_per_period", "lyapunov")), "counts"),
+        "P": Contender(partial(plane, outputs=power), "counts"),
+        f"P at {FREQUENCIES} omega": Contender(partial(plane, omega=omega, outputs=power), "P"),
+        "gamma = 0 given": Contender(partial(plane, gamma=LEVEL, outputs=counts), "counts"),
+        f"gamma = {INCLINED}": Contender(partial(plane, gamma=INCLINED, outputs=counts), "counts"),
+        "soft, starts": Contender(partial(starts, outputs=power), None),
+        "rigid, starts": Contender(partial(starts, wall="rigid", outputs=power), "soft, starts"),
+        # All kappa of a rigid wall are one simulation, so its whole map is.
+        "rigid map": Contender(partial(plane, wall="rigid", outputs=power), "P"),
+    }
+
+
+def timed(what: str, call: Callable[[], Any], side: int, periods: int, repeat: int) -> Row:
+    """Run a sweep and time it."""
+    start = time.perf_counter()
+    found = call()
+    seconds = time.perf_counter() - start
+    if lost := int(found["impacts_per_period"].isnull().sum()):
+        raise SystemExit(f"{what}: {lost} cells without a number")
+    return Row(what, side * side, periods, repeat, seconds)
+
+
+def measure(side: int, periods: int, repeats: int) -> Iterator[Row]:
+    """Rounds over all contenders, so that a ratio compares calls of one moment; the first compiles and is dropped."""
+    entered = contenders(side, periods)
+    rows: dict[str, list[Row]] = {what: [] for what in entered}
+    for what, contender in entered.items():
+        timed(what, contender.call, side, periods, -1)
+    for repeat in range(repeats):
+        for what, contender in entered.items():
+            rows[what].append(timed(what, contender.call, side, periods, repeat))
+            yield rows[what][-1]
+    for what, contender in entered.items():
+        typical = statistics.median(row.cell_period for row in rows[what])
+        print(f"{what:16} {typical:8.4f} us per cell-period", end="")
+        if contender.against is not None:
+            pairs = zip(rows[what], rows[contender.against], strict=True)
+            ratios = [row.seconds / other.seconds for row, other in pairs]
+            print(f"   {statistics.median(ratios):6.2f} times {contender.against}", end="")
+            print(f" ({min(ratios):.2f} to {max(ratios):.2f})", end="")
+        print()
+
+
+def main() -> None:
+    """Measure, print, and save the raw rows."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
+    parser.add_argument("--rows", type=Path, default=HERE / "rows", help="folder for the raw rows")
+    given = parser.parse_args()
+
+    print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
+    given.rows.mkdir(parents=True, exist_ok=True)
+    with (given.rows / f"cost{'_quick' if given.quick else ''}.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow([*Row._fields, "us_per_cell_period"])
+        for row in measure(32, 10, 3) if given.quick else measure(128, 100, 5):
+            table.writerow([*row, row.cell_period])
+
+
+if __name__ == "__main__":
+    main()
