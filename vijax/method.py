@@ -55,3 +55,6 @@ class Rk4(eqx.Module):
 
     steps: Real
     law: Law
+
+
+Method = Ode | Rk4

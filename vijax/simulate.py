@@ -7,6 +7,9 @@ that reaches its last period without an orbit reports averages over the window s
 """
 
 from functools import lru_cache, partial
+from importlib import import_module
+from types import ModuleType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax import energy, exact, flow, lanes, quick
+from vijax.method import Method, Ode, Passage
 from vijax.model import Harvester, ImpactPair, State, Status
 from vijax.quick import Hit, Lanes, Wall
 
@@ -29,6 +33,7 @@ _BUDGET = 512  # impacts per period before a cell is stopped
 _ROUNDS = 8  # Newton rounds on one candidate
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
 _QUIET = 64  # a flight that outlasts the last period by so many is over for good
+_STEPS = 20_000  # steps per period before a cell of a stepping engine is stopped
 _SCALE = 2.0**40  # the tangent map is kept between 1/_SCALE and _SCALE, the rest in an exponent
 
 ENERGY = frozenset({"P", "P_stderr", "energy_ratio"})
@@ -74,6 +79,7 @@ class Plan(eqx.Module):
     """What a run is asked for: the static choices that select a compiled program."""
 
     until: str = eqx.field(static=True)
+    stepping: str | None = eqx.field(static=True)  # the room of the stepping engine, None for the exact one
     rigid: bool = eqx.field(static=True)
     level: bool = eqx.field(static=True)  # gamma = 0 everywhere
     deep: bool = eqx.field(static=True)
@@ -88,6 +94,7 @@ class Settings(eqx.Module):
     periods: Float[Array, ""]
     transient: Float[Array, ""]
     device: Harvester
+    method: Method | None
     length_variant: Float[Array, "variant"]
     speed_variant: Float[Array, "variant"]
 
@@ -130,11 +137,21 @@ class Candidate(eqx.Module):
     rounds: Lane
 
 
+class Course(eqx.Module):
+    """A lane of a stepping engine: its wall, the engine's carry, and the last impact if it waits to be folded."""
+
+    wall: Any
+    carry: Any
+    waits: Mask
+    passage: Passage
+
+
 class Cell(eqx.Module):
     """A lane's cell: parameters, where the ball is, and what has been seen."""
 
     pair: ImpactPair
     wall: Wall | None
+    course: Course | None
     length: Lane
     speed: Lane
     ball: Lanes
@@ -198,16 +215,18 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
     pair = ImpactPair(d, None if plan.rigid else kappa, r, gamma)
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
     ball = Lanes(u, v, zero, zero)
+    held = exact.start_mode(pair, u, v, zero)
     start = settings.transient + zero
     eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None
     attractor = plan.until == "attractor"
     return Cell(
         pair=pair,
-        wall=quick.prepare(pair) if plan.level else None,
+        wall=quick.prepare(pair) if plan.level and plan.stepping is None else None,
+        course=_set_off(plan, settings, pair, ball, held) if plan.stepping else None,
         length=length,
         speed=speed,
         ball=ball,
-        held=exact.start_mode(pair, u, v, zero),
+        held=held,
         running=~no,
         declined=no,
         hard=no,
@@ -290,6 +309,74 @@ def _careful_trip(plan: Plan, settings: Settings, cell: Cell, patience: Int[Arra
         ),
     )
     return _fold(plan, settings, cell, event)
+
+
+def _stepping(plan: Plan) -> ModuleType:
+    """The room of the stepping engine, loaded when it is first asked for: diffrax takes a second."""
+    return import_module(f"vijax.{plan.stepping}")
+
+
+def _set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Lanes, held: Lane) -> Course:
+    """Lanes of a stepping engine at the start of a run or of a round."""
+    engine, method = _stepping(plan), settings.method
+    whole = ball.n.astype(jnp.int32)
+    state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
+    carry = jax.vmap(partial(engine.start, method, deep=plan.deep, tangent=plan.tangent))(pair, state)
+    wall = method.law.wall(pair)
+    _, passage, _ = jax.eval_shape(jax.vmap(partial(engine.step, method)), pair, wall, carry)
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), passage)
+    return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
+
+
+def _stepping_trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """One solver step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
+    old = cell.course
+    step = partial(_stepping(plan).step, settings.method)
+    carry, passage, finished = flow.share(jax.vmap(step)(cell.pair, old.wall, old.carry))
+    blocked = old.waits & finished
+    new = Course(
+        old.wall,
+        _where(blocked, old.carry, carry),
+        old.waits | finished,
+        _where(finished & ~blocked, passage, old.passage),
+    )
+    return eqx.tree_at(lambda c: c.course, cell, new)
+
+
+def _stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """Fold the impacts that wait, end flights and contacts that outlast the run, and review what has stopped."""
+    course, carry, passage = cell.course, cell.course.carry, cell.course.passage
+    impact, after = passage.impact, passage.after
+    waits = course.waits & cell.running
+    late = carry.n.astype(cell.count.dtype) - _window_end(plan, settings)
+    idle = cell.running & ~course.waits
+    quiet = idle & (carry.mode == 0) & (late >= (_QUIET if cell.candidate is not None else 0))
+    permanent = idle & (carry.mode != 0) & (late >= _QUIET)
+    hit = Hit(
+        onset_t=impact.t,
+        onset_n=impact.n.astype(impact.t.dtype),
+        side=impact.side.astype(impact.t.dtype),
+        v_in=impact.v_in,
+        v_out=impact.v_out,
+        flight=passage.flight,
+        duration=impact.duration,
+        after=Lanes(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
+        depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
+        work=impact.work if plan.deep else None,
+        tangent=passage.tangent,
+    )
+    cell = _fold(plan, settings, cell, _Event(hit, waits, quiet, permanent, jnp.zeros_like(waits)))
+    spent = cell.running & (carry.steps > _STEPS * (_window_end(plan, settings) + 1))
+    cell = eqx.tree_at(
+        lambda c: (c.running, c.status),
+        cell,
+        (cell.running & ~spent, jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)),
+    )
+    stopped = ~cell.running
+    cell = _review(plan, settings, cell)
+    again = _set_off(plan, settings, cell.pair, cell.ball, jnp.zeros_like(cell.count))
+    course = eqx.tree_at(lambda c: c.waits, course, jnp.zeros_like(waits))
+    return eqx.tree_at(lambda c: c.course, cell, _where(stopped & cell.running, again, course))
 
 
 def _where(mask: Mask, new, old):
@@ -645,9 +732,9 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
     )
     return lanes.Program(
         load=partial(_load, plan, settings),
-        trip=trip,
-        careful=partial(_careful_trip, plan, settings),
-        review=partial(_review, plan, settings),
+        trip=partial(_stepping_trip, plan, settings) if plan.stepping else trip,
+        careful=(lambda cell, patience: cell) if plan.stepping else partial(_careful_trip, plan, settings),
+        review=partial(_stepping_review if plan.stepping else _review, plan, settings),
         declined=_declined,
         stopped=lambda cell: ~cell.running,
         hard=lambda cell: cell.hard,
@@ -741,6 +828,7 @@ def summarise(
     until: str = "attractor",
     transient: int = 0,
     outputs: frozenset[str] = frozenset({"P"}),
+    method: Method | None = None,
     count: int | None = None,
 ) -> Summary:
     """Run a tile of cells from phase 0, each until its attractor is certain or its window is over, in one jitted call.
@@ -754,6 +842,7 @@ def summarise(
         until: "attractor" or "window".
         transient: Periods before the window ("window" only).
         outputs: Names of `Summary` fields that must be there; what only others need is not computed.
+        method: The stepping method (`method.choose` makes it); None for the exact engine.
         count: How many cells are real, the rest being padding; all unless given.
 
     Returns:
@@ -762,6 +851,7 @@ def summarise(
     dtype = pair.d.dtype
     plan = Plan(
         until=until,
+        stepping=None if method is None else "ode" if isinstance(method, Ode) else "rk4",
         rigid=pair.kappa is None,
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=bool(outputs & DEEP),
@@ -776,6 +866,7 @@ def summarise(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
         device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
     )
