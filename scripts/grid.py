@@ -57,6 +57,14 @@ def _options() -> list[click.Parameter]:
         click.Option(["--until"], default="attractor", show_default=True, help="attractor or window"),
         click.Option(["--transient"], default=0, show_default=True, help="forcing periods to drop first"),
         click.Option(["--wall"], default="soft", show_default=True, help="soft or rigid"),
+        click.Option(["--method"], default="exact", show_default=True, help="exact, ode or rk4"),
+        click.Option(["--solver"], help="of ode: Tsit5, Dopri5, Dopri8, Kvaerno5 ... [Tsit5]"),
+        click.Option(["--rtol"], type=float, help="of ode: relative tolerance of a step [1e-8]"),
+        click.Option(["--atol"], type=float, help="of ode: absolute tolerance of a step [1e-10]"),
+        click.Option(["--steps"], type=int, help="of rk4: steps per forcing period [1000]"),
+        click.Option(["--membrane"], help="of ode and rk4: linear or hunt-crossley [linear]"),
+        click.Option(["--chi"], type=float, help="of hunt-crossley: damping over stiffness"),
+        click.Option(["--exponent"], type=float, help="of hunt-crossley: exponent of the penetration [1.5]"),
         click.Option(["--dtype"], default="float64", show_default=True, help="float64 or float32"),
         click.Option(["--outputs"], metavar="NAME,NAME", help="variables wanted [all but lyapunov]"),
         click.Option(["--out"], metavar="FILE.zarr", help="store to write"),
@@ -128,9 +136,25 @@ def _plan(constants: tuple[str, ...], outputs: str | None, given: dict[str, Any]
     # A plane of the default ranges comes first, so that what is given besides makes panels of it.
     if not _PHYSICAL & set(texts):
         texts = {name: text for name, text in _DEFAULT_PLANE.items() if name not in texts} | texts
+    given["membrane"] = _membrane(given["membrane"], given.pop("chi"), given.pop("exponent"))
     wanted = None if outputs is None else [name.strip() for name in outputs.split(",")]
     values = {name: parse_axis(name, text) for name, text in texts.items()}
-    return plan(values, wanted, _device(constants), method="exact", **given)
+    return plan(values, wanted, _device(constants), **given)
+
+
+def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
+    from vijax.membrane import HuntCrossley, Linear
+
+    if name == "hunt-crossley":
+        if chi is None:
+            raise ValueError("chi must be given with --membrane hunt-crossley; got none")
+        return HuntCrossley(chi) if exponent is None else HuntCrossley(chi, exponent)
+    for option, value in (("chi", chi), ("exponent", exponent)):
+        if value is not None:
+            raise ValueError(f"{option} must be left out unless --membrane is hunt-crossley; got {value:g}")
+    if name not in (None, "linear"):
+        raise ValueError(f"membrane must be linear or hunt-crossley; got {name!r}")
+    return None if name is None else Linear()
 
 
 def _device(constants: tuple[str, ...]) -> Any:

@@ -1,9 +1,11 @@
 """Membrane laws: the acceleration that a wall gives to a ball which has entered it by w at rate w'."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from vijax.model import ImpactPair, Real, is_concrete
@@ -75,8 +77,10 @@ class HuntCrossley(eqx.Module):
 
 
 def _allowed(value: Any, least: float) -> bool:
-    array = jnp.asarray(value) if not isinstance(value, str | None) else jnp.asarray(jnp.nan)
-    return array.ndim == 0 and bool(jnp.isfinite(array)) and bool(array >= least)
+    number = np.asarray(value)
+    return number.dtype.kind in "iuf" and number.ndim == 0 and bool(np.isfinite(number)) and bool(number >= least)
 
 
 Law = Linear | HuntCrossley
+Wall = Callable[[Values, Values], Values]
+"""A law with the numbers of a pair: (w, w') -> acceleration."""

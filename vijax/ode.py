@@ -9,8 +9,6 @@ the repeated step, so that the state has the order of the solver and not that of
 This is the only file that imports diffrax.
 """
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -19,12 +17,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax.flow import PI, share
+from vijax.membrane import Wall
 from vijax.method import Ode, Passage
 from vijax.model import Impact, ImpactPair, MembranePair, State
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
-Wall = Any  # what a membrane law makes of a pair: (w, w') -> acceleration
 
 _LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
 _CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step

@@ -366,12 +366,10 @@ def _stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
         tangent=passage.tangent,
     )
     cell = _fold(plan, settings, cell, _Event(hit, waits, quiet, permanent, jnp.zeros_like(waits)))
-    spent = cell.running & (carry.steps > _STEPS * (_window_end(plan, settings) + 1))
-    cell = eqx.tree_at(
-        lambda c: (c.running, c.status),
-        cell,
-        (cell.running & ~spent, jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)),
-    )
+    if plan.stepping == "ode":  # the steps of the other are counted by its clock
+        spent = cell.running & (carry.steps > _STEPS * (_window_end(plan, settings) + 1))
+        status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
+        cell = eqx.tree_at(lambda c: (c.running, c.status), cell, (cell.running & ~spent, status))
     stopped = ~cell.running
     cell = _review(plan, settings, cell)
     again = _set_off(plan, settings, cell.pair, cell.ball, jnp.zeros_like(cell.count))
