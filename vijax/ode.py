@@ -165,7 +165,8 @@ def _control(engine: Ode, order: float, t0: Scalar, t1: Scalar, y0: Point, y1: P
     if engine.dt is not None:
         return jnp.ones_like(t0, bool), jnp.full_like(t0, engine.dt)
     controller = diffrax.PIDController(rtol=engine.rtol, atol=engine.atol)
-    (x0, z0), (x1, z1), (e_x, e_z) = ((y.x, y.z) for y in lax.stop_gradient((y0, y1, error)))
+    t0, t1, y0, y1, error = lax.stop_gradient((t0, t1, y0, y1, error))
+    (x0, z0), (x1, z1), (e_x, e_z) = ((y.x, y.z) for y in (y0, y1, error))
     one = jnp.ones_like(t0)
     keep, begin, end, _, _, _ = controller.adapt_step_size(
         t0, t1, (x0, z0), (x1, z1), None, (e_x, e_z), order, (one, one, jnp.asarray(False))
@@ -310,7 +311,7 @@ def _ratio(change: Scalar, speed: Scalar) -> Scalar:
 
 
 def step(
-    engine: Ode, pair: ImpactPair, wall: Wall, m: Motion, *, strobe: bool = False, kind: str = "lax"
+    engine: Ode, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
 ) -> tuple[Motion, Passage, Flag]:
     """Try one step of the solver.
 
@@ -319,19 +320,18 @@ def step(
         pair: One cell (scalars).
         wall: Its membrane, (w, w') -> acceleration.
         m: The carry, from `start` or an earlier step.
-        strobe: Whether steps end at phase 0.
-        kind: How diffrax loops over stages: "lax", or "bounded" for what is differentiated in reverse.
+        recorded: For trajectories: a step ends at phase 0, and can be differentiated in reverse.
 
     Returns:
         The carry after it, and the impact that this step finished, meaningless unless the flag says that it did.
         A step length that is not finite or vanishes beside the time makes an impact of NaN.
     """
     half = 0.5 * pair.d
-    solver = _solver(engine, kind)
+    solver = _solver(engine, "bounded" if recorded else "lax")
     spell = Spell(pair.gamma, m.mode, wall)
-    h = jnp.minimum(m.h, _LONGEST)
-    room = 2 - m.t
-    to_strobe = (h >= room) if strobe else jnp.zeros_like(m.cut)
+    h = jnp.minimum(lax.stop_gradient(m.h), _LONGEST)
+    room = lax.stop_gradient(2 - m.t)
+    to_strobe = (h >= room) if recorded else jnp.zeros_like(m.cut)
     h = jnp.where(to_strobe, room, h)
     t1 = jnp.where(to_strobe, 2.0, m.t + h)
     f0 = _field(m.t, m.y, spell)
@@ -430,8 +430,8 @@ def _advance(engine, pair, spell, m, y1, f1, t1, h, h_next, seen, sight, moved, 
     return new, passage, ends | lost
 
 
-def state(pair: ImpactPair, m: Motion) -> State:
-    """Where the ball is."""
+def ball(pair: ImpactPair, method: Ode, m: Motion) -> State:
+    """Where the ball of a carry is."""
     side = m.mode.astype(m.y.x.dtype)
     held = m.mode != 0
     u = jnp.where(held, side * (0.5 * pair.d + m.y.x), m.y.x)

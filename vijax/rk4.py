@@ -95,7 +95,9 @@ def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Scalar, u: Scalar, 
     return u + h / 6 * (u1 + 2 * (u2 + u3) + u4), v + h / 6 * (v1 + 2 * (v2 + v3) + v4)
 
 
-def step(method: Rk4, pair: ImpactPair, wall: Wall, m: Motion) -> tuple[Motion, Passage, Bool[Array, ""]]:
+def step(
+    method: Rk4, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
+) -> tuple[Motion, Passage, Bool[Array, ""]]:
     """One step, and what its sample shows.
 
     Args:
@@ -103,6 +105,7 @@ def step(method: Rk4, pair: ImpactPair, wall: Wall, m: Motion) -> tuple[Motion, 
         pair: One cell (scalars).
         wall: Its membrane, (w, w') -> acceleration.
         m: The carry.
+        recorded: Taken for the seam's sake: a sample at phase 0 and derivatives in reverse cost nothing here.
 
     Returns:
         The carry after it, and the impact that this sample ended, meaningless unless the flag says that it did.
@@ -170,6 +173,6 @@ def step(method: Rk4, pair: ImpactPair, wall: Wall, m: Motion) -> tuple[Motion, 
     return new, passage, ends
 
 
-def state(pair: ImpactPair, m: Motion, method: Rk4) -> State:
-    """The last sample."""
+def ball(pair: ImpactPair, method: Rk4, m: Motion) -> State:
+    """The last sample of a carry."""
     return State(m.u, m.v, m.offset + m.k * (2 / method.steps), m.n, m.mode)
