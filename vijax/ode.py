@@ -226,7 +226,8 @@ def _root(function, low: Scalar, high: Scalar) -> Scalar:
         value, slope = function(x)
         low, high = jnp.where(value <= 0, x, low), jnp.where(value > 0, x, high)
         newton = x - value / jnp.where(slope > 0, slope, jnp.inf)
-        x = share(jnp.where((slope > 0) & (newton > low) & (newton < high), newton, 0.5 * (low + high)))
+        inside = (slope > 0) & (newton >= low) & (newton <= high)
+        x = share(jnp.where(inside, newton, 0.5 * (low + high)))
     return x
 
 

@@ -192,21 +192,26 @@ def _tally(plan: Plan, like: Lane) -> Tally:
     return Tally(zero, zero, zero, zero, zero, zero, deepest, wide, wide, wide, wide, stuck)
 
 
-def _candidate(like: Lane, ball: Lanes) -> Candidate:
+def _candidate(settings: Settings, like: Lane, ball: Lanes) -> Candidate:
     zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
     inf = jnp.full_like(like, jnp.inf)
-    tolerance = jnp.full_like(like, _recurrence(like.dtype))
+    tolerance = jnp.full_like(like, _recurrence(like.dtype, _grain(settings)))
     return Candidate(zero, zero, inf, zero, zero, tolerance, no, no, zero, zero, zero, zero, ball, zero, inf, zero)
 
 
-def _recurrence(dtype) -> float:
-    """How closely an impact must recur to start a Newton round: 1e-6 in float64."""
-    return 1e-6 if dtype == jnp.float64 else 3e-3
+def _grain(settings: Settings) -> Float[Array, ""] | float:
+    """How far a round started from one point may end apart: nothing but where a solver chooses its steps."""
+    return settings.method.rtol if isinstance(settings.method, Ode) else 0.0
 
 
-def _settled(dtype) -> float:
-    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64."""
-    return 1e4 * float(jnp.finfo(dtype).eps)
+def _recurrence(dtype, grain=0.0):
+    """How closely an impact must recur to start a Newton round: 1e-6 in float64, and more as the method is coarse."""
+    return (1e-6 if dtype == jnp.float64 else 3e-3) + 100 * grain
+
+
+def _settled(dtype, grain=0.0):
+    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64, likewise."""
+    return 1e4 * float(jnp.finfo(dtype).eps) + grain
 
 
 def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell:
@@ -236,7 +241,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
         since=start,
         batch=zero - 1,
         tally=_tally(plan, d),
-        candidate=_candidate(d, ball) if attractor else None,
+        candidate=_candidate(settings, d, ball) if attractor else None,
         tangent=eye,
         exponent=zero if plan.tangent else None,
         multiplier=zero if plan.tangent else None,
@@ -348,7 +353,8 @@ def _stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     course, carry, passage = cell.course, cell.course.carry, cell.course.passage
     impact, after = passage.impact, passage.after
     waits = course.waits & cell.running
-    late = carry.n.astype(cell.count.dtype) - _window_end(plan, settings)
+    # A round of a candidate orbit may begin close to the end and go on beyond it.
+    late = carry.n.astype(cell.count.dtype) - jnp.maximum(_window_end(plan, settings), cell.ball.n)
     idle = cell.running & ~course.waits
     quiet = idle & (carry.mode == 0) & (late >= (_QUIET if cell.candidate is not None else 0))
     permanent = idle & (carry.mode != 0) & (late >= _QUIET)
@@ -403,7 +409,7 @@ def _fold(plan: Plan, settings: Settings, cell: Cell, event: _Event) -> Cell:
         # A contact for ever has a depth although no impact ends it.
         held = event.permanent & (hit.depth > tally.deepest)
         tally = eqx.tree_at(lambda t: t.deepest, tally, jnp.where(held, hit.depth, tally.deepest))
-    candidate, found = _recur(cell, hit, kept, count)
+    candidate, found = _recur(settings, cell, hit, kept, count)
     stop = over | ended | spent | broken | found
     return eqx.tree_at(
         lambda c: (c.ball, c.running, c.status, c.count, c.batch, c.tally, c.candidate, c.tangent, c.exponent),
@@ -477,7 +483,7 @@ def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, traci
     )
 
 
-def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
+def _recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
     """Compare the impact with the anchor, an earlier one moved on by a quarter of the count; end rounds."""
     c = cell.candidate
     if c is None:
@@ -492,7 +498,8 @@ def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
     # On a round the anchor is the round's first impact.
     opening = kept & c.tracing & (c.left == c.length)
     again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
-    again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < 1e-2 * _recurrence(lag.dtype))
+    same = 1e-2 * _recurrence(lag.dtype, 100 * _grain(settings))
+    again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < same)
     fresh = fresh | opening
     return (
         Candidate(
@@ -530,14 +537,15 @@ def _review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     start = stopped & c.found & ~failed
     judged = stopped & c.tracing & (c.left <= 0) & ~failed
     size, nudge_u, nudge_v, largest = _newton(plan, cell)
-    close = _settled(size.dtype)
+    grain = _grain(settings)
+    close, far = _settled(size.dtype, grain), 1e3 * _recurrence(size.dtype, grain)
     settled = (size < close) | ((size < 1e3 * close) & (size > 0.25 * c.last))
     good = judged & settled & (largest < 1 + 1e-6)
     # Where a bounded, contracting Newton step leads nowhere near, the recurrence was a coincidence.
-    bad = judged & ~good & (settled | ~(size + c.moved < 1e3 * _recurrence(size.dtype)) | (c.rounds >= _ROUNDS))
+    bad = judged & ~good & (settled | ~(size + c.moved < far) | (c.rounds >= _ROUNDS))
     again = judged & ~good & ~bad
     cell = _begin_round(plan, cell, start | again, start, nudge_u, nudge_v, size)
-    cell = _back_to_search(plan, cell, bad)
+    cell = _back_to_search(plan, cell, bad, 10 * grain)
     done = cell.done | (stopped & ~start & ~again & ~bad)
     return eqx.tree_at(lambda x: (x.done, x.multiplier), cell, (done, jnp.where(good, largest, cell.multiplier)))
 
@@ -604,7 +612,7 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
     )
 
 
-def _back_to_search(plan: Plan, cell: Cell, bad: Mask) -> Cell:
+def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] | float) -> Cell:
     """A candidate that is no attractor: go on from where the round ended, with a tolerance a hundred times tighter."""
     c = cell.candidate
     zero = jnp.zeros_like(cell.since)
@@ -613,7 +621,7 @@ def _back_to_search(plan: Plan, cell: Cell, bad: Mask) -> Cell:
         c,
         (
             c.tracing & ~bad,
-            jnp.where(bad, 1e-2 * c.tolerance, c.tolerance),
+            jnp.where(bad, jnp.maximum(1e-2 * c.tolerance, least), c.tolerance),
             jnp.where(bad, jnp.inf, c.anchor_v),
             jnp.where(bad, cell.count, c.next_anchor),
         ),
