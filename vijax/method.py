@@ -50,7 +50,7 @@ class Ode(eqx.Module):
     rtol: Real
     atol: Real
     law: Law
-    dt: float | None = eqx.field(static=True, default=None)
+    dt: Real | None = None
 
 
 class Rk4(eqx.Module):

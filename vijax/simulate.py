@@ -652,6 +652,9 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
     quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
     end = _window_end(plan, settings)
     window = jnp.maximum(end - cell.since, 1.0)
+    # A round that failed in the last period left no window to measure: not decided, and not silent.
+    spoiled = ~periodic & ~quiet & ~permanent & (cell.since >= end)
+    failed = failed | spoiled
     span = jnp.where(periodic, cell.candidate.period if attractor else 1.0, window)
     hits = t.left + t.right
     silent = ~periodic & ~failed & ~permanent & ((hits == 0) | (quiet if attractor else False))
@@ -671,6 +674,7 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
             status = jnp.where(~periodic & ~chaotic & ~still & ~failed, Status.SLOW, status)
     if attractor:
         period = jnp.where(still, 1.0, jnp.where(failed, -1.0, period))
+    status = jnp.where(spoiled & (cell.status == Status.OK), Status.SLOW, status)
     if plan.rigid:
         status = jnp.where(t.stuck & (status == Status.OK), Status.STICKING, status)
 
