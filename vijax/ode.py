@@ -3,8 +3,8 @@
 One `step` of a lane is one attempt of a solver step, accepted, rejected or cut short, so that no lane waits for
 another's solve. A cell's motion is a chain of smooth spells: flight in the displacement u, contact in the penetration
 w = side u - d/2; `mode` says which, and no sign of a rounded number is asked. The wall is met where the dense output of
-a step first crosses it; the step is then repeated up to there, and what is missing is closed by the Taylor polynomial of
-the repeated step, so that the state has the order of the solver and not that of the dense output.
+a step first crosses it; the step is then repeated up to there, and what is missing is closed by the Taylor polynomial
+of the repeated step, so that the state has the order of the solver and not that of the dense output.
 
 This is the only file that imports diffrax.
 """
@@ -352,7 +352,9 @@ def step(
     )
     seen = keep & sight.seen & ~met & ~crest
     moved = keep & ~seen
-    return _advance(engine, pair, spell, m, y1, f1, t1, h, h_next, seen, sight, moved, met, crest, delay, speed, to_strobe)
+    return _advance(
+        engine, pair, spell, m, y1, f1, t1, h, h_next, seen, sight, moved, met, crest, delay, speed, to_strobe
+    )
 
 
 def _advance(engine, pair, spell, m, y1, f1, t1, h, h_next, seen, sight, moved, met, crest, delay, speed, to_strobe):
@@ -363,7 +365,9 @@ def _advance(engine, pair, spell, m, y1, f1, t1, h, h_next, seen, sight, moved, 
     onset, leaves = met & (m.mode == 0), met & (m.mode != 0)
     side = jnp.where(m.mode == 0, lax.stop_gradient(m.aim), m.mode.astype(h.dtype))
     # In flight a speed is towards the wall, in contact it is away from it.
-    x = jnp.where(onset, 0.0, jnp.where(leaves, side * 0.5 * pair.d, jnp.where(crest, y1.x - 0.5 * delay * delay * f1.z, y1.x)))
+    x = jnp.where(
+        onset, 0.0, jnp.where(leaves, side * 0.5 * pair.d, jnp.where(crest, y1.x - 0.5 * delay * delay * f1.z, y1.x))
+    )
     z = jnp.where(onset, speed, jnp.where(leaves, -side * speed, jnp.where(crest, 0.0, y1.z)))
     zero = jnp.zeros_like(h)
     depth = jnp.where(onset, 0.0, jnp.where(crest, jnp.maximum(m.depth, x), m.depth))

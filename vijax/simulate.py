@@ -327,7 +327,7 @@ def _set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Lanes, held
     whole = ball.n.astype(jnp.int32)
     state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
     carry = jax.vmap(partial(engine.start, method, deep=plan.deep, tangent=plan.tangent))(pair, state)
-    wall = method.law.wall(pair)
+    wall = jax.vmap(method.law.wall)(pair)
     _, passage, _ = jax.eval_shape(jax.vmap(partial(engine.step, method)), pair, wall, carry)
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), passage)
     return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
@@ -373,7 +373,7 @@ def _stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     )
     cell = _fold(plan, settings, cell, _Event(hit, waits, quiet, permanent, jnp.zeros_like(waits)))
     if plan.stepping == "ode":  # the steps of the other are counted by its clock
-        spent = cell.running & (carry.steps > _STEPS * (_window_end(plan, settings) + 1))
+        spent = cell.running & (carry.steps.astype(cell.count.dtype) > _STEPS * (_window_end(plan, settings) + 1))
         status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
         cell = eqx.tree_at(lambda c: (c.running, c.status), cell, (cell.running & ~spent, status))
     stopped = ~cell.running

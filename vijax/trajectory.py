@@ -152,7 +152,7 @@ def _stepped(room: str, steps: int, periods: int, max_impacts: int, method: Meth
     """Stepping engines: all lanes step together, each until its last period is over and its last contact has ended."""
     engine = import_module(f"vijax.{room}")
     begun = jax.vmap(_begin)(pair, u0, v0, t0)
-    wall = method.law.wall(pair)
+    wall = jax.vmap(method.law.wall)(pair)
     carry = jax.vmap(partial(engine.start, method, deep=True, tangent=False))(pair, begun)
     start = _recording(periods, max_impacts, carry, u0)
 
