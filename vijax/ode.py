@@ -9,6 +9,8 @@ of the repeated step, so that the state has the order of the solver and not that
 This is the only file that imports diffrax.
 """
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -23,12 +25,14 @@ from vijax.model import Impact, ImpactPair, MembranePair, State
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
+Solver = Any  # a Runge-Kutta solver of diffrax
 
 _LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
 _CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step
 _ATTEMPTS = 6  # repeats after which a crossing is taken as it is: rounding holds it from closing
 _TRIPS = 5  # of a root on the dense output; a crossing missed by more than _CLOSED is located again
 _FIRST_STEP = 1e-3
+_VANISHING = 4  # roundings: a shorter step does not advance time
 
 
 # --- vector fields --------------------------------------------------------------------------------
@@ -40,7 +44,7 @@ class Point(eqx.Module):
     x: Scalar
     z: Scalar
     work: Scalar | None = None
-    tangent: tuple[Scalar, Scalar, Scalar, Scalar] | None = None
+    tangent: tuple[Scalar, ...] | None = None  # row by row
 
 
 class Spell(eqx.Module):
@@ -51,7 +55,7 @@ class Spell(eqx.Module):
     wall: Wall
 
 
-def _field(t: Scalar, y: Point, spell: Spell) -> Point:
+def _field(t: Any, y: Point, spell: Spell) -> Point:
     held = spell.mode != 0
     force = jnp.where(spell.mode < 0, -1.0, 1.0) * (jnp.cos(PI * t) - spell.gamma)
     pull = jnp.where(held, spell.wall(y.x, y.z), 0.0)
@@ -69,7 +73,7 @@ equation_38 = diffrax.ODETerm(_field)
 """Eq. (38) in one spell: x'' = side (cos(pi t) - gamma) + membrane(w, w'), for `Point` and `Spell`."""
 
 
-def _field_39(t: Scalar, y: Point, args: tuple[MembranePair, Int[Array, ""]]) -> Point:
+def _field_39(t: Any, y: Point, args: tuple[MembranePair, Int[Array, ""]]) -> Point:
     pair, mode = args
     side = jnp.sign(mode).astype(y.x.dtype)
     pull = jnp.where(mode == 0, 0.0, y.x - 0.5 * side + pair.c_star * y.z)
@@ -109,10 +113,12 @@ class Motion(eqx.Module):
 _CREST = 2.0  # as an aim
 
 
-def _solver(engine: Ode, kind: str) -> diffrax.AbstractAdaptiveSolver:
-    solver = getattr(diffrax, engine.solver)
+def _solver(engine: Ode, recorded: bool) -> Solver:
+    """diffrax's solver; its loop over stages is differentiable in reverse where a run is recorded."""
+    solver, kind = getattr(diffrax, engine.solver), "bounded" if recorded else "lax"
     if issubclass(solver, diffrax.AbstractImplicitSolver):
-        return solver(scan_kind=kind, root_finder=diffrax.VeryChord(engine.rtol, engine.atol))
+        tolerances: Any = (engine.rtol, engine.atol)
+        return solver(scan_kind=kind, root_finder=diffrax.VeryChord(*tolerances))
     return solver(scan_kind=kind)
 
 
@@ -130,8 +136,10 @@ def start(engine: Ode, pair: ImpactPair, state: State, *, deep: bool, tangent: b
     side = state.mode.astype(zero.dtype)
     held = state.mode != 0
     x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
-    first = zero + (_FIRST_STEP if engine.dt is None else engine.dt)
-    inside = first if engine.dt is not None else jnp.minimum(first, 0.1 / pair.kappa)
+    if engine.dt is None:
+        first, inside = zero + _FIRST_STEP, jnp.minimum(_FIRST_STEP, 0.1 / pair._soft_kappa())
+    else:
+        first = inside = zero + engine.dt
     no = jnp.zeros_like(held)
     return Motion(
         y=Point(
@@ -160,7 +168,7 @@ def start(engine: Ode, pair: ImpactPair, state: State, *, deep: bool, tangent: b
     )
 
 
-def _control(engine: Ode, order: float, t0: Scalar, t1: Scalar, y0: Point, y1: Point, error: Point):
+def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: Point, y1: Point, error: Point):
     """Whether a step is accepted, and the length of the next; the error of position and velocity alone decides."""
     if engine.dt is not None:
         return jnp.ones_like(t0, bool), jnp.full_like(t0, engine.dt)
@@ -231,84 +239,129 @@ def _root(function, low: Scalar, high: Scalar) -> Scalar:
     return x
 
 
+class _Trial(eqx.Module):
+    """A step that was tried: where it leads, whether its error lets it pass, and the length to try next."""
+
+    h: Scalar
+    t: Scalar
+    y: Point
+    f: Point
+    passes: Flag
+    h_next: Scalar
+    dense: Dense
+
+
+def _try(engine: Ode, solver: Solver, m: Motion, spell: Spell, recorded: bool) -> _Trial:
+    """One step of the solver, at most to the end of the period if it is recorded."""
+    h = jnp.minimum(lax.stop_gradient(m.h), _LONGEST)
+    t = m.t + h
+    if recorded:
+        room = lax.stop_gradient(2 - m.t)
+        t = jnp.where(h >= room, 2.0, t)
+        h = jnp.minimum(h, room)
+    no = jnp.zeros_like(m.cut)
+    f0 = _field(m.t, m.y, spell)
+    fsal = solver.tableau.fsal
+    y, error, _, last, _ = solver.step(equation_38, m.t, t, m.y, spell, (no, f0) if fsal else None, no)
+    f = last[1] if fsal else _field(t, y, spell)
+    y, error, f0, f = share((y, error, f0, f))
+    passes, h_next = _control(engine, solver.error_order(equation_38), m.t, t, m.y, y, error)
+    dense = share(dense_output(h, *lax.stop_gradient((m.y, f0, y, f))))
+    return _Trial(h, t, y, f, passes, h_next, dense)
+
+
 class _Sight(eqx.Module):
-    """What the dense output of a step shows: the part of the step to keep to, and the event there."""
+    """What the dense output of a step shows: whether to try it shorter, how much, and the event it should end at."""
 
     seen: Flag
     theta: Scalar
     aim: Scalar
 
 
-def _look(dense: Dense, mode: Int[Array, ""], half: Scalar, z1: Scalar, deep: bool, cut: Flag) -> _Sight:
+def _look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) -> _Sight:
     """The first wall crossing of a step, the crest of a contact before it, or a second turning of the velocity.
 
     A velocity that changes sign between the ends turns once; the position is monotone up to there and from there on,
     so each crossing is bracketed, and of two the earlier is found. Where the acceleration changes sign (at most once,
     as a step is at most _LONGEST) the velocity is extreme: if it has changed sign there and back, the step is cut at
-    that place, and the next look sees one turning at a time.
+    that place, and the next look sees one turning at a time (`untwisted`: it was cut so).
     """
-    one, zero = jnp.ones_like(z1), jnp.zeros_like(z1)
-    held = mode != 0
-    z0 = dense.c1
+    one, zero = jnp.ones_like(half), jnp.zeros_like(half)
+    z0, z1, bend0, bend1 = dense.c1, dense.rate(one), dense.c2, dense.bend(one)
     heading = jnp.where(z0 == 0, jnp.sign(z1), jnp.sign(z0))
     turns = heading * z1 < 0
     turning = _root(lambda s: (-heading * dense.rate(s), -heading * dense.bend(s)), zero, one)
-    middle = jnp.where(turns, turning, one)
-    a0, a1 = dense.c2, dense.bend(one)
-    bends = (a0 * a1 < 0) & ~turns & ~cut
-    rising = jnp.sign(a1)
-    bend = _root(lambda s: (rising * dense.bend(s), rising * dense.jerk(s)), zero, one)
-    twice = bends & (heading * dense.rate(bend) < 0)
-    # The goal ahead and behind: a wall in flight, and in contact the membrane's rest from above.
+    rising = jnp.sign(bend1)
+    extreme = _root(lambda s: (rising * dense.bend(s), rising * dense.jerk(s)), zero, one)
+    twice = (bend0 * bend1 < 0) & ~turns & ~untwisted & (heading * dense.rate(extreme) < 0)
+    # What may be met: either wall in flight, and in contact the membrane's rest from above.
     wall = jnp.where(held, 0.0, half)
-    may_first, may_second = ~held | (heading < 0), ~held | (heading > 0)
-    first = may_first & (heading * dense.place(middle) > wall)
-    second = turns & ~first & may_second & (-heading * dense.place(one) > wall)
+    middle = jnp.where(turns, turning, one)
+    first = (~held | (heading < 0)) & (heading * dense.place(middle) > wall)
+    second = turns & ~first & (~held | (heading > 0)) & (-heading * dense.place(one) > wall)
     aim = jnp.where(first, heading, -heading)
     low, high = jnp.where(first, 0.0, middle), jnp.where(first, middle, 1.0)
     crossing = _root(lambda s: (aim * dense.place(s) - wall, aim * dense.rate(s)), low, high)
     crest = turns & held & (heading > 0) if deep else jnp.zeros_like(turns)
-    theta = jnp.where(twice, bend, jnp.where(crest, turning, crossing))
-    aim = jnp.where(twice, 0.0, jnp.where(crest, _CREST, aim))
-    return _Sight(twice | crest | first | second, theta, aim)
+    return _Sight(
+        twice | crest | first | second,
+        jnp.where(twice, extreme, jnp.where(crest, turning, crossing)),
+        jnp.where(twice, 0.0, jnp.where(crest, _CREST, aim)),
+    )
 
 
 class _Landing(eqx.Module):
-    """Whether a step that was cut for an event has met it, how far off in time it is, and the speed there."""
+    """Whether a step that was cut for an event has met it, how much later in time it is, and the speed there."""
 
-    met: Flag
+    onset: Flag
+    exits: Flag
     crest: Flag
     delay: Scalar
-    speed: Scalar
+    speed: Scalar  # towards the wall at an onset, away from it at an exit
 
 
-def _land(m: Motion, h: Scalar, half: Scalar, y1: Point, push: Scalar) -> _Landing:
+def _land(m: Motion, half: Scalar, trial: _Trial) -> _Landing:
     """Close the gap that the repeated step leaves, to second order: aim (x + z s + push s^2/2) = wall.
 
     The root is -2 gap/(speed + sqrt(speed^2 - 2 push gap)), and the speed there is that square root. A ball that turns
-    just before the wall has none, and has not met it. Its derivatives are those of the true event: the lengths of steps
-    are constants to them.
+    just before the wall has none, and has not met it. Derivatives are those of the true event: the lengths of steps are
+    constants to them.
     """
-    held = m.mode != 0
-    towards = (m.aim != 0) & (m.aim != _CREST)
-    aim = lax.stop_gradient(m.aim)
-    gap = aim * y1.x - jnp.where(held, 0.0, half)
-    speed, drive = aim * y1.z, aim * push
+    held, aim = m.mode != 0, lax.stop_gradient(m.aim)
+    x, z, push = trial.y.x, trial.y.z, trial.f.z
+    gap, speed, drive = aim * x - jnp.where(held, 0.0, half), aim * z, aim * push
     square = speed * speed - 2 * drive * gap
     root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     both = speed + root
-    delay = -2 * gap / jnp.where(both > 0, both, jnp.inf)
     real = ((square >= 0) | (gap > 0)) & ((root > 0) | (drive > 0))
-    tops = (m.aim == _CREST) & (push < 0)
-    delay = jnp.where(tops, -y1.z / jnp.where(tops, push, -1.0), delay)
-    near = (jnp.abs(delay) <= _CLOSED * h) | (m.attempts >= _ATTEMPTS)
-    return _Landing(towards & near & real, tops & near, delay, root)
+    tops = (aim == _CREST) & (push < 0)
+    delay = jnp.where(tops, -z / jnp.where(tops, push, -1.0), -2 * gap / jnp.where(both > 0, both, jnp.inf))
+    near = trial.passes & ((jnp.abs(delay) <= _CLOSED * trial.h) | (m.attempts >= _ATTEMPTS))
+    met, crest = near & real & (jnp.abs(aim) == 1), near & tops
+    return _Landing(met & ~held, met & held, crest, jnp.where(met | crest, delay, 0.0), root)
 
 
 def _ratio(change: Scalar, speed: Scalar) -> Scalar:
     """Jump of the acceleration over the speed of crossing: the one entry of a soft saltation matrix."""
     moving = speed != 0
     return jnp.where(moving, change / jnp.where(moving, speed, 1.0), 0.0)
+
+
+def _meet(m: Motion, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, landing: _Landing) -> Point:
+    """The state at the event that a step has met (at its end, if none), in the coordinates of the spell after it."""
+    onset, exits, crest, delay, speed = landing.onset, landing.exits, landing.crest, landing.delay, landing.speed
+    y = jax.tree.map(lambda value, slope: value + delay * slope, trial.y, trial.f)
+    top = y.x + 0.5 * delay * delay * trial.f.z
+    x = jnp.where(onset, 0.0, jnp.where(exits, side * half, jnp.where(crest, top, y.x)))
+    z = jnp.where(onset, speed, jnp.where(exits, -side * speed, jnp.where(crest, 0.0, y.z)))
+    tangent = None
+    if y.tangent is not None:
+        a, b, c, d = y.tangent
+        zero = jnp.zeros_like(speed)
+        jump = jnp.where(onset, _ratio(wall(zero, speed), speed), 0.0)
+        jump = jnp.where(exits, _ratio(wall(zero, -speed), speed), jump)
+        tangent = (a, b, c + jump * a, d + jump * b)
+    return Point(x, z, None if y.work is None else jnp.where(onset, 0.0, y.work), tangent)
 
 
 def step(
@@ -324,115 +377,84 @@ def step(
         recorded: For trajectories: a step ends at phase 0, and can be differentiated in reverse.
 
     Returns:
-        The carry after it, and the impact that this step finished, meaningless unless the flag says that it did.
-        A step length that is not finite or vanishes beside the time makes an impact of NaN.
+        The carry after it, and the impact that this step finished, meaningless unless the flag says that it did. A
+        step that vanishes beside the time, or is not finite, makes an impact of NaN.
     """
-    half = 0.5 * pair.d
-    solver = _solver(engine, "bounded" if recorded else "lax")
-    spell = Spell(pair.gamma, m.mode, wall)
-    h = jnp.minimum(lax.stop_gradient(m.h), _LONGEST)
-    room = lax.stop_gradient(2 - m.t)
-    to_strobe = (h >= room) if recorded else jnp.zeros_like(m.cut)
-    h = jnp.where(to_strobe, room, h)
-    t1 = jnp.where(to_strobe, 2.0, m.t + h)
-    f0 = _field(m.t, m.y, spell)
-    no = jnp.zeros_like(m.cut)
-    fsal = solver.tableau.fsal
-    y1, error, _, last, _ = solver.step(equation_38, m.t, t1, m.y, spell, (no, f0) if fsal else None, no)
-    f1 = last[1] if fsal else _field(t1, y1, spell)
-    y1, error, f0, f1 = share((y1, error, f0, f1))
-    keep, h_next = _control(engine, solver.error_order(equation_38), m.t, t1, m.y, y1, error)
+    half, held = 0.5 * pair.d, m.mode != 0
+    trial = _try(engine, _solver(engine, recorded), m, Spell(pair.gamma, m.mode, wall), recorded)
+    landing = _land(m, half, trial)
+    sight = _look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
+    landing, sight = share((landing, sight))
+    shut = landing.onset | landing.exits
+    seen = trial.passes & sight.seen & ~shut & ~landing.crest
+    moved = trial.passes & ~seen
+    side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
+    y = _meet(m, half, side, wall, trial, landing)
 
-    landing = _land(m, h, half, y1, f1.z)
-    dense = share(dense_output(h, *lax.stop_gradient((m.y, f0, y1, f1))))
-    sight = _look(dense, m.mode, half, lax.stop_gradient(y1.z), m.y.work is not None, m.cut & (m.aim == 0))
-    met, crest = keep & landing.met, keep & landing.crest
-    met, crest, sight, delay, speed, keep, h_next = share(
-        (met, crest, sight, landing.delay, landing.speed, keep, h_next)
-    )
-    seen = keep & sight.seen & ~met & ~crest
-    moved = keep & ~seen
-    return _advance(
-        engine, pair, spell, m, y1, f1, t1, h, h_next, seen, sight, moved, met, crest, delay, speed, to_strobe
-    )
-
-
-def _advance(engine, pair, spell, m, y1, f1, t1, h, h_next, seen, sight, moved, met, crest, delay, speed, to_strobe):
-    """The carry after a step that was looked at, and the impact that it finished."""
-    shift = met | crest
-    delay = jnp.where(shift, delay, 0.0)
-    y1 = jax.tree.map(lambda y, f: y + delay * f, y1, f1)
-    onset, leaves = met & (m.mode == 0), met & (m.mode != 0)
-    side = jnp.where(m.mode == 0, lax.stop_gradient(m.aim), m.mode.astype(h.dtype))
-    # In flight a speed is towards the wall, in contact it is away from it.
-    x = jnp.where(
-        onset, 0.0, jnp.where(leaves, side * 0.5 * pair.d, jnp.where(crest, y1.x - 0.5 * delay * delay * f1.z, y1.x))
-    )
-    z = jnp.where(onset, speed, jnp.where(leaves, -side * speed, jnp.where(crest, 0.0, y1.z)))
-    zero = jnp.zeros_like(h)
-    depth = jnp.where(onset, 0.0, jnp.where(crest, jnp.maximum(m.depth, x), m.depth))
-    work = tangent = mapped = None
-    if y1.work is not None:
-        work = jnp.where(onset, 0.0, y1.work)
-    if y1.tangent is not None:
-        a, b, c, d = y1.tangent
-        jump = jnp.where(onset, _ratio(spell.wall(zero, speed), speed), 0.0)
-        jump = jnp.where(leaves, _ratio(spell.wall(zero, -speed), speed), jump)
-        mapped = (a, b, c + jump * a, d + jump * b)
-        unit = (1.0, 0.0, 0.0, 1.0)
-        tangent = tuple(jnp.where(leaves, one, value) for one, value in zip(unit, mapped, strict=True))
-    t = t1 + delay
+    t = trial.t + landing.delay
     over = t >= 2
-    t, n = jnp.where(over, t - 2, t), m.n + over.astype(m.n.dtype)
-    t, n = jnp.where(moved, t, m.t), jnp.where(moved, n, m.n)
-    mode = jnp.where(onset, side.astype(m.mode.dtype), jnp.where(leaves, 0, m.mode))
-    v_out = -side * speed
+    t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
+    n = m.n + (moved & over).astype(m.n.dtype)
+    passage = _passage(m, half, side, y, t, n, landing.speed)
+    lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
+    passage = eqx.tree_at(lambda p: p.impact.v_out, passage, jnp.where(lost, jnp.nan, passage.impact.v_out))
 
-    def since(t_0, n_0):
-        return (t - t_0) + 2 * (n - n_0).astype(t.dtype)
+    if y.tangent is not None:
+        unit = (1.0, 0.0, 0.0, 1.0)
+        fresh = tuple(jnp.where(landing.exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
+        y = eqx.tree_at(lambda y: y.tangent, y, fresh)
+    h, full, other = _lengths(engine, m, trial, sight, seen, moved, shut)
+    depth = jnp.where(landing.crest, jnp.maximum(m.depth, y.x), m.depth)
+    new = Motion(
+        y=jax.tree.map(lambda new, old: jnp.where(moved, new, old), y, m.y),
+        t=t,
+        n=n,
+        mode=jnp.where(landing.onset, side.astype(m.mode.dtype), jnp.where(landing.exits, 0, m.mode)),
+        h=h,
+        full=full,
+        other=other,
+        cut=seen,
+        aim=lax.stop_gradient(jnp.where(seen, sight.aim, 0.0)),
+        attempts=jnp.where(seen, m.attempts + 1, 0),
+        onset_t=jnp.where(landing.onset, t, m.onset_t),
+        onset_n=jnp.where(landing.onset, n, m.onset_n),
+        entered=(m.entered | landing.onset) & ~landing.exits,
+        v_in=jnp.where(landing.onset, side * landing.speed, m.v_in),
+        depth=jnp.where(landing.onset, 0.0, depth),
+        left_t=jnp.where(landing.exits, t, m.left_t),
+        left_n=jnp.where(landing.exits, n, m.left_n),
+        steps=m.steps + 1,
+    )
+    return new, passage, (landing.exits & m.entered) | lost
 
-    ends = leaves & m.entered
-    eps = jnp.finfo(h.dtype).eps
-    lost = ~moved & ~(h > 4 * eps)
-    blank = jnp.where(lost, jnp.nan, 0.0)
+
+def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, moved: Flag, shut: Flag):
+    """Length of the next step, the one to go on with after a cut one, and the one for after the next change of mode.
+
+    A change of mode changes the scale of time: each mode goes on with the length that it had.
+    """
+    ahead = trial.h_next if engine.dt is not None else jnp.maximum(trial.h_next, m.h)  # m.h: was capped
+    ahead = jnp.minimum(jnp.where(m.cut, m.full, ahead), _LONGEST)
+    after = jnp.where(shut, m.other, jnp.where(moved, ahead, trial.h_next))
+    h = jnp.where(seen, sight.theta * trial.h, after)
+    return lax.stop_gradient((h, jnp.where(seen, ahead, m.full), jnp.where(shut, m.full, m.other)))
+
+
+def _passage(m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[Array, ""], speed: Scalar) -> Passage:
+    """The impact that ends at (t, n) with the ball leaving at a speed."""
+    zero, v_out = jnp.zeros_like(half), -side * speed
     impact = Impact(
         n=m.onset_n,
         t=m.onset_t,
         side=side.astype(m.mode.dtype),
         v_in=m.v_in,
-        v_out=v_out + blank,
+        v_out=v_out,
         depth=m.depth,
-        duration=since(m.onset_t, m.onset_n),
-        work=zero if work is None else work,
+        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
+        work=zero if y.work is None else y.work,
     )
-    after = State(side * 0.5 * pair.d, v_out, t, n, jnp.zeros_like(m.mode))
     flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
-    passage = Passage(impact, flight, after, mapped)
-
-    reached = jnp.where(m.cut, m.full, jnp.maximum(h_next, m.h) if engine.dt is None else h_next)
-    reached = jnp.minimum(reached, _LONGEST)
-    h_after = jnp.where(seen, sight.theta * h, jnp.where(met, m.other, jnp.where(moved, reached, h_next)))
-    new = Motion(
-        y=jax.tree.map(lambda new, old: jnp.where(moved, new, old), Point(x, z, work, tangent), m.y),
-        t=t,
-        n=n,
-        mode=mode,
-        h=lax.stop_gradient(h_after),
-        full=lax.stop_gradient(jnp.where(seen & ~m.cut, reached, m.full)),
-        other=lax.stop_gradient(jnp.where(met, m.full, m.other)),
-        cut=seen,
-        aim=lax.stop_gradient(jnp.where(seen, sight.aim, 0.0)),
-        attempts=jnp.where(seen, m.attempts + 1, 0),
-        onset_t=jnp.where(onset, t, m.onset_t),
-        onset_n=jnp.where(onset, n, m.onset_n),
-        entered=(m.entered | onset) & ~leaves,
-        v_in=jnp.where(onset, side * speed, m.v_in),
-        depth=depth,
-        left_t=jnp.where(leaves, t, m.left_t),
-        left_n=jnp.where(leaves, n, m.left_n),
-        steps=m.steps + 1,
-    )
-    return new, passage, ends | lost
+    return Passage(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), y.tangent)
 
 
 def ball(pair: ImpactPair, method: Ode, m: Motion) -> State:

@@ -43,7 +43,7 @@ class Motion(eqx.Module):
     work: Scalar
     left_t: Scalar
     left_n: Int[Array, ""]
-    tangent: tuple[Scalar, Scalar, Scalar, Scalar] | None
+    tangent: tuple[Scalar, ...] | None  # row by row
 
 
 def start(method: Rk4, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:

@@ -219,6 +219,14 @@ def _compiled(periods: int, max_impacts: int, axes: int) -> Callable[..., Trajec
     return jax.jit(run)
 
 
+def _wall(pair: ImpactPair) -> str:
+    return "rigid" if pair.kappa is None else "soft"
+
+
+def _precision(pair: ImpactPair) -> str:
+    return str(jnp.result_type(float, pair.d))
+
+
 def trajectory(
     pair: ImpactPair,
     u0: Float[Array, "..."] | float,
@@ -254,10 +262,8 @@ def trajectory(
         ValueError: periods or max_impacts below 1, an inadmissible pair, start or method.
     """
     options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "steps": steps}
-    if isinstance(method, str):
-        wall, dtype = "rigid" if pair.kappa is None else "soft", str(jnp.result_type(float, pair.d))
-        method = choose(method, options, wall=wall, dtype=dtype)
-    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    told = method if not isinstance(method, str) else choose(method, options, wall=_wall(pair), dtype=_precision(pair))
+    lossy = told is None or not isinstance(told.law, HuntCrossley)
     if (pair.r is None) == lossy:
         raise ValueError(f"r must be None with a Hunt-Crossley membrane, and a number with others; got {pair.r}")
     room = 16 * periods + 16 if max_impacts is None else max_impacts
@@ -277,6 +283,6 @@ def trajectory(
     shape = jnp.broadcast_shapes(*(x.shape for x in numbers), *(jnp.shape(x) for x in jax.tree.leaves(pair)))
     pair = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), shape), pair)
     u0, v0, t0 = (jnp.broadcast_to(x, shape) for x in numbers)
-    if method is not None:
-        return _by_steps(method, periods, room, pair, u0, v0, t0)
+    if told is not None:
+        return _by_steps(told, periods, room, pair, u0, v0, t0)
     return _compiled(periods, room, len(shape))(pair, u0, v0, t0)
