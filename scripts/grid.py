@@ -30,6 +30,7 @@ _STARTED = time.perf_counter()
 _DEFAULT_PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
 # One physical name among these, and the plane is the device's: what is not given is taken from Tables I and II.
 _PHYSICAL = {"s", "omega0", "k"}
+_METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", "chi", "exponent")
 _LONG = 9  # periods from here on are counted together
 _DEFAULT_FILES = ("power_map.zarr", "power_map.png")
 _COMPARISON_FILES = ("comparison.zarr", "comparison.png")
@@ -62,6 +63,14 @@ def _options() -> list[click.Parameter]:
         click.Option(["--wall"], default="soft", show_default=True, help="soft or rigid"),
         click.Option(["--compare"], metavar="rigid", help="map what rigid walls change instead: P and the label"),
         click.Option(["--tolerance"], type=float, help="with --compare: part of P that they may change"),
+        click.Option(["--method"], default="exact", show_default=True, help="exact, ode or rk4"),
+        click.Option(["--solver"], help="of ode: Tsit5, Dopri5, Dopri8, Kvaerno5 ... [Tsit5]"),
+        click.Option(["--rtol"], type=float, help="of ode: relative tolerance of a step [1e-8]"),
+        click.Option(["--atol"], type=float, help="of ode: absolute tolerance of a step [1e-10]"),
+        click.Option(["--steps"], type=int, help="of rk4: steps per forcing period [1000]"),
+        click.Option(["--membrane"], help="of ode and rk4: linear or hunt-crossley [linear]"),
+        click.Option(["--chi"], type=float, help="of hunt-crossley: damping over stiffness"),
+        click.Option(["--exponent"], type=float, help="of hunt-crossley: exponent of the penetration [1.5]"),
         click.Option(["--dtype"], default="float64", show_default=True, help="float64 or float32"),
         click.Option(["--outputs"], metavar="NAME,NAME", help="variables wanted [all but lyapunov]"),
         click.Option(["--out"], metavar="FILE.zarr", help="store to write"),
@@ -158,7 +167,8 @@ def _plan(axes: dict[str, Any], device: Any, outputs: str | None, settings: dict
     from vijax.grid import plan
 
     wanted = None if outputs is None else [name.strip() for name in outputs.split(",")]
-    return plan(axes, wanted, device, method="exact", **settings)
+    settings["membrane"] = _membrane(settings["membrane"], settings.pop("chi"), settings.pop("exponent"))
+    return plan(axes, wanted, device, **settings)
 
 
 def _comparison(
@@ -177,7 +187,25 @@ def _comparison(
         raise ValueError(f"wall must not be chosen with compare, which runs soft and rigid ones; got {wall!r}")
     if outputs is not None:
         raise ValueError(f"outputs must not be chosen with compare; got {outputs!r}; leave them out")
+    for name in _METHOD_OPTIONS:
+        if (value := settings.pop(name)) not in (None, "exact"):
+            raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
     return plan(axes, tolerance, device, **settings)
+
+
+def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
+    from vijax.membrane import HuntCrossley, Linear
+
+    if name == "hunt-crossley":
+        if chi is None:
+            raise ValueError("chi must be given with --membrane hunt-crossley; got none")
+        return HuntCrossley(chi) if exponent is None else HuntCrossley(chi, exponent)
+    for option, value in (("chi", chi), ("exponent", exponent)):
+        if value is not None:
+            raise ValueError(f"{option} must be left out unless --membrane is hunt-crossley; got {value:g}")
+    if name not in (None, "linear"):
+        raise ValueError(f"membrane must be linear or hunt-crossley; got {name!r}")
+    return None if name is None else Linear()
 
 
 def _device(constants: tuple[str, ...]) -> Any:

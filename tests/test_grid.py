@@ -14,6 +14,7 @@ import xarray as xr
 from vijax import dataset, grid, simulate
 from vijax.axes import cells, parse_axis
 from vijax.grid import load, save, sweep
+from vijax.membrane import HuntCrossley
 from vijax.model import Harvester, Status
 
 SETTINGS = {
@@ -190,7 +191,24 @@ BAD = [
     ({"wall": "rigid", "d": [0.2, 0.1], "u0": 0.08}, "u0 must lie in the gap .* got 0.08 where d = 0.1"),
     ({"wall": "hard"}, 'wall must be "soft" or "rigid"'),
     ({"until": "chaos"}, "until must be"),
-    ({"method": "rk4"}, "method must be"),
+    ({"method": "euler"}, 'method must be "exact" or "ode" or "rk4"; got \'euler\''),
+    ({"solver": "Tsit5"}, "solver must be left out unless method is \"ode\"; got 'Tsit5'"),
+    ({"method": "rk4", "rtol": 1e-8}, "rtol must be left out unless method is"),
+    ({"method": "ode", "steps": 100}, 'steps must be left out unless method is "rk4"; got 100'),
+    ({"method": "ode", "solver": "Euler"}, "solver must be among Bosh3, .* got 'Euler'"),
+    ({"method": "ode", "rtol": 0.0}, "rtol must be a finite number of at least 1.8e-15; got 0.0"),
+    (
+        {"method": "ode", "rtol": 1e-8, "dtype": "float32"},
+        "rtol must be a finite number of at least 9.5e-07; got 1e-08",
+    ),
+    ({"method": "ode", "atol": -1e-9}, "atol must be a finite number above 0; got -1e-09"),
+    ({"method": "ode", "atol": "fine"}, "atol must be a finite number above 0; got 'fine'"),
+    ({"method": "rk4", "steps": 4}, "steps must be a whole number of at least 8; got 4"),
+    ({"method": "rk4", "steps": 1e3}, "steps must be a whole number"),
+    ({"method": "ode", "wall": "rigid"}, 'wall must be "soft" for method="ode"; got \'rigid\''),
+    ({"method": "ode", "membrane": "linear"}, "membrane must be a vijax.HuntCrossley"),
+    ({"membrane": HuntCrossley(0.5)}, 'membrane must be linear for method="exact"; got .* use method="ode"'),
+    ({"method": "ode", "membrane": HuntCrossley(0.5), "r": 0.5}, "r must be left out with a membrane"),
     ({"dtype": "float16"}, "dtype must be"),
     ({"periods": 0}, "periods must be a whole number of at least 1; got 0"),
     ({"periods": 1.5}, "periods must be"),

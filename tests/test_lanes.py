@@ -95,16 +95,18 @@ def review(toy):
 PROGRAM = lanes.Program(
     load=load,
     trip=trip,
-    request=lambda toy: toy,
-    second=second,
-    careful=careful,
-    settle=settle,
     review=review,
-    declined=lambda toy: toy.declined,
     stopped=lambda toy: toy.left <= 0,
-    hard=lambda toy: toy.hard,
     done=lambda toy: toy.done,
     unload=lambda toy: jnp.stack([toy.name, toy.hash, toy.careful], axis=1),
+    service=lanes.Service(
+        declined=lambda toy: toy.declined,
+        hard=lambda toy: toy.hard,
+        request=lambda toy: toy,
+        second=second,
+        careful=careful,
+        settle=settle,
+    ),
 )
 
 

@@ -53,6 +53,20 @@ BAD = [
     (["--wall", "rigid", "--u0", "0.2", "--d", "0.1,0.2"], "u0 must lie in the gap"),
     (["--wall", "hard"], "wall must be"),
     (["--dtype", "float16"], "dtype must be"),
+    (["--method", "euler"], "method must be"),
+    (["--solver", "Tsit5"], "solver must be left out unless method is"),
+    (["--method", "ode", "--solver", "Euler"], "solver must be among"),
+    (["--method", "ode", "--rtol", "0"], "rtol must be a finite number"),
+    (["--method", "ode", "--atol", "small"], "--atol"),
+    (["--method", "rk4", "--steps", "4"], "steps must be a whole number of at least 8"),
+    (["--method", "rk4", "--steps", "1.5"], "--steps"),
+    (["--membrane", "hunt-crossley", "--chi", "0.5"], 'membrane must be linear for method="exact"'),
+    (["--method", "ode", "--membrane", "rubber"], "membrane must be linear or hunt-crossley; got 'rubber'"),
+    (["--method", "ode", "--membrane", "hunt-crossley"], "chi must be given"),
+    (["--method", "ode", "--chi", "0.5"], "chi must be left out"),
+    (["--method", "ode", "--exponent", "2"], "exponent must be left out"),
+    (["--method", "ode", "--membrane", "hunt-crossley", "--chi=-1"], "chi must be one finite number"),
+    (["--method", "ode", "--membrane", "hunt-crossley", "--chi", "0.5", "--r", "0.5"], "r must be left out"),
     (["--until", "never"], "until must be"),
     (["--periods", "0"], "periods must be"),
     (["--periods", "many"], "--periods"),
@@ -159,6 +173,16 @@ def test_settings_and_constants_arrive(planned):
     plan = planned(*settings, "--set", "V=1000", "--set", "m_b=0.01")
     assert {"until": "window", "transient": 5, "periods": 7, "wall": "rigid"}.items() <= plan.settings.items()
     assert (plan.device.V, plan.device.m_b) == (1000.0, 0.01)
+
+
+def test_methods_and_membranes_arrive(planned):
+    plan = planned("--method", "ode", "--solver", "Dopri8", "--rtol", "1e-9", "--atol", "1e-11")
+    assert (plan.method.solver, plan.method.rtol, plan.method.atol) == ("Dopri8", 1e-9, 1e-11)
+    plan = planned("--method", "ode", "--membrane", "hunt-crossley", "--chi", "0.5", "--exponent", "1.4")
+    assert (plan.method.law.chi, plan.method.law.exponent) == (0.5, 1.4)
+    plan = planned("--method", "rk4", "--steps", "500", "--membrane", "linear")
+    assert plan.method.steps == 500
+    assert planned().method is None
 
 
 def test_from_arguments_to_store_and_picture(folder):

@@ -10,12 +10,14 @@ jax.config.update("jax_enable_x64", True)
 from vijax.compare import compare
 from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
+from vijax.membrane import HuntCrossley
 from vijax.model import Harvester, Impact, ImpactPair, State, Status, impact_pair
 from vijax.simulate import summarise
 from vijax.trajectory import trajectory
 
 __all__ = [
     "Harvester",
+    "HuntCrossley",
     "Impact",
     "ImpactPair",
     "State",

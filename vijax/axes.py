@@ -161,8 +161,10 @@ class Cells:
         return np.ravel(full.values / full.values.flat[0])
 
 
-def cells(given: Mapping[str, Any], device: Harvester, wall: str) -> Cells:
+def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: bool = True) -> Cells:
     """Cells of a sweep over the given axes; a quantity that no axis gives is the device's.
+
+    Without `restitution`, of a membrane whose loss is not told by r, there is no axis r, and r is NaN.
 
     Raises:
         ValueError: If a value is not allowed, two axes give one quantity, or a start lies outside a rigid gap.
@@ -177,10 +179,14 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str) -> Cells:
         rivals = [name for name in row if name in given]
         if len(rivals) > 1:
             raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
+    if "r" in given and not restitution:
+        raise ValueError(f"r must be left out with a membrane that has no restitution of its own; got {given['r']!r}")
     arrays = {name: check_axis(name, values) for name, values in given.items()}
     values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
     sizes = {name: array.size for name, array in arrays.items() if array.ndim}
     quantities = _quantities(values, device, xr)
+    if not restitution:
+        quantities["r"] = xr.Variable((), np.nan)
     if wall == "rigid":
         _check_start(quantities["d"], quantities["u0"])
     motion = [quantities[name] for name in ("d", "r", "gamma", "u0", "v0")]

@@ -14,6 +14,7 @@ import numpy as np
 
 from vijax import simulate
 from vijax.axes import AXES, Cells
+from vijax.method import Method, record
 from vijax.model import Harvester, Status
 
 if TYPE_CHECKING:
@@ -24,10 +25,14 @@ Found = dict[str, Any]  # field of Summary -> xr.Variable
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep that has passed the door: its cells, its settings by name, the outputs wanted, the device."""
+    """A sweep that has passed the door: its cells, its settings by name, its method unless it is the exact one.
+
+    And the outputs wanted, and the device.
+    """
 
     cells: Cells
     settings: dict[str, Any]
+    method: Method | None
     outputs: tuple[str, ...]
     device: Harvester
 
@@ -148,6 +153,7 @@ def _provenance(planned: Plan) -> dict[str, Any]:
         "version_python": platform.python_version(),
         "device": f"{accelerator.device_kind} ({accelerator.platform}), {platform.machine()}, {os.cpu_count()} cores",
         **planned.settings,
+        **record(planned.method),
         "outputs": " ".join(planned.outputs),
         **{f"harvester_{name}": float(getattr(planned.device, name)) for name in constants},
         "harvester_penetration_limit": float(planned.device.depth_limit),

@@ -4,7 +4,6 @@
 """
 
 import math
-import operator
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -15,9 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from vijax import method as methods
 from vijax import simulate
 from vijax.axes import cells
 from vijax.dataset import OUTPUTS, Plan, label
+from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
 from vijax.store import load, save
 
@@ -29,7 +30,6 @@ __all__ = ["Axes", "load", "plan", "run", "save", "sweep"]
 _CHOICES = {
     "until": ("attractor", "window"),
     "wall": ("soft", "rigid"),
-    "method": ("exact",),
     "dtype": ("float64", "float32"),
 }
 # A tile is one compiled call of about a second: large enough to keep the lanes full, small enough for progress.
@@ -60,6 +60,11 @@ def sweep(
     transient: int = 0,
     wall: str = "soft",
     method: str = "exact",
+    solver: str | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    membrane: Law | None = None,
+    steps: int | None = None,
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
     dtype: str = "float64",
@@ -87,7 +92,13 @@ def sweep(
             `transient` periods and measures over the next `periods`.
         transient: Forcing periods to drop first.
         wall: "soft" or "rigid".
-        method: "exact", the event-driven engine.
+        method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
+            paper's fixed steps without event location (`vijax.rk4` says what it cannot know).
+        solver: Of "ode": Tsit5 unless given; Bosh3, Dopri5, Dopri8, Kvaerno3, Kvaerno4 or Kvaerno5.
+        rtol, atol: Of "ode": tolerances of position and velocity step by step, 1e-8 and 1e-10 unless given.
+        membrane: Of "ode" and "rk4": `HuntCrossley(chi)` for the linear membrane. It takes no r: the map's
+            `restitution` is what came out.
+        steps: Of "rk4": steps per forcing period, 1000 unless given.
         outputs: The variables wanted, of those in `vijax.dataset.OUTPUTS`; all but `lyapunov` unless given. What is not
             wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
@@ -115,6 +126,11 @@ def sweep(
         wall=wall,
         method=method,
         dtype=dtype,
+        solver=solver,
+        rtol=rtol,
+        atol=atol,
+        membrane=membrane,
+        steps=steps,
     )
     return run(planned, progress)
 
@@ -128,17 +144,20 @@ def plan(
         axes: Value or values of each axis; None counts as not given.
         outputs: As in `sweep`.
         device: As in `sweep`.
-        settings: periods, until, transient, wall, method, dtype: all of them, as in `sweep`.
+        settings: periods, until, transient, wall, method, dtype: all of them, as in `sweep`; and of solver, rtol, atol,
+            membrane, steps those that are given.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
     for name, least in (("periods", 1), ("transient", 0)):
-        settings[name] = _whole(name, settings[name], least)
+        settings[name] = methods.whole(name, settings[name], least)
     for name, allowed in _CHOICES.items():
         if settings[name] not in allowed:
             choices = " or ".join(f'"{choice}"' for choice in allowed)
             raise ValueError(f"{name} must be {choices}; got {settings[name]!r}")
+    options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
+    method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
     if outputs is None:
         outputs = (name for name in OUTPUTS if name != "lyapunov")
     wanted = (outputs,) if isinstance(outputs, str) else tuple(outputs)
@@ -147,23 +166,15 @@ def plan(
             raise ValueError(f"outputs must be among {', '.join(OUTPUTS)}; got {name!r}")
     device = Harvester() if device is None else device
     given = {name: values for name, values in axes.items() if values is not None}
+    lossy = method is None or not isinstance(method.law, HuntCrossley)
     return Plan(
-        cells=cells(given, device, settings["wall"]),
+        cells=cells(given, device, settings["wall"], restitution=lossy),
         settings=settings,
+        method=method,
         # No map can be read without knowing how its cells ended.
         outputs=tuple(name for name in OUTPUTS if name in wanted or name == "status"),
         device=device,
     )
-
-
-def _whole(name: str, value: Any, least: int) -> int:
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = least - 1
-    if number < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}")
-    return number
 
 
 def run(planned: Plan, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
@@ -236,6 +247,7 @@ def _simulate(planned: Plan, index: np.ndarray, tile: int, count: int) -> dict[s
         until=settings["until"],
         transient=settings["transient"],
         outputs=needs,
+        method=planned.method,
         count=count,
     )
     return {name: np.asarray(getattr(summary, name))[:count] for name in needs}

@@ -32,33 +32,44 @@ def compiler_options() -> dict[str, Any]:
     return dict(_CPU_OPTIONS) if jax.default_backend() == "cpu" else {}
 
 
+class Service(NamedTuple):
+    """What becomes of lanes that a trip declined; every function works on a whole batch of lanes, row by row.
+
+    Attributes:
+        declined, hard: Carry -> which lanes are; a hard lane needs the careful try.
+        request: Carry -> the part of it that serving a lane needs.
+        second, careful: Requests -> answers; what `second` is not sure of is left to `careful`, which would hold up a
+            whole batch.
+        settle: Carry, an answer for every lane, which lanes were served -> carry; unsure answers mark the lane hard.
+    """
+
+    declined: Callable[[Carry], Bool[Array, "lane"]]
+    hard: Callable[[Carry], Bool[Array, "lane"]]
+    request: Callable[[Carry], Any]
+    second: Callable[[Any], Any]
+    careful: Callable[[Any], Any]
+    settle: Callable[[Carry, Any, Bool[Array, "lane"]], Carry]
+
+
 class Program(NamedTuple):
     """What `run` is told about a cell; every function works on a whole batch of lanes, row by row.
 
     Attributes:
         load: Rows of the cell table -> fresh carry.
-        trip: Carry -> carry after one quick trip; it may mark lanes as declined.
-        request: Carry -> the part of it that serving a declined lane needs.
-        second, careful: Requests -> answers, in a batch; what `second` is not sure of is marked hard and left to
-            `careful`, which would hold up a whole batch.
-        settle: Carry, an answer for every lane, which lanes were served -> carry.
+        trip: Carry -> carry after one trip; it may decline lanes where there is a service.
         review: Carry -> carry; what is too slow for every trip: decisions, ends.
-        declined, hard, stopped, done: Carry -> which lanes are; a stopped lane waits for review.
+        stopped, done: Carry -> which lanes are; a stopped lane waits for review.
         unload: Carry -> rows of the result table.
+        service: For the rare lane that a trip declines.
     """
 
     load: Callable[[Float[Array, "row in"]], Carry]
     trip: Callable[[Carry], Carry]
-    request: Callable[[Carry], Any]
-    second: Callable[[Any], Any]
-    careful: Callable[[Any], Any]
-    settle: Callable[[Carry, Any, Bool[Array, "lane"]], Carry]
     review: Callable[[Carry], Carry]
-    declined: Callable[[Carry], Bool[Array, "lane"]]
     stopped: Callable[[Carry], Bool[Array, "lane"]]
-    hard: Callable[[Carry], Bool[Array, "lane"]]
     done: Callable[[Carry], Bool[Array, "lane"]]
     unload: Callable[[Carry], Float[Array, "row out"]]
+    service: Service | None = None
 
 
 class _Queue(NamedTuple):
@@ -122,22 +133,27 @@ def run(
     """
     width = max(lanes // _SHARE, 1)
 
+    service = program.service
+
+    def declined(cell, carry):
+        return service.declined(carry) & (cell >= 0) if service else jnp.zeros_like(cell, bool)
+
     def able(cell, carry):
-        return ((cell >= 0) & ~program.declined(carry) & ~program.stopped(carry)).sum()
+        return ((cell >= 0) & ~declined(cell, carry) & ~program.stopped(carry)).sum()
 
     def serve(cell, carry):
         """A second try for easy lanes together, or the careful one for hard lanes."""
-        declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
-        easy = (declined & ~hard).sum() >= jnp.minimum((declined & hard).sum(), width)
-        members, place, chosen = _first(declined & (hard != easy), width)
-        answers = lax.cond(easy, program.second, program.careful, _take(program.request(carry), members))
-        return program.settle(carry, _take(answers, jnp.minimum(place, width - 1)), chosen)
+        asking, hard = declined(cell, carry), service.hard(carry)
+        easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
+        members, place, chosen = _first(asking & (hard != easy), width)
+        answers = lax.cond(easy, service.second, service.careful, _take(service.request(carry), members))
+        return service.settle(carry, _take(answers, jnp.minimum(place, width - 1)), chosen)
 
     def to_serve(cell, carry):
         """Whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
-        declined, hard = program.declined(carry) & (cell >= 0), program.hard(carry)
-        full = ((declined & ~hard).sum() >= width) | ((declined & hard).sum() >= width)
-        return full | (declined.any() & (declined.sum() >= able(cell, carry)))
+        asking, hard = declined(cell, carry), service.hard(carry)
+        full = ((asking & ~hard).sum() >= width) | ((asking & hard).sum() >= width)
+        return full | (asking.any() & (asking.sum() >= able(cell, carry)))
 
     def free(queue: _Queue) -> Bool[Array, "lane"]:
         """Lanes whose cell is done, or that wait for their first."""
@@ -173,7 +189,8 @@ def run(
         queue = lax.while_loop(to_refill, refill, queue)
         going = partial(keeps_on, queue.cell, able(queue.cell, queue.carry))
         _, carry = lax.while_loop(going, one_trip, (0, queue.carry))
-        carry = lax.while_loop(partial(to_serve, queue.cell), partial(serve, queue.cell), carry)
+        if service:
+            carry = lax.while_loop(partial(to_serve, queue.cell), partial(serve, queue.cell), carry)
         return queue._replace(carry=program.review(carry))
 
     # Every cell is loaded by `refill`, the first ones too: another compiled copy of `load` may round otherwise.

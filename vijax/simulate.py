@@ -7,6 +7,9 @@ that reaches its last period without an orbit reports averages over the window s
 """
 
 from functools import lru_cache, partial
+from importlib import import_module
+from types import ModuleType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax import energy, exact, flow, lanes, quick, sampled
+from vijax.method import Method, Ode, Passage
 from vijax.model import Harvester, ImpactPair, State, Status
 from vijax.quick import Hit, Lanes, Wall
 
@@ -28,6 +32,7 @@ _BUDGET = 512  # impacts per period before a cell is stopped
 _ROUNDS = 8  # Newton rounds on one candidate
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
 _QUIET = 64  # a flight that outlasts the last period by so many is over for good
+_STEPS = 20_000  # steps per period before a cell of a stepping engine is stopped
 _SCALE = 2.0**40  # the tangent map is kept between 1/_SCALE and _SCALE, the rest in an exponent
 
 ENERGY = frozenset({"P", "P_stderr", "energy_ratio"})
@@ -73,6 +78,7 @@ class Plan(eqx.Module):
     """What a run is asked for: the static choices that select a compiled program."""
 
     until: str = eqx.field(static=True)
+    stepping: str | None = eqx.field(static=True)  # the room of the stepping engine, None for the exact one
     rigid: bool = eqx.field(static=True)
     level: bool = eqx.field(static=True)  # gamma = 0 everywhere
     deep: bool = eqx.field(static=True)
@@ -87,6 +93,7 @@ class Settings(eqx.Module):
     periods: Float[Array, ""]
     transient: Float[Array, ""]
     device: Harvester
+    method: Method | None
     length_variant: Float[Array, "variant"]
     speed_variant: Float[Array, "variant"]
 
@@ -129,11 +136,21 @@ class Candidate(eqx.Module):
     rounds: Lane
 
 
+class Course(eqx.Module):
+    """A lane of a stepping engine: its wall, the engine's carry, and the last impact if it waits to be folded."""
+
+    wall: Any
+    carry: Any
+    waits: Mask
+    passage: Passage
+
+
 class Cell(eqx.Module):
     """A lane's cell: parameters, where the ball is, and what has been seen."""
 
     pair: ImpactPair
     wall: Wall | None
+    course: Course | None
     length: Lane
     speed: Lane
     ball: Lanes
@@ -174,21 +191,26 @@ def _tally(plan: Plan, like: Lane) -> Tally:
     return Tally(zero, zero, zero, zero, zero, zero, deepest, wide, wide, wide, wide, stuck)
 
 
-def _candidate(like: Lane, ball: Lanes) -> Candidate:
+def _candidate(settings: Settings, like: Lane, ball: Lanes) -> Candidate:
     zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
     inf = jnp.full_like(like, jnp.inf)
-    tolerance = jnp.full_like(like, _recurrence(like.dtype))
+    tolerance = jnp.full_like(like, _recurrence(like.dtype, _grain(settings)))
     return Candidate(zero, zero, inf, zero, zero, tolerance, no, no, zero, zero, zero, zero, ball, zero, inf, zero)
 
 
-def _recurrence(dtype) -> float:
-    """How closely an impact must recur to start a Newton round: 1e-6 in float64."""
-    return 1e-6 if dtype == jnp.float64 else 3e-3
+def _grain(settings: Settings) -> Float[Array, ""] | float:
+    """How far a round started from one point may end apart: nothing but where a solver chooses its steps."""
+    return settings.method.rtol if isinstance(settings.method, Ode) else 0.0
 
 
-def _settled(dtype) -> float:
-    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64."""
-    return 1e4 * float(jnp.finfo(dtype).eps)
+def _recurrence(dtype, grain=0.0):
+    """How closely an impact must recur to start a Newton round: 1e-6 in float64, and more as the method is coarse."""
+    return (1e-6 if dtype == jnp.float64 else 3e-3) + 100 * grain
+
+
+def _settled(dtype, grain=0.0):
+    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64, likewise."""
+    return 1e4 * float(jnp.finfo(dtype).eps) + grain
 
 
 def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell:
@@ -197,16 +219,18 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
     pair = ImpactPair(d, None if plan.rigid else kappa, r, gamma)
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
     ball = Lanes(u, v, zero, zero)
+    held = exact.start_mode(pair, u, v, zero)
     start = settings.transient + zero
     eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None
     attractor = plan.until == "attractor"
     return Cell(
         pair=pair,
-        wall=quick.prepare(pair) if plan.level else None,
+        wall=quick.prepare(pair) if plan.level and plan.stepping is None else None,
+        course=_set_off(plan, settings, pair, ball, held) if plan.stepping else None,
         length=length,
         speed=speed,
         ball=ball,
-        held=exact.start_mode(pair, u, v, zero),
+        held=held,
         running=~no,
         declined=no,
         hard=no,
@@ -216,7 +240,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
         since=start,
         batch=zero - 1,
         tally=_tally(plan, d),
-        candidate=_candidate(d, ball) if attractor else None,
+        candidate=_candidate(settings, d, ball) if attractor else None,
         tangent=eye,
         exponent=zero if plan.tangent else None,
         multiplier=zero if plan.tangent else None,
@@ -329,6 +353,73 @@ def _settle(plan: Plan, settings: Settings, cell: Cell, answer: _Answer, served:
     return _fold(plan, settings, cell, event)
 
 
+def _stepping(plan: Plan) -> ModuleType:
+    """The room of the stepping engine, loaded when it is first asked for: diffrax takes a second."""
+    return import_module(f"vijax.{plan.stepping}")
+
+
+def _set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Lanes, held: Lane) -> Course:
+    """Lanes of a stepping engine at the start of a run or of a round."""
+    engine, method = _stepping(plan), settings.method
+    whole = ball.n.astype(jnp.int32)
+    state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
+    carry = jax.vmap(partial(engine.start, method, deep=plan.deep, tangent=plan.tangent))(pair, state)
+    wall = jax.vmap(method.law.wall)(pair)
+    _, passage, _ = jax.eval_shape(jax.vmap(partial(engine.step, method)), pair, wall, carry)
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), passage)
+    return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
+
+
+def _stepping_trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """One solver step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
+    old = cell.course
+    step = partial(_stepping(plan).step, settings.method)
+    carry, passage, finished = flow.share(jax.vmap(step)(cell.pair, old.wall, old.carry))
+    blocked = old.waits & finished
+    new = Course(
+        old.wall,
+        _where(blocked, old.carry, carry),
+        old.waits | finished,
+        _where(finished & ~blocked, passage, old.passage),
+    )
+    return eqx.tree_at(lambda c: c.course, cell, new)
+
+
+def _stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """Fold the impacts that wait, end flights and contacts that outlast the run, and review what has stopped."""
+    course, carry, passage = cell.course, cell.course.carry, cell.course.passage
+    impact, after = passage.impact, passage.after
+    waits = course.waits & cell.running
+    # A round of a candidate orbit may begin close to the end and go on beyond it.
+    late = carry.n.astype(cell.count.dtype) - jnp.maximum(_window_end(plan, settings), cell.ball.n)
+    idle = cell.running & ~course.waits
+    quiet = idle & (carry.mode == 0) & (late >= (_QUIET if cell.candidate is not None else 0))
+    permanent = idle & (carry.mode != 0) & (late >= _QUIET)
+    hit = Hit(
+        onset_t=impact.t,
+        onset_n=impact.n.astype(impact.t.dtype),
+        side=impact.side.astype(impact.t.dtype),
+        v_in=impact.v_in,
+        v_out=impact.v_out,
+        flight=passage.flight,
+        duration=impact.duration,
+        after=Lanes(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
+        depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
+        work=impact.work if plan.deep else None,
+        tangent=passage.tangent,
+    )
+    cell = _fold(plan, settings, cell, _Event(hit, waits, quiet, permanent, jnp.zeros_like(waits)))
+    if plan.stepping == "ode":  # the steps of the other are counted by its clock
+        spent = cell.running & (carry.steps.astype(cell.count.dtype) > _STEPS * (_window_end(plan, settings) + 1))
+        status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
+        cell = eqx.tree_at(lambda c: (c.running, c.status), cell, (cell.running & ~spent, status))
+    stopped = ~cell.running
+    cell = _review(plan, settings, cell)
+    again = _set_off(plan, settings, cell.pair, cell.ball, jnp.zeros_like(cell.count))
+    course = eqx.tree_at(lambda c: c.waits, course, jnp.zeros_like(waits))
+    return eqx.tree_at(lambda c: c.course, cell, _where(stopped & cell.running, again, course))
+
+
 def _where(mask: Mask, new, old):
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
@@ -355,7 +446,7 @@ def _fold(plan: Plan, settings: Settings, cell: Cell, event: _Event) -> Cell:
         # A contact for ever has a depth although no impact ends it.
         held = event.permanent & (hit.depth > tally.deepest)
         tally = eqx.tree_at(lambda t: t.deepest, tally, jnp.where(held, hit.depth, tally.deepest))
-    candidate, found = _recur(cell, hit, kept, count)
+    candidate, found = _recur(settings, cell, hit, kept, count)
     stop = over | ended | spent | broken | found
     return eqx.tree_at(
         lambda c: (c.ball, c.running, c.status, c.count, c.batch, c.tally, c.candidate, c.tangent, c.exponent),
@@ -431,7 +522,7 @@ def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, traci
     )
 
 
-def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
+def _recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
     """Compare the impact with the anchor, an earlier one moved on by a quarter of the count; end rounds."""
     c = cell.candidate
     if c is None:
@@ -446,7 +537,8 @@ def _recur(cell: Cell, hit: Hit, kept: Mask, count: Lane):
     # On a round the anchor is the round's first impact.
     opening = kept & c.tracing & (c.left == c.length)
     again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
-    again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < 1e-2 * _recurrence(lag.dtype))
+    same = 1e-2 * _recurrence(lag.dtype, 100 * _grain(settings))
+    again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < same)
     fresh = fresh | opening
     return (
         Candidate(
@@ -484,14 +576,15 @@ def _review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     start = stopped & c.found & ~failed
     judged = stopped & c.tracing & (c.left <= 0) & ~failed
     size, nudge_u, nudge_v, largest = _newton(plan, cell)
-    close = _settled(size.dtype)
+    grain = _grain(settings)
+    close, far = _settled(size.dtype, grain), 1e3 * _recurrence(size.dtype, grain)
     settled = (size < close) | ((size < 1e3 * close) & (size > 0.25 * c.last))
     good = judged & settled & (largest < 1 + 1e-6)
     # Where a bounded, contracting Newton step leads nowhere near, the recurrence was a coincidence.
-    bad = judged & ~good & (settled | ~(size + c.moved < 1e3 * _recurrence(size.dtype)) | (c.rounds >= _ROUNDS))
+    bad = judged & ~good & (settled | ~(size + c.moved < far) | (c.rounds >= _ROUNDS))
     again = judged & ~good & ~bad
     cell = _begin_round(plan, cell, start | again, start, nudge_u, nudge_v, size)
-    cell = _back_to_search(plan, cell, bad)
+    cell = _back_to_search(plan, cell, bad, 10 * grain)
     done = cell.done | (stopped & ~start & ~again & ~bad)
     return eqx.tree_at(lambda x: (x.done, x.multiplier), cell, (done, jnp.where(good, largest, cell.multiplier)))
 
@@ -558,7 +651,7 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
     )
 
 
-def _back_to_search(plan: Plan, cell: Cell, bad: Mask) -> Cell:
+def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] | float) -> Cell:
     """A candidate that is no attractor: go on from where the round ended, with a tolerance a hundred times tighter."""
     c = cell.candidate
     zero = jnp.zeros_like(cell.since)
@@ -567,7 +660,7 @@ def _back_to_search(plan: Plan, cell: Cell, bad: Mask) -> Cell:
         c,
         (
             c.tracing & ~bad,
-            jnp.where(bad, 1e-2 * c.tolerance, c.tolerance),
+            jnp.where(bad, jnp.maximum(1e-2 * c.tolerance, least), c.tolerance),
             jnp.where(bad, jnp.inf, c.anchor_v),
             jnp.where(bad, cell.count, c.next_anchor),
         ),
@@ -598,6 +691,9 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
     quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
     end = _window_end(plan, settings)
     window = jnp.maximum(end - cell.since, 1.0)
+    # A round that failed in the last period left no window to measure: not decided, and not silent.
+    spoiled = ~periodic & ~quiet & ~permanent & (cell.since >= end)
+    failed = failed | spoiled
     span = jnp.where(periodic, cell.candidate.period if attractor else 1.0, window)
     hits = t.left + t.right
     silent = ~periodic & ~failed & ~permanent & ((hits == 0) | (quiet if attractor else False))
@@ -617,6 +713,7 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
             status = jnp.where(~periodic & ~chaotic & ~still & ~failed, Status.SLOW, status)
     if attractor:
         period = jnp.where(still, 1.0, jnp.where(failed, -1.0, period))
+    status = jnp.where(spoiled & (cell.status == Status.OK), Status.SLOW, status)
     if plan.rigid:
         status = jnp.where(t.stuck & (status == Status.OK), Status.STICKING, status)
 
@@ -674,19 +771,25 @@ def _power(plan, settings, cell: Cell, periodic: Mask, still: Mask, window: Lane
 
 
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
-    return lanes.Program(
+    program = lanes.Program(
         load=partial(_load, plan, settings),
-        trip=partial(_trip, plan, settings),
-        request=_request,
-        second=partial(_sampled_answer, plan),
-        careful=partial(_careful_answer, plan, settings),
-        settle=partial(_settle, plan, settings),
-        review=partial(_review, plan, settings),
-        declined=lambda cell: cell.declined,
+        trip=partial(_stepping_trip if plan.stepping else _trip, plan, settings),
+        review=partial(_stepping_review if plan.stepping else _review, plan, settings),
         stopped=lambda cell: ~cell.running,
-        hard=lambda cell: cell.hard,
         done=lambda cell: cell.done,
         unload=lambda cell: _pack(_unload(plan, settings, cell)),
+    )
+    if plan.stepping:
+        return program
+    return program._replace(
+        service=lanes.Service(
+            declined=lambda cell: cell.declined,
+            hard=lambda cell: cell.hard,
+            request=_request,
+            second=partial(_sampled_answer, plan),
+            careful=partial(_careful_answer, plan, settings),
+            settle=partial(_settle, plan, settings),
+        )
     )
 
 
@@ -776,6 +879,7 @@ def summarise(
     until: str = "attractor",
     transient: int = 0,
     outputs: frozenset[str] = frozenset({"P"}),
+    method: Method | None = None,
     count: int | None = None,
 ) -> Summary:
     """Run a tile of cells from phase 0, each until its attractor is certain or its window is over, in one jitted call.
@@ -789,6 +893,7 @@ def summarise(
         until: "attractor" or "window".
         transient: Periods before the window ("window" only).
         outputs: Names of `Summary` fields that must be there; what only others need is not computed.
+        method: The stepping method (`method.choose` makes it); None for the exact engine.
         count: How many cells are real, the rest being padding; all unless given.
 
     Returns:
@@ -797,6 +902,7 @@ def summarise(
     dtype = pair.d.dtype
     plan = Plan(
         until=until,
+        stepping=None if method is None else "ode" if isinstance(method, Ode) else "rk4",
         rigid=pair.kappa is None,
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=bool(outputs & DEEP),
@@ -811,6 +917,7 @@ def summarise(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
         device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
     )

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from functools import lru_cache, partial
+from importlib import import_module
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +13,13 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vijax import exact, flow
+from vijax.membrane import HuntCrossley, Law
+from vijax.method import Method, Rk4, choose
 from vijax.model import Impact, ImpactPair, State, Status, check, is_concrete
+
+_CHUNK = 64  # steps that a differentiated run computes twice, to remember only where each chunk began
+_STEPS = 256  # steps of an adaptive solver per impact and period, before a run is stopped
+_HELD = 8  # a contact that outlasts the last period by so many is for ever
 
 
 class Trajectory(eqx.Module):
@@ -105,12 +113,118 @@ def _one(periods: int, max_impacts: int, pair: ImpactPair, u0, v0, t0) -> Trajec
     return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
 
 
+class _Recording(eqx.Module):
+    """The loop's state of stepped runs: carries, what was found so far, and whether something broke."""
+
+    carry: Any
+    impacts: Impact
+    filled: Int[Array, "lane"]
+    states: State
+    broken: Array
+
+
+def _recording(periods: int, max_impacts: int, carry: Any, like: Float[Array, "lane"]) -> _Recording:
+    """Empty records."""
+    lanes = like.shape[0]
+    whole = jnp.zeros(lanes, jnp.int32)
+
+    def blank(width):
+        return jnp.full((lanes, width), jnp.nan, like.dtype), jnp.zeros((lanes, width), jnp.int32)
+
+    x, n = blank(max_impacts)
+    impacts = Impact(n=n, t=x, side=n, v_in=x, v_out=x, depth=x, duration=x, work=x)
+    x, n = blank(periods)
+    k = jnp.broadcast_to(jnp.arange(1, periods + 1, dtype=jnp.int32), n.shape)
+    return _Recording(carry, impacts, whole, State(x, x, x, k, n), jnp.zeros(lanes, bool))
+
+
+def _write(table: Any, row: Any, index: Int[Array, "lane"], wanted: Array) -> Any:
+    """A table [lane, width] with a row written at each lane's index, where wanted."""
+
+    def write(leaf, value):
+        column = jnp.where(wanted, index, leaf.shape[1])
+        return leaf.at[jnp.arange(leaf.shape[0], dtype=jnp.int32), column].set(value.astype(leaf.dtype), mode="drop")
+
+    return jax.tree.map(write, table, row)
+
+
+def _stepped(room: str, steps: int, periods: int, max_impacts: int, method: Method, pair, u0, v0, t0) -> Trajectory:
+    """Stepping engines: all lanes step together, each until its last period is over and its last contact has ended."""
+    engine = import_module(f"vijax.{room}")
+    begun = jax.vmap(_begin)(pair, u0, v0, t0)
+    wall = jax.vmap(method.law.wall)(pair)
+    carry = jax.vmap(partial(engine.start, method, deep=True, tangent=False))(pair, begun)
+    start = _recording(periods, max_impacts, carry, u0)
+
+    def runs(r: _Recording):
+        m = r.carry
+        inside = (m.mode != 0) & (m.onset_n < periods)
+        full = (r.filled >= max_impacts) & (m.mode != 0)
+        return ~r.broken & ~full & ((m.n < periods) | (inside & (m.n < periods + _HELD)))
+
+    def advance(r: _Recording) -> _Recording:
+        going = runs(r)
+        carry, passage, ended = jax.vmap(partial(engine.step, method, recorded=True))(pair, wall, r.carry)
+        impact = passage.impact
+        real = going & ended & (impact.n < periods)
+        strobe = going & (carry.n > r.carry.n) & (carry.n <= periods)
+        ball = jax.vmap(lambda pair, m: engine.ball(pair, method, m))(pair, carry)
+        return _Recording(
+            carry=jax.tree.map(lambda new, old: jnp.where(going, new, old), carry, r.carry),
+            impacts=_write(r.impacts, impact, r.filled, real),
+            filled=r.filled + real.astype(jnp.int32),
+            states=_write(r.states, ball, carry.n - 1, strobe),
+            broken=r.broken | (real & ~jnp.isfinite(impact.v_out)),
+        )
+
+    def chunk(r: _Recording, _):
+        def go(r):
+            return lax.scan(lambda r, _: (advance(r), None), r, None, length=_CHUNK)[0]
+
+        return lax.cond(runs(r).any(), jax.checkpoint(go), lambda r: r, r), None
+
+    end, _ = lax.scan(chunk, start, None, length=-(-steps // _CHUNK))
+    m = end.carry
+    held = (m.mode != 0) & (m.n >= periods) & (m.onset_n < periods)
+    short = runs(end) | ((end.filled >= max_impacts) & (m.n < periods))
+    status = jnp.where(held, Status.PERMANENT_CONTACT, jnp.where(end.filled == 0, Status.NO_IMPACT, Status.OK))
+    status = jnp.where(end.broken, Status.NONFINITE, jnp.where(short, Status.EVENT_BUDGET, status))
+    return Trajectory(end.impacts, end.filled, end.states, status.astype(jnp.int32))
+
+
+@lru_cache(maxsize=32)
+def _compiled_steps(room: str, steps: int, periods: int, max_impacts: int) -> Callable[..., Trajectory]:
+    return jax.jit(partial(_stepped, room, steps, periods, max_impacts))
+
+
+def _by_steps(method: Method, periods: int, max_impacts: int, pair: ImpactPair, *starts) -> Trajectory:
+    """A trajectory by a stepping engine, of starts of any shape."""
+    shape = starts[0].shape
+    pair, starts = jax.tree.map(lambda x: x.reshape(-1), (pair, starts))
+    if isinstance(method, Rk4):
+        room, steps = "rk4", int(method.steps) * (periods + _HELD)
+    else:
+        room, steps = "ode", _STEPS * (periods + max_impacts)
+    dtype = starts[0].dtype
+    method = jax.tree.map(lambda x: jnp.asarray(x, dtype), method)
+    flat = _compiled_steps(room, steps, periods, max_impacts)(method, pair, *starts)
+    return jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), flat)
+
+
 @lru_cache(maxsize=32)
 def _compiled(periods: int, max_impacts: int, axes: int) -> Callable[..., Trajectory]:
     run = partial(_one, periods, max_impacts)
     for _ in range(axes):
         run = jax.vmap(run)
     return jax.jit(run)
+
+
+def _wall(pair: ImpactPair) -> str:
+    return "rigid" if pair.kappa is None else "soft"
+
+
+def _precision(pair: ImpactPair) -> str:
+    return str(jnp.result_type(float, pair.d))
 
 
 def trajectory(
@@ -121,6 +235,12 @@ def trajectory(
     t0: Float[Array, "..."] | float = 0.0,
     *,
     max_impacts: int | None = None,
+    method: str | Method = "exact",
+    solver: str | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    membrane: Law | None = None,
+    steps: int | None = None,
 ) -> Trajectory:
     """Follow one start, or an array of starts, for a number of forcing periods.
 
@@ -130,19 +250,29 @@ def trajectory(
         periods: The motion is followed to t = 2 periods.
         t0: Time of the start, in [0, 2 periods).
         max_impacts: Room for impacts; 16 a period and 16 more unless given.
+        method: "exact", "ode" or "rk4", as in `sweep`; or the record of a stepping method (`vijax.method`).
+        solver, rtol, atol, membrane, steps: As in `sweep`. With a `HuntCrossley` membrane the pair's r is None.
 
     Returns:
-        The `Trajectory`. Differentiable in pair and start to any order, forward and reverse: a scan of bounded length.
+        The `Trajectory`. Differentiable in pair and start, forward and reverse: a scan of bounded length. The exact
+        engine to any order; "ode" once, as the lengths of its steps are constants to a derivative; "rk4" not
+        usefully, as its derivatives miss the jump at the wall.
 
     Raises:
-        ValueError: periods or max_impacts below 1, an inadmissible pair or start.
+        ValueError: periods or max_impacts below 1, an inadmissible pair, start or method.
     """
+    options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "steps": steps}
+    told = method if not isinstance(method, str) else choose(method, options, wall=_wall(pair), dtype=_precision(pair))
+    lossy = told is None or not isinstance(told.law, HuntCrossley)
+    if (pair.r is None) == lossy:
+        raise ValueError(f"r must be None with a Hunt-Crossley membrane, and a number with others; got {pair.r}")
     room = 16 * periods + 16 if max_impacts is None else max_impacts
     for name, value in (("periods", periods), ("max_impacts", room)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1; got {value}")
-    for name in ("d", "r", "gamma") + (() if pair.kappa is None else ("kappa",)):
-        check(name, getattr(pair, name))
+    for name in ("d", "kappa", "r", "gamma"):
+        if getattr(pair, name) is not None:
+            check(name, getattr(pair, name))
     for name, start in (("u0", u0), ("v0", v0), ("t0", t0)):
         if is_concrete(start) and not np.isfinite(np.asarray(start)).all():
             raise ValueError(f"{name} must be finite; got {start}")
@@ -153,4 +283,6 @@ def trajectory(
     shape = jnp.broadcast_shapes(*(x.shape for x in numbers), *(jnp.shape(x) for x in jax.tree.leaves(pair)))
     pair = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), shape), pair)
     u0, v0, t0 = (jnp.broadcast_to(x, shape) for x in numbers)
+    if told is not None:
+        return _by_steps(told, periods, room, pair, u0, v0, t0)
     return _compiled(periods, room, len(shape))(pair, u0, v0, t0)

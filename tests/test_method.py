@@ -1,0 +1,181 @@
+"""Methods by name: the door, maps by every method, membranes without a closed form."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vijax
+from vijax import HuntCrossley, sweep
+from vijax.membrane import Linear
+from vijax.method import OPTIONS, Ode, choose, record
+from vijax.model import ImpactPair, impact_pair
+
+PLANE = {"d": np.linspace(0.08, 0.3, 6), "kappa": np.geomspace(4, 300, 6), "r": 0.5, "u0": 0.0, "v0": 0.4}
+
+# --- the door ---------------------------------------------------------------------------------------------------------
+
+
+def test_defaults():
+    assert choose("exact", {"solver": None, "membrane": Linear()}) is None
+    method = choose("ode", {})
+    assert (method.solver, method.rtol, method.atol, method.dt) == ("Tsit5", 1e-8, 1e-10, None)
+    assert choose("ode", {}, dtype="float32").rtol > 1e-6
+    assert choose("rk4", {}).steps == 1000
+    assert set(OPTIONS) == {"exact", "ode", "rk4"}
+
+
+def test_record_tells_every_number():
+    method = choose("ode", {"solver": "Dopri8", "rtol": 1e-10, "atol": 1e-12, "membrane": HuntCrossley(0.5)})
+    told = {"solver": "Dopri8", "rtol": 1e-10, "atol": 1e-12, "membrane": "hunt-crossley with chi 0.5, exponent 1.5"}
+    assert record(method) == told
+    assert record(choose("rk4", {"steps": 200})) == {"steps": 200, "membrane": "linear"}
+    assert record(None) == {}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "says"),
+    [
+        ({"chi": -0.1}, "chi must be one finite number of at least 0; got -0.1"),
+        ({"chi": np.nan}, "chi must"),
+        ({"chi": [0.1, 0.2]}, "chi must"),
+        ({"chi": "much"}, "chi must"),
+        ({"chi": 0.5, "exponent": 0.5}, "exponent must be one finite number of at least 1"),
+        ({"chi": 0.5, "exponent": np.inf}, "exponent must"),
+    ],
+)
+def test_bad_membranes_are_named(numbers, says):
+    with pytest.raises(ValueError, match=says):
+        HuntCrossley(**numbers)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"method": "euler"}, "method must be"),
+        ({"method": "ode", "solver": "Euler"}, "solver must be among"),
+        ({"steps": 100}, "steps must be left out"),
+        ({"membrane": HuntCrossley(0.5)}, "membrane must be linear for method"),
+        ({"method": "ode", "membrane": HuntCrossley(0.5)}, "r must be None"),
+        ({"method": "ode", "pair": ImpactPair(0.2, 40.0, None, 0.0)}, "r must be None"),
+        ({"pair": ImpactPair(0.2, 40.0, None, 0.0)}, "r must be None"),
+        ({"method": "ode", "pair": ImpactPair(0.2, None, 0.5, 0.0)}, 'wall must be "soft"'),
+    ],
+)
+def test_trajectory_names_bad_input(arguments, says):
+    given = {"pair": ImpactPair(0.2, 40.0, 0.5, 0.0), "u0": 0.0, "v0": 0.3, "periods": 4} | arguments
+    with pytest.raises(ValueError, match=says):
+        vijax.trajectory(**given)
+
+
+# --- maps -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return sweep(**PLANE)
+
+
+def test_attractors_by_steps_are_those_of_the_exact_engine(exact):
+    found = sweep(**PLANE, method="ode", solver="Dopri8", rtol=1e-10, atol=1e-12)
+    assert set(found) == set(exact)
+    periodic = (exact["period"] > 0) & (exact["status"] == 0)
+    assert int(periodic.sum()) > 25
+    for name in ("period", "impacts_left", "impacts_right", "status"):
+        assert bool((found[name] == exact[name]).where(periodic, True).all()), name
+    for name in ("P", "energy_ratio", "max_penetration", "restitution", "contact_time"):
+        wrong = abs(found[name] / exact[name] - 1).where(periodic, 0.0)
+        assert float(wrong.max()) < 1e-6, name
+    assert found.attrs["solver"] == "Dopri8"
+
+
+def test_windows_by_steps(exact):
+    window = {"until": "window", "periods": 4, "outputs": ["impacts_per_period", "max_impact_speed"]}
+    true = sweep(**PLANE, **window)
+    for options, impacts, tolerance in (({"method": "ode"}, 0, 1e-6), ({"method": "rk4", "steps": 800}, 2, 0.3)):
+        found = sweep(**PLANE, **window, **options)
+        assert float(abs(found["impacts_per_period"] - true["impacts_per_period"]).max()) <= impacts / 4
+        assert float(abs(found["max_impact_speed"] / true["max_impact_speed"] - 1).max()) < tolerance
+
+
+def test_a_cell_does_not_depend_on_its_company():
+    window = {"until": "window", "periods": 5, "outputs": ["max_impact_speed"], "method": "ode"}
+    many = sweep(**PLANE, **window)["max_impact_speed"].values
+    one = sweep(**(PLANE | {"d": PLANE["d"][2], "kappa": PLANE["kappa"][3]}), **window)["max_impact_speed"].values
+    assert many[2, 3] == one
+
+
+def test_unstable_steps_are_said():
+    # kappa h = 4 is beyond the stability limit of the scheme.
+    blown = sweep(d=0.1, kappa=400.0, r=0.5, method="rk4", steps=200, until="window", periods=4, outputs=["status"])
+    assert int(blown["status"]) == vijax.Status.NONFINITE
+
+
+# --- Hunt and Crossley ------------------------------------------------------------------------------------------------
+
+
+def contact(law, kappa, gamma, t, v, count=20000):
+    """A contact from phase t at speed v, in classical steps that end by the secant: exit time, speed, depth, work."""
+    wall = law.wall(ImpactPair(0.2, jnp.asarray(kappa), None, gamma))
+    square, chi, power = (float(x) for x in (wall.square, wall.chi, wall.exponent))
+
+    def slope(s, y):
+        spring = square * max(y[0], 0.0) ** power
+        push = np.cos(np.pi * s) - gamma - spring * (1 + chi * y[1])
+        return np.array([y[1], push, chi * spring * y[1] ** 2])  # the last: what the damper takes
+
+    reach = ((power + 1) * v**2 / (2 * square)) ** (1 / (power + 1))  # of an undamped contact
+    h = 4 * reach / v / count
+    y, deepest = np.array([0.0, v, 0.0]), 0.0
+    for k in range(10 * count):
+        s = t + k * h
+        a = slope(s, y)
+        b = slope(s + h / 2, y + h / 2 * a)
+        c = slope(s + h / 2, y + h / 2 * b)
+        after = y + h / 6 * (a + 2 * b + 2 * c + slope(s + h, y + h * c))
+        deepest = max(deepest, after[0])
+        if after[0] <= 0:
+            part = y[0] / (y[0] - after[0])
+            return (k + part) * h, -(y + part * (after - y))[1], deepest, after[2]
+        y = after
+    raise AssertionError("no exit")
+
+
+def test_a_free_contact_has_the_restitution_of_its_law():
+    # v dv = -kappa^2 w^n (1 + chi v) dw on the way in and out: chi v - ln(1 + chi v) is the same at both ends.
+    law = HuntCrossley(1.2, exponent=1.7)
+    for v in (0.05, 0.5):
+        _, out, _, work = contact(law, 3e5, 0.0, 0.5, v, count=4000)
+        ends = [law.chi * x - np.log1p(law.chi * x) for x in (v, -out)]
+        assert abs(ends[0] / ends[1] - 1) < 1e-4
+        assert abs(work / (0.5 * (v**2 - out**2)) - 1) < 1e-4
+
+
+def test_contacts_of_a_membrane_without_closed_form():
+    law = HuntCrossley(0.8)
+    pair = impact_pair([0.2, 0.15], [40.0, 150.0], 0.5, [0.0, 0.05])
+    pair = ImpactPair(pair.d, pair.kappa, None, pair.gamma)
+    ran = vijax.trajectory(pair, 0.02, 0.3, 4, method=Ode("Dopri8", 1e-10, 1e-12, law))
+    for lane in range(2):
+        for k in (0, 3):
+            hit = {
+                name: float(getattr(ran.impacts, name)[lane, k])
+                for name in ("t", "v_in", "v_out", "depth", "duration", "work")
+            }
+            gamma, side = float(pair.gamma[lane]), int(ran.impacts.side[lane, k])
+            # On the left wall the forcing is that of the right one half a period later, with gravity reversed.
+            shift = 0.0 if side > 0 else 1.0
+            true = contact(law, float(pair.kappa[lane]), side * gamma, hit["t"] + shift, abs(hit["v_in"]))
+            got = (hit["duration"], abs(hit["v_out"]), hit["depth"], hit["work"])
+            assert np.allclose(got, true, rtol=2e-6), (got, true)
+
+
+def test_hunt_crossley_maps():
+    axes = {"d": [0.2, 0.25, 0.3], "kappa": [60.0, 200.0]}
+    found = sweep(**axes, method="ode", membrane=HuntCrossley(0.8))
+    assert int((found["status"] == 0).sum()) >= 4
+    assert np.isnan(found["r"]).all()
+    restitution = found["restitution"]
+    assert float(restitution.min()) > 0.3
+    assert float(restitution.max()) < 1
+    assert float(restitution.max() - restitution.min()) > 0.01  # it is a result: slower impacts lose less
+    assert "hunt-crossley" in found.attrs["membrane"]

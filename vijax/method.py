@@ -1,0 +1,151 @@
+"""The methods that integrate a cell: the numbers each one is told, and the door that checks them."""
+
+import math
+import operator
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from vijax.membrane import HuntCrossley, Law, Linear
+from vijax.model import Impact, Real, State
+
+SOLVERS = ("Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5")
+OPTIONS = {"exact": (), "ode": ("solver", "rtol", "atol", "membrane"), "rk4": ("steps", "membrane")}
+_DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
+_STEPS = 1000
+_FEWEST_STEPS = 8
+_FINEST = 8  # roundings: no error estimate is worth anything below
+
+
+class Passage(eqx.Module):
+    """A finished impact of a stepping engine: from the exit of the last contact to the exit of this one.
+
+    Attributes:
+        impact: The impact.
+        flight: Time from the last exit (or the start) to the onset.
+        after: The ball as it leaves.
+        tangent: Tangent map of the whole, row by row, saltations included; None where nobody asked for it.
+    """
+
+    impact: Impact
+    flight: Float[Array, "..."]
+    after: State
+    tangent: tuple[Any, ...] | None
+
+
+class Ode(eqx.Module):
+    """An adaptive Runge-Kutta method of diffrax with located events.
+
+    Attributes:
+        solver: One of `SOLVERS`.
+        rtol, atol: Tolerances of position and velocity, step by step.
+        law: The membrane.
+        dt: A constant step instead, for measuring orders of convergence.
+    """
+
+    solver: str = eqx.field(static=True)
+    rtol: Real
+    atol: Real
+    law: Law
+    dt: Real | None = None
+
+
+class Rk4(eqx.Module):
+    """The paper's method: classical Runge-Kutta steps of constant length, no event located.
+
+    Attributes:
+        steps: Steps per forcing period.
+        law: The membrane.
+    """
+
+    steps: Real
+    law: Law
+
+
+Method = Ode | Rk4
+
+
+def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype: str = "float64") -> Method | None:
+    """The method of a name, with what it is told; None for the exact one, which is told nothing.
+
+    Args:
+        method: "exact", "ode" or "rk4".
+        options: Of solver, rtol, atol, membrane and steps those given; None counts as not given.
+        wall: "soft" or "rigid".
+        dtype: "float64" or "float32": the defaults of the tolerances, and the least that they may be.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
+    """
+    if method not in OPTIONS:
+        raise ValueError(f"method must be {' or '.join(map(_quoted, OPTIONS))}; got {method!r}")
+    given = {name: value for name, value in options.items() if value is not None}
+    law = given.get("membrane", Linear())
+    if not isinstance(law, Linear | HuntCrossley):
+        raise ValueError(f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {law!r}")
+    if method == "exact" and not isinstance(law, Linear):
+        raise ValueError(f'membrane must be linear for method="exact"; got {describe(law)}; use method="ode"')
+    for name in given:
+        takers = [taker for taker, taken in OPTIONS.items() if name in taken]
+        if method not in takers and name != "membrane":
+            raise ValueError(
+                f"{name} must be left out unless method is {' or '.join(map(_quoted, takers))}; got {given[name]!r}"
+            )
+    if method == "exact":
+        return None
+    if wall != "soft":
+        raise ValueError(f'wall must be "soft" for method={_quoted(method)}; got {wall!r}; use method="exact"')
+    if method == "rk4":
+        return Rk4(whole("steps", given.get("steps", _STEPS), _FEWEST_STEPS), law)
+    solver = given.get("solver", "Tsit5")
+    if solver not in SOLVERS:
+        raise ValueError(f"solver must be among {', '.join(SOLVERS)}; got {solver!r}")
+    rtol, atol = _DEFAULTS[dtype]
+    least = _FINEST * float(np.finfo(dtype).eps)
+    return Ode(solver, _least("rtol", given.get("rtol", rtol), least), _least("atol", given.get("atol", atol), 0), law)
+
+
+def describe(law: Law) -> str:
+    """A membrane law in words: its name, as `--membrane` takes it, and its numbers."""
+    if isinstance(law, Linear):
+        return "linear"
+    return f"hunt-crossley with chi {float(law.chi):g}, exponent {float(law.exponent):g}"
+
+
+def record(method: Method | None) -> dict[str, Any]:
+    """What a method was told, by name, for the attributes of a map."""
+    if method is None:
+        return {}
+    told = {"membrane": describe(method.law)}
+    if isinstance(method, Rk4):
+        return told | {"steps": int(method.steps)}
+    return told | {"solver": method.solver, "rtol": float(method.rtol), "atol": float(method.atol)}
+
+
+def _quoted(name: str) -> str:
+    return f'"{name}"'
+
+
+def whole(name: str, value: Any, least: int) -> int:
+    """The value as an int, or a ValueError that names the argument."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}")
+    return number
+
+
+def _least(name: str, value: Any, least: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (number > 0 and number >= least and math.isfinite(number)):
+        must = f"of at least {least:.1e}" if least else "above 0"
+        raise ValueError(f"{name} must be a finite number {must}; got {value!r}")
+    return number
