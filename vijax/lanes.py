@@ -39,14 +39,14 @@ class Service(NamedTuple):
         declined, hard: Carry -> which lanes are; a hard lane needs the careful try.
         request: Carry -> the part of it that serving a lane needs.
         second, careful: Requests -> answers; what `second` is not sure of is left to `careful`, which would hold up a
-            whole batch.
+            whole batch. None: every declined lane is hard.
         settle: Carry, an answer for every lane, which lanes were served -> carry; unsure answers mark the lane hard.
     """
 
     declined: Callable[[Carry], Bool[Array, "lane"]]
     hard: Callable[[Carry], Bool[Array, "lane"]]
     request: Callable[[Carry], Any]
-    second: Callable[[Any], Any]
+    second: Callable[[Any], Any] | None
     careful: Callable[[Any], Any]
     settle: Callable[[Carry, Any, Bool[Array, "lane"]], Carry]
 
@@ -146,7 +146,11 @@ def run(
         asking, hard = declined(cell, carry), service.hard(carry)
         easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
         members, place, chosen = _first(asking & (hard != easy), width)
-        answers = lax.cond(easy, service.second, service.careful, _take(service.request(carry), members))
+        requests = _take(service.request(carry), members)
+        if service.second is None:
+            answers = service.careful(requests)
+        else:
+            answers = lax.cond(easy, service.second, service.careful, requests)
         return service.settle(carry, _take(answers, jnp.minimum(place, width - 1)), chosen)
 
     def to_serve(cell, carry):

@@ -31,7 +31,8 @@ _BATCHES = 24  # batch means behind a standard error
 _BUDGET = 512  # impacts per period before a cell is stopped
 _ROUNDS = 8  # Newton rounds on one candidate
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
-_QUIET = 64  # a flight that outlasts the last period by so many is over for good
+_QUIET = 64  # periods beyond the last one in which the end of a flight is still looked for
+_FOR_EVER = 1e7  # half periods
 _STEPS = 20_000  # steps per period before a cell of a stepping engine is stopped
 _SCALE = 2.0**40  # the tangent map is kept between 1/_SCALE and _SCALE, the rest in an exponent
 
@@ -250,8 +251,11 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
 # --- trips ----------------------------------------------------------------------------------------
 
 
-def _window_end(plan: Plan, settings: Settings) -> Float[Array, ""]:
-    return settings.periods + (settings.transient if plan.until == "window" else 0.0)
+def _last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:
+    """Where the window of a cell ends; one that a failed round made begin late is a share of the periods long too."""
+    if plan.until == "window":
+        return settings.periods + settings.transient + jnp.zeros_like(since)
+    return jnp.maximum(settings.periods, since + jnp.ceil(TRANSIENT_SHARE * settings.periods))
 
 
 def _batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
@@ -283,6 +287,7 @@ class _Request(eqx.Module):
     pair: ImpactPair
     ball: Lanes
     held: Lane
+    end: Lane  # last period
 
 
 class _Answer(eqx.Module):
@@ -293,24 +298,23 @@ class _Answer(eqx.Module):
     sure: Mask
 
 
-def _request(cell: Cell) -> _Request:
-    return _Request(cell.pair, cell.ball, cell.held)
+def _request(plan: Plan, settings: Settings, cell: Cell) -> _Request:
+    return _Request(cell.pair, cell.ball, cell.held, _last_period(plan, settings, cell.since))
 
 
 def _sampled_answer(plan: Plan, request: _Request) -> _Answer:
-    arrival = None
-    if plan.level and not plan.rigid:
-        arrival = quick.arrive(0.5 * request.pair.d, request.ball)
+    """Of level cells: where walls are soft it is the contact that the quick step declines nearly always."""
+    arrival = None if plan.rigid else quick.arrive(0.5 * request.pair.d, request.ball)
     hit, sure = sampled.sampled_step(request.pair, request.ball, arrival, deep=plan.deep, tangent=plan.tangent)
     no = jnp.zeros_like(sure)
     sure = sure & (request.held == 0)
     return _Answer(_Event(hit, sure, no, no, no), no, sure)
 
 
-def _careful_answer(plan: Plan, settings: Settings, request: _Request) -> _Answer:
+def _careful_answer(plan: Plan, request: _Request) -> _Answer:
     """`exact.step` on every lane."""
     pair, ball, held = request.pair, request.ball, request.held
-    horizon = 2 * (jnp.maximum(_window_end(plan, settings) - ball.n, 0.0) + _QUIET)
+    horizon = 2 * (jnp.maximum(request.end - ball.n, 0.0) + _QUIET)
     state = State(ball.u, ball.v, ball.t, jnp.zeros(ball.n.shape, jnp.int32), held.astype(jnp.int32))
     out = jax.vmap(partial(exact.step, deep=plan.deep))(pair, state, horizon)
     matrix = None
@@ -318,9 +322,11 @@ def _careful_answer(plan: Plan, settings: Settings, request: _Request) -> _Answe
         rows = jax.vmap(exact.tangent)(pair, out)
         matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
     after = out.state
+    # A flight that drifts comes to a wall after the horizon.
+    late = out.quiet & ~_neutral(pair, ball)
     hit = Hit(
         onset_t=out.impact.t,
-        onset_n=ball.n + out.impact.n.astype(ball.n.dtype),
+        onset_n=jnp.where(late, jnp.inf, ball.n + out.impact.n.astype(ball.n.dtype)),
         side=jnp.where(out.impact.side < 0, -1.0, 1.0).astype(ball.u.dtype),
         v_in=out.impact.v_in,
         v_out=out.impact.v_out,
@@ -331,8 +337,14 @@ def _careful_answer(plan: Plan, settings: Settings, request: _Request) -> _Answe
         work=out.impact.work if plan.deep else None,
         tangent=matrix,
     )
-    event = _Event(hit, out.impact.side != 0, out.quiet, out.permanent, out.stuck)
+    event = _Event(hit, (out.impact.side != 0) | late, out.quiet & ~late, out.permanent, out.stuck)
     return _Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
+
+
+def _neutral(pair: ImpactPair, ball: Lanes) -> Mask:
+    """Whether a flight that nothing stops stays within the gap for as good as ever."""
+    drift = ball.v - jnp.sin(flow.PI * ball.t) / flow.PI
+    return jnp.abs(drift) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
 
 
 def _settle(plan: Plan, settings: Settings, cell: Cell, answer: _Answer, served: Mask) -> Cell:
@@ -391,13 +403,15 @@ def _stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     impact, after = passage.impact, passage.after
     waits = course.waits & cell.running
     # A round of a candidate orbit may begin close to the end and go on beyond it.
-    late = carry.n.astype(cell.count.dtype) - jnp.maximum(_window_end(plan, settings), cell.ball.n)
+    end = _last_period(plan, settings, cell.since)
+    late = carry.n.astype(cell.count.dtype) - jnp.maximum(end, cell.ball.n)
     idle = cell.running & ~course.waits
-    quiet = idle & (carry.mode == 0) & (late >= (_QUIET if cell.candidate is not None else 0))
+    out = idle & (carry.mode == 0) & (late >= (_QUIET if cell.candidate is not None else 0))
+    quiet = out & _neutral(cell.pair, cell.ball)
     permanent = idle & (carry.mode != 0) & (late >= _QUIET)
     hit = Hit(
         onset_t=impact.t,
-        onset_n=impact.n.astype(impact.t.dtype),
+        onset_n=jnp.where(out, jnp.inf, impact.n.astype(impact.t.dtype)),
         side=impact.side.astype(impact.t.dtype),
         v_in=impact.v_in,
         v_out=impact.v_out,
@@ -408,9 +422,9 @@ def _stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
         work=impact.work if plan.deep else None,
         tangent=passage.tangent,
     )
-    cell = _fold(plan, settings, cell, _Event(hit, waits, quiet, permanent, jnp.zeros_like(waits)))
+    cell = _fold(plan, settings, cell, _Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
     if plan.stepping == "ode":  # the steps of the other are counted by its clock
-        spent = cell.running & (carry.steps.astype(cell.count.dtype) > _STEPS * (_window_end(plan, settings) + 1))
+        spent = cell.running & (carry.steps.astype(cell.count.dtype) > _STEPS * (end + 1))
         status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
         cell = eqx.tree_at(lambda c: (c.running, c.status), cell, (cell.running & ~spent, status))
     stopped = ~cell.running
@@ -428,7 +442,8 @@ def _fold(plan: Plan, settings: Settings, cell: Cell, event: _Event) -> Cell:
     """Add one event to a cell."""
     hit = event.hit
     ended = event.quiet | event.permanent
-    over = event.real & (hit.onset_n >= _window_end(plan, settings))
+    end = _last_period(plan, settings, cell.since)
+    over = event.real & (hit.onset_n >= end)
     tracing = jnp.zeros_like(over) if cell.candidate is None else cell.candidate.tracing
     over = over & ~tracing
     kept = event.real & ~over & ~event.permanent
@@ -436,7 +451,7 @@ def _fold(plan: Plan, settings: Settings, cell: Cell, event: _Event) -> Cell:
     status = jnp.where(event.permanent, Status.PERMANENT_CONTACT, status).astype(cell.status.dtype)
     counted = kept & (tracing | (hit.onset_n >= cell.since))
     count = cell.count + kept.astype(cell.count.dtype)
-    spent = count > _BUDGET * (_window_end(plan, settings) + 1)
+    spent = count > _BUDGET * (end + 1)
     broken = event.real & ~jnp.isfinite(hit.v_out + hit.after.t)
     status = jnp.where(spent, Status.EVENT_BUDGET, jnp.where(broken, Status.NONFINITE, status))
     tangent, exponent = _extend_tangent(cell, hit, kept, counted)
@@ -689,11 +704,8 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
     failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
     periodic = periodic & ~failed
     quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
-    end = _window_end(plan, settings)
-    window = jnp.maximum(end - cell.since, 1.0)
-    # A round that failed in the last period left no window to measure: not decided, and not silent.
-    spoiled = ~periodic & ~quiet & ~permanent & (cell.since >= end)
-    failed = failed | spoiled
+    end = _last_period(plan, settings, cell.since)
+    window = end - cell.since
     span = jnp.where(periodic, cell.candidate.period if attractor else 1.0, window)
     hits = t.left + t.right
     silent = ~periodic & ~failed & ~permanent & ((hits == 0) | (quiet if attractor else False))
@@ -713,7 +725,6 @@ def _unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
             status = jnp.where(~periodic & ~chaotic & ~still & ~failed, Status.SLOW, status)
     if attractor:
         period = jnp.where(still, 1.0, jnp.where(failed, -1.0, period))
-    status = jnp.where(spoiled & (cell.status == Status.OK), Status.SLOW, status)
     if plan.rigid:
         status = jnp.where(t.stuck & (status == Status.OK), Status.STICKING, status)
 
@@ -785,9 +796,9 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
         service=lanes.Service(
             declined=lambda cell: cell.declined,
             hard=lambda cell: cell.hard,
-            request=_request,
-            second=partial(_sampled_answer, plan),
-            careful=partial(_careful_answer, plan, settings),
+            request=partial(_request, plan, settings),
+            second=partial(_sampled_answer, plan) if plan.level else None,
+            careful=partial(_careful_answer, plan),
             settle=partial(_settle, plan, settings),
         )
     )
