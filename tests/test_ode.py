@@ -93,6 +93,16 @@ def test_samples_without_events_are_of_first_order():
     assert abs(slope(steps, [errors(Rk4(count, Linear())) for count in steps]) - 1) < 0.3
 
 
+def test_samples_are_of_fourth_order_away_from_the_walls_and_know_no_other_time():
+    steps = 64
+    free = follow([(1.0, 8.0, 0.5, 0.0, -1 / np.pi**2, 0.0)], Rk4(steps, Linear()))
+    assert np.abs(free.states.u + 1 / np.pi**2).max() < 1e-7
+    hits = follow(REGULAR, Rk4(steps, Linear())).impacts
+    for time_of in (hits.t, hits.duration):
+        samples = time_of[np.isfinite(time_of)] * steps / 2
+        assert np.abs(samples - np.round(samples)).max() < 1e-9
+
+
 # --- events -----------------------------------------------------------------------------------------------------------
 
 COARSE = Ode("Tsit5", 1e-3, 1e-5, Linear())  # steps that see several events
