@@ -32,7 +32,7 @@ ROOMS: dict[str, set[str]] = {
     "lanes": set(),
     "cell": {"model", "method", "quick"},
     "recurrence": {"model", "flow", "method", "quick", "cell"},
-    "fold": {"model", "energy", "quick", "cell", "recurrence"},
+    "fold": {"model", "flow", "energy", "quick", "cell", "recurrence"},
     "summary": {"model", "cell"},
     "trips": {"model", "flow", "exact", "quick", "sampled", "ode", "rk4", "cell", "recurrence", "fold"},
     "simulate": {"model", "exact", "quick", "lanes", "method", "cell", "recurrence", "summary", "trips"},

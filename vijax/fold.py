@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from vijax import energy
 from vijax.cell import TANGENT_SCALE, Cell, Event, Lane, Mask, Plan, Settings, Tally, batch_length, choose, last_period
+from vijax.flow import share
 from vijax.model import Status
 from vijax.quick import Hit
 from vijax.recurrence import recur
@@ -24,6 +25,7 @@ def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     status = jnp.where(event.quiet, Status.NO_IMPACT, cell.status)
     status = jnp.where(event.permanent, Status.PERMANENT_CONTACT, status).astype(cell.status.dtype)
     counted = kept & (tracing | (hit.onset_n >= cell.since))
+    over, kept, counted = share((over, kept, counted))
     count = cell.count + kept.astype(cell.count.dtype)
     spent = count > _BUDGET * (end + 1)
     broken = event.real & ~jnp.isfinite(hit.v_out + hit.after.t)

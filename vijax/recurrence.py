@@ -55,7 +55,7 @@ def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
     again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
     same = 1e-2 * recurrence(lag.dtype, 100 * grain(settings))
     again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < same)
-    fresh = fresh | opening
+    fresh, again, found = flow.share((fresh | opening, again, found))
     return (
         Candidate(
             anchor_t=jnp.where(fresh, hit.onset_t, c.anchor_t),
