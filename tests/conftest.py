@@ -1,6 +1,7 @@
 """Settings every test runs under: strict dtype promotion, and property tests that CI draws the same way each time."""
 
 import os
+from pathlib import Path
 
 import jax
 from hypothesis import settings
@@ -8,6 +9,10 @@ from hypothesis import settings
 import vijax  # noqa: F401  switches x64 on before a test makes its first array
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+# Workers, and the scripts that tests start, compile many of the same programs: one of them does it for all.
+CACHE = str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
+jax.config.update("jax_compilation_cache_dir", CACHE)
 
 # No deadline: the first example of a property pays for the compilation.
 settings.register_profile("vijax", deadline=None, max_examples=50)

@@ -8,6 +8,7 @@ import pytest
 from helpers import DIGITS, mp_march
 
 import vijax
+from vijax.lanes import compiler_options
 from vijax.model import ImpactPair, Status, impact_pair
 
 IMPACTS, PERIODS = 3, 4
@@ -69,7 +70,8 @@ def derivatives(rigid: bool):
         return jax.jvp(slope, (x,), (w,))
 
     points = jnp.asarray([[0.0 if x is None else x for x in case] for case in cases])
-    first, second = jax.jit(jax.vmap(jax.vmap(jet, (None, 0)), (0, None)))(points, jnp.asarray(directions))
+    every = jax.vmap(jax.vmap(jet, (None, 0)), (0, None))
+    first, second = jax.jit(every, compiler_options=compiler_options())(points, jnp.asarray(directions))
     return cases, directions, np.asarray(first), np.asarray(second), points
 
 
