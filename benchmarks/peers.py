@@ -268,15 +268,13 @@ def _scipy_cell(d, kappa, r, gamma, u, v, periods, rtol, solver) -> tuple[float,
         def gap(t, y):
             return y[0] - wall
 
-        gap.terminal, gap.direction = True, direction  # type: ignore[attr-defined]
+        gap.terminal, gap.direction = True, direction
         return gap
 
     onsets = [meets(half, 1), meets(-half, -1)]
     while t < end:
         events = [meets(side * half, -side)] if side else onsets
-        found = solve_ivp(
-            field, (t, end), (u, v), solver, events=events, max_step=LONGEST, rtol=rtol, atol=ATOL * rtol
-        )
+        found = solve_ivp(field, (t, end), (u, v), solver, events=events, max_step=LONGEST, rtol=rtol, atol=ATOL * rtol)
         if not found.success:
             return math.nan, math.nan
         t, (u, v) = found.t[-1], found.y[:, -1]

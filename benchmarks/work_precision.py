@@ -46,7 +46,8 @@ SETTLING = 40  # times PERIODS, from the default start to the attractor
 COMPARED = 5  # cells of a scene whose error is measured
 NUDGE = mp.mpf("1e-18")  # relative, of kappa, for central differences in 50 digits: exact to 36
 
-TIMED = {"exact": 16384, "ode": 2048, "rk4": 2048, "numba": 4096, "chain": 64, "scipy": COMPARED, "gradient": 64}  # cells
+# Cells of a timing.
+TIMED = {"exact": 16384, "ode": 2048, "rk4": 2048, "numba": 4096, "chain": 64, "scipy": COMPARED, "gradient": 64}
 LEAST_SECONDS, MOST_PERIODS, REPEATS = 0.2, 100, 2  # of a timing
 
 CHAOTIC_CELLS, TRANSIENT, WINDOW, LONG = 1024, 50, 50, 40  # periods, and windows in the reference
@@ -118,11 +119,10 @@ class Contender(NamedTuple):
 
 def pair_of(cells: Cells, dtype: str = "float64", kappa: Any = None) -> vijax.ImpactPair:
     """The parameters of the cells, or those with another kappa."""
-    d, r, gamma = (np.broadcast_to(np.asarray(x, dtype), cells.d.shape) for x in (cells.d, R, cells.scene.gamma))
-    if cells.scene.kappa is None:
-        return vijax.ImpactPair(d=d, kappa=None, r=r, gamma=gamma)
-    stiffness = np.full(cells.d.shape, cells.scene.kappa, dtype) if kappa is None else kappa
-    return vijax.ImpactPair(d=d, kappa=stiffness, r=r, gamma=gamma)
+    d, r, gamma = (jnp.broadcast_to(jnp.asarray(x, dtype), cells.d.shape) for x in (cells.d, R, cells.scene.gamma))
+    if kappa is None and cells.scene.kappa is not None:
+        kappa = jnp.full_like(d, cells.scene.kappa)
+    return vijax.ImpactPair(d=d, kappa=kappa, r=r, gamma=gamma)
 
 
 def follow(cells: Cells, dtype: str = "float64", **options: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -148,8 +148,8 @@ def slope(cells: Cells, **options: Any) -> tuple[np.ndarray, np.ndarray]:
         states = vijax.trajectory(pair, cells.u0, cells.v0, PERIODS, max_impacts=ROOM, **options).states
         return states.u[:, -1], states.v[:, -1]
 
-    kappa = jnp.full(cells.d.shape, cells.scene.kappa)
-    _, (u, v) = jax.jvp(end, (kappa,), (jnp.ones_like(kappa),))
+    kappa = pair_of(cells).kappa
+    _, (u, v) = jax.jvp(end, (kappa,), (jnp.ones(cells.d.shape),))
     return np.asarray(u), np.asarray(v)
 
 
@@ -173,7 +173,8 @@ def settled(scene: Scene) -> Cells:
     """The cells whose errors are measured, each on its attractor at phase 0."""
     cells = Cells(scene, np.linspace(*scene.d, COMPARED), 0.02, 0.3)
     for _ in range(SETTLING):
-        cells = cells._replace(**dict(zip(("u0", "v0"), follow(cells), strict=True)))
+        u, v = follow(cells)
+        cells = cells._replace(u0=u, v0=v)
     return cells
 
 
@@ -216,7 +217,7 @@ def _slope_50(parameters: list[Any], guesses: list) -> list[mp.mpf]:
 # --- the contenders -------------------------------------------------------------------------------
 
 
-def tolerances(*exponents: int) -> Iterator[tuple[str, dict[str, float]]]:
+def tolerances(*exponents: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """Relative tolerances by their exponents, in words and as options; the absolute one is a hundredth."""
     for exponent in exponents:
         yield f"1e-{exponent}", {"rtol": 10.0**-exponent, "atol": 10.0 ** -(exponent + 2)}
@@ -232,9 +233,10 @@ def ours(scene: Scene) -> Iterator[Contender]:
         yield Contender(name, dtype, partial(follow, dtype=dtype), partial(sweep, dtype=dtype), TIMED["exact"])
     if scene.kappa is None:
         return
+    told: dict[str, Any]
     for solver, exponents in SOLVERS.items():
-        for setting, told in tolerances(*exponents):
-            told = {"method": "ode", "solver": solver} | told
+        for setting, numbers in tolerances(*exponents):
+            told = {"method": "ode", "solver": solver} | numbers
             yield Contender(f"ode {solver}", setting, partial(follow, **told), partial(sweep, **told), TIMED["ode"])
     for steps in STEPS:
         told = {"method": "rk4", "steps": steps}
@@ -261,16 +263,14 @@ def theirs(scene: Scene) -> Iterator[Contender]:
 
 def of_gradients() -> Iterator[Contender]:
     """What can be differentiated."""
-    told: dict[str, Any]
     choices: list[tuple[str, str, dict[str, Any]]] = [("exact", "float64", {})]
     for solver in ("Tsit5", "Dopri8"):
-        for setting, told in tolerances(4, 6, 8, 10):
-            choices.append((f"ode {solver}", setting, {"method": "ode", "solver": solver} | told))
-    for steps in STEPS[:3]:
-        choices.append(("rk4", f"{steps}", {"method": "rk4", "steps": steps}))
+        named: dict[str, Any] = {"method": "ode", "solver": solver}
+        choices += [(f"ode {solver}", setting, named | more) for setting, more in tolerances(4, 6, 8, 10)]
+    choices += [("rk4", f"{steps}", {"method": "rk4", "steps": steps}) for steps in STEPS[:3]]
     for name, setting, told in choices:
         run = partial(slope, **told)
-        yield Contender(name, setting, run, lambda cells, _, run=run: run(cells), TIMED["gradient"])
+        yield Contender(name, setting, run, partial(as_it_is, run), TIMED["gradient"])
 
 
 def of_averages() -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -309,6 +309,11 @@ def pace(run: Callable[[int], Any], cells: int, periods: int | None = None) -> t
     return 1e6 * warm / (cells * first), cold - warm
 
 
+def as_it_is(answer: Callable[[Cells], Any], cells: Cells, _: int) -> Any:
+    """A run of PERIODS, which cannot be had for another number of periods without compiling it again."""
+    return answer(cells)
+
+
 def deviation(found: tuple[np.ndarray, np.ndarray], true: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Distance of each cell's answer from the true one, infinite where there is none."""
     error = np.hypot(*(np.asarray(a, float) - b for a, b in zip(found, true, strict=True)))
@@ -323,10 +328,10 @@ def regular(scene: Scene, contenders: Iterator[Contender], quick: bool) -> Itera
     for one in contenders:
         error = deviation(one.answer(cells), true)
         if quick:
-            us, compiling = pace(lambda _, one=one: one.answer(cells), COMPARED, PERIODS)
+            us, compiling = pace(partial(as_it_is, one.answer, cells), COMPARED, PERIODS)
         else:
             many = Cells(scene, np.linspace(*scene.d, one.cells), cells.u0[middle], cells.v0[middle])
-            us, compiling = pace(lambda periods, one=one, many=many: one.timed(many, periods), one.cells)
+            us, compiling = pace(partial(one.timed, many), one.cells)
         yield Row(scene.title, "state", one.method, one.setting, us, compiling, *summary(error))
 
 
@@ -342,7 +347,7 @@ def gradients(scene: Scene) -> Iterator[Row]:
     copies = np.resize(np.arange(COMPARED), TIMED["gradient"])
     many = Cells(scene, *(np.asarray(x)[copies] for x in cells[1:]))
     for one in of_gradients():
-        us, compiling = pace(lambda periods, one=one: one.timed(many, periods), one.cells, PERIODS)
+        us, compiling = pace(partial(one.timed, many), one.cells, PERIODS)
         u, v = one.answer(many)
         error = deviation((u[:COMPARED], v[:COMPARED]), true) / np.hypot(*true)
         name = scene.title.replace(scene.name, "gradient")

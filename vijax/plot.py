@@ -492,10 +492,12 @@ def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
     taken: list[tuple[float, float, float]] = []
     for x, y, method, colour in sorted(ends, key=lambda end: end[1]):
         place, height = (np.log(x) - left) / (right - left), (np.log(y) - low) / (high - low)
-        width = 0.026 * len(method)
+        width = 0.018 * len(method)
         begin = place + 0.015 if place + width < 1 else place - width - 0.015
         height -= 0.03
-        while any(abs(height - other) < _LABEL_GAP and begin < end and start < begin + width for start, end, other in taken):
+        while any(
+            abs(height - other) < _LABEL_GAP and begin < end and start < begin + width for start, end, other in taken
+        ):
             height += 0.01
         taken.append((begin, begin + width, height))
         axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, fontsize=7)
