@@ -401,8 +401,12 @@ _MEASURES = {
     "power": "bias of mean $P$ / standard error",
     "gradient": "relative error of the gradient",
 }
+_HOW_TO_READ = (
+    "down and to the left is better; the grey stairs are the best there is at each cost\n"
+    "whole lines: vijax; dashed: its peers; crosses: no result"
+)
 _COLUMNS = 3
-_ROUNDING = 1e-17  # where an error of nothing is drawn
+_ROUNDING = 1e-16  # an error below is drawn there
 _NOISE = 2.0  # standard errors that mean nothing
 _LABEL_GAP = 0.052  # between labels, of the height of a panel
 
@@ -436,6 +440,7 @@ def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figur
             else:
                 axes.set_xlim(span)
                 _work_panel(axes, *panel)
+        figure.suptitle(_HOW_TO_READ, fontsize="medium")
         figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
         if path is not None:
             with replacing(Path(path)) as part:
@@ -450,13 +455,14 @@ def _decades(values: list[float]) -> tuple[float, float]:
 
 def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
     measure = rows[0].measure
-    errors = [max(row.error / row.noise if row.noise else row.error, _ROUNDING) for row in rows]
+    errors = [row.error / row.noise if row.noise else row.error for row in rows]
     finite = [error for error in errors if math.isfinite(error)]
-    low, high = min(finite) / 10, max(10.0, 10 * max(finite))
-    axes.set(title=title, xscale="log", yscale="log", ylim=(low, high), ylabel=_MEASURES[measure])
+    low, high = (_NOISE / 100 if measure == "power" else _ROUNDING), max(10.0, 10 * max(finite))
+    errors = [max(error, low) for error in errors]
+    axes.set(title=title, xscale="log", yscale="log", ylim=(low / 3, high), ylabel=_MEASURES[measure])
     if measure == "power":
-        axes.axhspan(low, _NOISE, color="0.92", zorder=0)
-        axes.text(0.98, 0.02, "noise", transform=axes.transAxes, ha="right", color="0.5", fontsize=7)
+        axes.axhspan(low / 3, _NOISE, color="0.94", zorder=0)
+        axes.text(0.98, 0.02, "noise", transform=axes.transAxes, ha="right", color="0.5", fontsize=7, in_layout=False)
     axes.grid(color="0.9", linewidth=0.4)
     axes.set_axisbelow(True)
     points = [(row.us, error) for row, error in zip(rows, errors, strict=True) if math.isfinite(error)]
@@ -467,11 +473,13 @@ def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
         colour, style = _METHODS[method]
         chosen = [(row.us, error) for row, error in zip(rows, errors, strict=True) if row.method == method]
         good = [(x, y) for x, y in chosen if math.isfinite(y)]
-        axes.plot(*zip(*good, strict=True), color=colour, linestyle=style, marker="o", markersize=2.5, linewidth=1.1)
         bad = [x for x, y in chosen if not math.isfinite(y)]
-        axes.plot(bad, [high] * len(bad), color=colour, marker="x", linestyle="none", clip_on=False)
         if good:
+            line = {"color": colour, "linestyle": style, "linewidth": 1.1, "marker": "o", "markersize": 2.5}
+            axes.plot(*zip(*good, strict=True), **line)
             ends.append((*min(good, key=lambda point: point[1]), method, colour))
+        if bad:  # a line without points and clipping would count as one at the picture's corner
+            axes.plot(bad, [high] * len(bad), color=colour, marker="x", linestyle="none", clip_on=False)
     _label_ends(axes, ends)
 
 
@@ -492,7 +500,7 @@ def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
     taken: list[tuple[float, float, float]] = []
     for x, y, method, colour in sorted(ends, key=lambda end: end[1]):
         place, height = (np.log(x) - left) / (right - left), (np.log(y) - low) / (high - low)
-        width = 0.018 * len(method)
+        width = 0.02 * len(method)
         begin = place + 0.015 if place + width < 1 else place - width - 0.015
         height -= 0.03
         while any(
@@ -500,4 +508,9 @@ def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
         ):
             height += 0.01
         taken.append((begin, begin + width, height))
-        axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, fontsize=7)
+        style: Any = {
+            "fontsize": 7,
+            "in_layout": False,
+            "path_effects": [Stroke(linewidth=2, foreground="white"), Normal()],
+        }
+        axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, **style)
