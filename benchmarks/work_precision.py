@@ -10,7 +10,10 @@ last scene asks for the derivative of the final state with respect to kappa, aga
 without a number has an infinite error. The time is that of a warm call on many cells, in microseconds per cell-period;
 compilation stands beside it. Typical printout, two cores:
 
-PRINTOUT
+    2 cores, cpu, JAX 0.10.2
+    soft, kappa = 4          exact               float64       0.441 us  error 1.5e-16
+    soft, kappa = 4          exact float32       float32       0.659 us  error 1.3e-07
+    soft, kappa = 4          ode Tsit5           1e-4           14.6 us  error 2.7e-05
 """
 
 import argparse
@@ -281,7 +284,7 @@ def of_averages() -> Iterator[tuple[str, str, dict[str, Any]]]:
         yield name, dtype, {"dtype": dtype}
     for setting, told in tolerances(4, 6, 8):
         yield "ode Tsit5", setting, {"method": "ode", "solver": "Tsit5"} | told
-    for steps in (100, *STEPS):
+    for steps in (100, *STEPS[:2]):
         yield "rk4", f"{steps}", {"method": "rk4", "steps": steps}
 
 
@@ -305,7 +308,7 @@ def pace(run: Callable[[int], Any], cells: int, periods: int | None = None) -> t
     """
     count = periods or 1
     cold, warm = seconds(partial(run, count)), seconds(partial(run, count))
-    compiling = cold - warm
+    compiling = max(cold - warm, 0.0)
     if periods is None and warm < LEAST_SECONDS:
         count = min(int(LEAST_SECONDS / warm) + 1, MOST_PERIODS)
         warm = seconds(partial(run, count))
@@ -329,12 +332,12 @@ def regular(scene: Scene, contenders: Iterator[Contender], quick: bool) -> Itera
     true = truth(cells)
     middle = COMPARED // 2
     for one in contenders:
-        error = deviation(one.answer(cells), true)
         if quick:
             us, compiling = pace(partial(as_it_is, one.answer, cells), COMPARED, PERIODS)
         else:
             many = Cells(scene, np.linspace(*scene.d, one.cells), cells.u0[middle], cells.v0[middle])
             us, compiling = pace(partial(one.timed, many), one.cells)
+        error = deviation(one.answer(cells), true)
         yield Row(scene.title, "state", one.method, one.setting, us, compiling, *summary(error))
 
 
