@@ -14,7 +14,7 @@ import argparse
 import csv
 import json
 from collections.abc import Callable, Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,10 +30,11 @@ from vijax import exact, flow, plot
 from vijax.membrane import Linear
 from vijax.method import Ode
 from vijax.model import ImpactPair, State, damping_ratio
+from vijax.trajectory import Trajectory
 
 HERE = Path(__file__).parent
 REFERENCE = HERE.parent / "tests" / "data" / "plane_cells.json"
-NONE = float("nan")  # the method does not have this figure
+NONE = float("nan")
 
 R, U0, V0 = 0.5, 0.0, 0.4
 D_REGULAR = 0.2
@@ -50,8 +51,8 @@ class Figure(NamedTuple):
     """One measured figure, as it goes to the CSV file."""
 
     what: str
-    usual: float
-    vijax: float
+    usual: Any  # a number of any make; NaN: there is none
+    vijax: Any
 
 
 class Scene(NamedTuple):
@@ -65,20 +66,20 @@ class Scene(NamedTuple):
 # --- runs -----------------------------------------------------------------------------------------
 
 
-def run(d: Any, kappa: Any, u0: Any = U0, v0: Any = V0, dtype: str = "float64") -> vijax.trajectory:
+def run(d: Any, kappa: Any, u0: Any = U0, v0: Any = V0, dtype: str = "float64") -> Trajectory:
     """The exact motion of N soft cells over `PERIODS` periods; leaves in numpy."""
     given = [np.asarray(x, dtype) for x in np.broadcast_arrays(d, kappa, np.asarray(R), u0, v0)]
     count = given[0].size
     parts = []
     for first in range(0, count, LANES):
-        rows = [np.resize(x[first : first + LANES], LANES) for x in given]
-        pair = vijax.impact_pair(*(jnp.asarray(x) for x in rows[:3]), jnp.zeros(LANES, dtype))
-        found = vijax.trajectory(pair, *map(jnp.asarray, rows[3:]), PERIODS, max_impacts=ROOM)
+        gap, stiffness, r, u, v = (jnp.asarray(np.resize(x[first : first + LANES], LANES)) for x in given)
+        pair = vijax.impact_pair(gap, stiffness, r, jnp.zeros(LANES, dtype))
+        found = vijax.trajectory(pair, u, v, PERIODS, max_impacts=ROOM)
         parts.append(jax.tree.map(np.asarray, found))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
 
-def impacts_in(motion: Any, first: int, last: int) -> np.ndarray:
+def impacts_in(motion: Trajectory, first: int, last: int) -> np.ndarray:
     """Impacts of each cell whose onset lies in periods first ... last - 1; -1 where the run did not get there."""
     n, side = motion.impacts.n, motion.impacts.side
     counts = ((side != 0) & (n >= first) & (n < last)).sum(axis=1)
@@ -88,11 +89,11 @@ def impacts_in(motion: Any, first: int, last: int) -> np.ndarray:
 class Label(NamedTuple):
     """Period of the motion that a run ends in (0: none up to 32) and its number of impacts, each [N]."""
 
-    period: np.ndarray
-    impacts: np.ndarray
+    period: Any
+    impacts: Any
 
 
-def label(motion: Any, dtype: str = "float64") -> Label:
+def label(motion: Trajectory, dtype: str = "float64") -> Label:
     """The least recurrence of the last stroboscopic state, and the impacts in the periods that it spans."""
     u, v = motion.states.u, motion.states.v
     recurs = np.stack(
@@ -120,7 +121,7 @@ def derivative(pair: ImpactPair, u0: Any, v0: Any, t0: Any, along: tuple[Any, An
 def by_kappa(kappa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Displacement after a short run of the regular cell, and its derivative by kappa, exact."""
     pair = vijax.impact_pair(D_REGULAR, kappa, R)
-    still = jnp.zeros_like(pair.kappa)
+    still = jnp.zeros(kappa.shape)
     along = ImpactPair(still, still + 1, still, still)
     motion, rate = derivative(pair, still + U0, still + V0, still, (along, still))
     return np.asarray(motion.states.u)[:, -1], np.asarray(rate.states.u)[:, -1]
@@ -145,6 +146,11 @@ def located(solver: str) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.nda
         return np.asarray(u), np.asarray(rate)
 
     return at
+
+
+def located_place(solver: str, kappa: np.ndarray, steps: int) -> np.ndarray:
+    """The displacement alone."""
+    return located(solver)(kappa, steps)[0]
 
 
 def slope(x: Any, y: Any) -> float:
@@ -231,7 +237,7 @@ def order(quick: bool) -> Iterator[Figure]:
         blind = NONE
         if not quick and name in _UNLOCATED:
             blind = rate(naive.where_solver(name, D_REGULAR, kappa, R, U0, V0, SHORT), 500, 8000)
-        seen = rate(lambda n, name=name: located(name)(kappa, n)[0], *_ORDER_STEPS[name])
+        seen = rate(partial(located_place, name, kappa), *_ORDER_STEPS[name])
         yield Figure(f"fitted order of {name} ({nominal}), events not located and located", blind, seen)
 
 
@@ -241,7 +247,7 @@ def speeds(quick: bool) -> Iterator[Figure]:
     true = run(D_REGULAR, 400.0, U0, v0).impacts
     formula = v0 + np.sin(np.pi * true.t[:, 0]) / np.pi
     pair = vijax.impact_pair(np.full(LANES, D_REGULAR), 400.0, R)
-    got = vijax.trajectory(pair, U0, v0, 1, max_impacts=4, method="rk4", steps=1024).impacts
+    got = vijax.trajectory(pair, U0, jnp.asarray(v0), 1, max_impacts=4, method="rk4", steps=1024).impacts
     sampled, ours = (np.abs(np.asarray(v_in)[:, 0] / formula - 1) for v_in in (got.v_in, true.v_in))
     for how, of in (("median", np.median), ("worst", np.max)):
         yield Figure(f"entry speed wrong by, {how}", float(of(sampled)), float(of(ours)))
@@ -302,7 +308,7 @@ def one_impact(pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
     return out, exact.tangent(pair, out)
 
 
-def first_impact(d: Any, kappa: float | None, u0: Any, v0: Any, t0: float = 0.0) -> tuple[exact.Outcome, np.ndarray]:
+def first_impact(d: Any, kappa: float | None, u0: Any, v0: Any, t0: Any = 0.0) -> tuple[exact.Outcome, np.ndarray]:
     """`one_impact` of starts in flight, leaves in numpy."""
     d, u0, v0, t0 = (jnp.asarray(x) for x in np.broadcast_arrays(d, u0, v0, t0))
     whole = jnp.zeros(d.shape, jnp.int32)
@@ -445,20 +451,20 @@ def resonance(quick: bool) -> Iterator[Figure]:
     for power in (4, 8, 12):
         kappa, r, speed, s = np.pi * (1 + 10.0**-power), 1 - 10.0**-power, 0.3, 0.7
         with mpmath.workdps(50):
-            true = naive.contact(*map(mpmath.mpf, (kappa, r, speed, s)), mpmath.mp)
+            exactly = [mpmath.mpf(x) for x in (kappa, r, speed, s)]
+            true = partial(naive.contact, xp=mpmath.mp)(*exactly)
         pair = vijax.impact_pair(D_REGULAR, kappa, r)
         zero, one = jnp.zeros(()), jnp.ones(())
         w, _ = flow.oscillate(flow.membrane(pair), flow.contact_force(zero, one, zero), zero, speed * one, s * one)
-        yield Figure(
-            f"error of the penetration, e = 1e-{power}",
-            *(abs(float(x / true - 1)) for x in (naive.contact(kappa, r, speed, s), mpmath.mpf(float(w)))),
-        )
+        errors = (abs(float(got / true - 1)) for got in (naive.contact(kappa, r, speed, s), mpmath.mpf(float(w))))
+        yield Figure(f"error of the penetration, e = 1e-{power}", *errors)
 
 
 def single_precision(quick: bool) -> Iterator[Figure]:
     """float32 beside float64 on a plane: entry speeds of the first impacts, and labels."""
-    cells = reference_cells(LANES if quick else None)
-    double, single = (run(cells["d"], cells["kappa"], dtype=dtype) for dtype in RECURRENCE)
+    cells = reference_cells(LANES)
+    d, kappa = (cells["d"], cells["kappa"]) if quick else plane(24, 400)
+    double, single = (run(d, kappa, dtype=dtype) for dtype in RECURRENCE)
     error = np.abs(single.impacts.v_in.astype(float) / double.impacts.v_in - 1)
     known, got = label(double), label(single, "float32")
     sure = known.period > 0

@@ -162,8 +162,8 @@ def stability_map(found: Any, path: str | Path | None = None) -> Figure:
         axes.pcolormesh(found.kappa, found.steps, found.stable, cmap="Blues_r", vmin=-1, vmax=1.5, rasterized=True)
         axes.plot(found.kappa, found.least_steps, **_OUTLINE)
         axes.set(xlim=found.kappa[[0, -1]], ylim=found.steps[[0, -1]])
-        handles = [Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4)]
-        handles.append(Line2D([], [], **_OUTLINE))
+        shades = (Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4))
+        handles = [*shades, Line2D([], [], **_OUTLINE)]
         texts = ["bounded", "blown up within 50 periods", "theory"]
         figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
         if path is not None:
