@@ -212,7 +212,7 @@ def stability(quick: bool) -> Iterator[Figure]:
 _UNLOCATED = ("Tsit5", "Dopri8", "Kvaerno5")
 _LOCATED = {"Bosh3": 3, "Tsit5": 5, "Dopri5": 5, "Dopri8": 8, "Kvaerno5": 5}
 _ORDER_STEPS = {
-    "Bosh3": (250, 2000),
+    "Bosh3": (250, 1000),
     "Tsit5": (300, 1200),
     "Dopri5": (300, 1200),
     "Dopri8": (60, 140),
