@@ -47,7 +47,7 @@ ROOMS: dict[str, set[str]] = {
 ROOMS["__init__"] = set(ROOMS)
 
 ONLY_IN = {
-    "diffrax": {"vijax/ode.py", "benchmarks/peers.py"},  # the peer is what users of diffrax write without vijax
+    "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
     "matplotlib": {"vijax/plot.py"},
 }
 NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]

@@ -142,6 +142,36 @@ def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Fig
     return _picture(dataset, _DIFFERENCE, path)
 
 
+def stability_map(found: Any, path: str | Path | None = None) -> Figure:
+    """Where an explicit method stays bounded over stiffness and steps per period, under the boundary of theory.
+
+    Args:
+        found: A record with `kappa` [K] and `steps` [S], both ascending, `stable` [S, K], and `least_steps` [K], the
+            boundary.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: If the path does not end as a picture does.
+    """
+    if path is not None:
+        check_format(path)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(5.2, 3.8), layout="constrained")
+        axes = figure.subplots()
+        axes.set(xscale="log", yscale="log", xlabel=r"$\kappa$", ylabel="RK4 steps per period")
+        axes.pcolormesh(found.kappa, found.steps, found.stable, cmap="Blues_r", vmin=-1, vmax=1.5, rasterized=True)
+        axes.plot(found.kappa, found.least_steps, **_OUTLINE)
+        axes.set(xlim=found.kappa[[0, -1]], ylim=found.steps[[0, -1]])
+        shades = (Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4))
+        handles = [*shades, Line2D([], [], **_OUTLINE)]
+        texts = ["bounded", "blown up within 50 periods", "theory"]
+        figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
+        if path is not None:
+            with replacing(Path(path)) as part:
+                figure.savefig(part)
+    return figure
+
+
 def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
     missing = [name for name in kind.needs if name not in dataset]
     if missing:
