@@ -476,7 +476,13 @@ def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
         good = [(x, y) for x, y in chosen if math.isfinite(y)]
         bad = [x for x, y in chosen if not math.isfinite(y)]
         if good:
-            line: dict[str, Any] = {"color": colour, "linestyle": style, "linewidth": 1.1, "marker": "o", "markersize": 2.5}
+            line: dict[str, Any] = {
+                "color": colour,
+                "linestyle": style,
+                "linewidth": 1.1,
+                "marker": "o",
+                "markersize": 2.5,
+            }
             axes.plot(*zip(*good, strict=True), **line)
             ends.append((*min(good, key=lambda point: point[1]), method, colour))
         if bad:  # a line without points and clipping would count as one at the picture's corner
