@@ -438,6 +438,7 @@ _HOW_TO_READ = (
 _COLUMNS = 3
 _ROUNDING = 1e-16  # an error below is drawn there
 _NOISE = 2.0  # standard errors that mean nothing
+_LEAST = 1.0  # fewer are drawn as so many: there is no better and worse among them
 _LABEL_GAP = 0.052  # between labels, of the height of a panel
 
 
@@ -486,8 +487,8 @@ def _decades(values: list[float]) -> tuple[float, float]:
 def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
     measure = rows[0].measure
     errors = [row.error / row.noise if row.noise else row.error for row in rows]
-    finite = [error for error in errors if math.isfinite(error)]
-    low, high = (_NOISE / 100 if measure == "power" else _ROUNDING), max(10.0, 10 * max(finite))
+    finite = [error for error in errors if math.isfinite(error)] or [1.0]
+    low, high = (_LEAST if measure == "power" else _ROUNDING), max(10.0, 10 * max(finite))
     errors = [max(error, low) for error in errors]
     axes.set(title=title, xscale="log", yscale="log", ylim=(low / 3, high), ylabel=_MEASURES[measure])
     if measure == "power":
@@ -505,7 +506,13 @@ def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
         good = [(x, y) for x, y in chosen if math.isfinite(y)]
         bad = [x for x, y in chosen if not math.isfinite(y)]
         if good:
-            line = {"color": colour, "linestyle": style, "linewidth": 1.1, "marker": "o", "markersize": 2.5}
+            line: dict[str, Any] = {
+                "color": colour,
+                "linestyle": style,
+                "linewidth": 1.1,
+                "marker": "o",
+                "markersize": 2.5,
+            }
             axes.plot(*zip(*good, strict=True), **line)
             ends.append((*min(good, key=lambda point: point[1]), method, colour))
         if bad:  # a line without points and clipping would count as one at the picture's corner
