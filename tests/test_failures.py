@@ -134,7 +134,8 @@ def test_resonance():
 
 
 def test_single_precision():
-    (first, *_, worst, labels), _ = measured("single_precision")
+    (first, *_, worst, labels), (*_, double, _) = measured("single_precision")
     assert 1e-9 < first < 1e-6
     assert first < worst < 1e-3
+    assert double < 1e-14
     assert labels < 0.1
