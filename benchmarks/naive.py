@@ -52,7 +52,7 @@ def where_rk4(d: Any, kappa: Any, r: Any, u0: Any, v0: Any, periods: Any, steps:
 
 
 def where_solver(solver: str, d: Any, kappa: Any, r: float, u0: float, v0: float, periods: int) -> Callable[[int], Any]:
-    """Displacement [N] after some periods by an explicit solver of diffrax, as a function of its steps a period; no events."""
+    """Displacement [N] after some periods by an explicit solver of diffrax with so many steps a period; no events."""
     numbers = jnp.asarray(d), jnp.asarray(r)
 
     def field(t, y, kappa):
