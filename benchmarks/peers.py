@@ -290,10 +290,10 @@ def _scipy_cell(d, kappa, r, gamma, u, v, periods, rtol, solver) -> tuple[float,
 
 def diffrax_chain(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float) -> tuple[np.ndarray, ...]:
     """As `dormand_prince`, by diffrax: `diffeqsolve` with an `Event`, restarted to the end of the run, vmapped."""
-    d, u0, v0 = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, u0, v0)))
-    stiffness, damping = (0.0, 0.0) if kappa is None else (float(kappa) ** 2, float(kappa) * _damping(r))
-    numbers = [jnp.asarray(x, float) for x in (stiffness, damping, r, gamma, 2.0 * periods, rtol)]
-    u, v = _restarts(kappa is None)(jnp.asarray(d / 2), jnp.asarray(u0), jnp.asarray(v0), *numbers)
+    stiff = np.asarray(0.0 if kappa is None else kappa, dtype=float)
+    d, u0, v0, stiff = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, u0, v0)), stiff)
+    cells = [jnp.asarray(x) for x in (d / 2, u0, v0, stiff**2, stiff * _damping(r))]
+    u, v = _restarts(kappa is None)(*cells, *(jnp.asarray(x, float) for x in (r, gamma, 2.0 * periods, rtol)))
     return np.asarray(u), np.asarray(v)
 
 
@@ -339,4 +339,4 @@ def _restarts(rigid: bool) -> Any:
         _, u, v, _ = jax.lax.while_loop(lambda carry: carry[0] < end, spell, carry)
         return u, v
 
-    return jax.jit(jax.vmap(run, in_axes=(0, 0, 0, *[None] * 6)))
+    return jax.jit(jax.vmap(run, in_axes=(*[0] * 5, *[None] * 4)))

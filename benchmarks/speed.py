@@ -3,6 +3,7 @@
     python benchmarks/speed.py             # against the peer; what asking for P adds; compilation; import
     python benchmarks/speed.py --scaling   # cost per cell from 16,384 to 1,048,576 cells
     python benchmarks/speed.py --large     # 1024 x 1024 attractors with P: seconds and peak memory
+    python benchmarks/speed.py --ode       # method="ode" against restarts of diffrax's own event solver
 
 The plane: d 0.05..0.3, kappa 3..400 (log), r 0.5, start (0, 0.4), impacts per period over a window. Warm times are of
 whole calls of `vijax.sweep`, from axes to labelled dataset. Typical printout, two cores:
@@ -195,6 +196,50 @@ def large(quick: bool) -> Iterator[Row]:
     print(f"periodic {sum(shares.values()):.1%}  aperiodic {aperiodic:.1%}  undecided {undecided:.1%}")
 
 
+def ode(quick: bool) -> Iterator[Row]:
+    """Warm times of the ode engine and of a plain diffrax restart chain, and how wrong either is after some periods."""
+    from peers import diffrax_chain
+
+    side, periods, chained, repeats = (24, 10, 2, 1) if quick else (64, 100, ACCURACY_PERIODS, 3)
+    d, kappa = cells(side)
+    pair, rtol = vijax.impact_pair(d, kappa, R, 0.0), 1e-8
+    found: dict[str, Any] = {}
+
+    def ours() -> Any:
+        grid = dict(zip(("d", "kappa"), axes(side), strict=True))
+        plane = {"until": "window", "outputs": ("impacts_per_period",), "method": "ode", "rtol": rtol}
+        return vijax.sweep(**grid, r=R, u0=U0, v0=V0, periods=periods, **plane)
+
+    def theirs() -> dict[str, Any]:
+        found["chain"] = diffrax_chain(d, kappa, R, 0.0, U0, V0, chained, rtol)
+        return {}
+
+    contenders = (("ode", periods, ours), ("chain", chained, theirs))
+    rows = []
+    for repeat in range(repeats + 1):  # the first round compiles
+        for what, run, call in contenders:
+            yield (row := timed(what, side, run, repeat, call))
+            rows += [row] if repeat else []
+    for what, _, _ in contenders:
+        print(f"{what:6} {typical(rows, what).cell_period:7.1f} us per cell-period")
+    ratio = typical(rows, "chain").cell_period / typical(rows, "ode").cell_period
+    print(f"ode is {ratio:.1f} times faster")
+    exact = vijax.trajectory(pair, U0, V0, chained, max_impacts=64).states
+    near = vijax.trajectory(pair, U0, V0 * (1 + 1e-9), chained, max_impacts=64).states
+    run = vijax.trajectory(pair, U0, V0, chained, max_impacts=64, method="ode", rtol=rtol).states
+    found["ode"] = tuple(np.asarray(x)[:, -1] for x in (run.u, run.v))
+    true = [np.asarray(x)[:, -1] for x in (exact.u, exact.v)]
+    # How far a change of 1e-9 at the start goes tells what a cell's sensitivity explains.
+    growth = np.hypot(*(np.asarray(x)[:, -1] - y for x, y in zip((near.u, near.v), true, strict=True))) / (1e-9 * V0)
+    for what, (u, v) in found.items():
+        error = np.hypot(u - true[0], v - true[1])
+        beyond = error > 1e3 * rtol * np.maximum(growth, 1)
+        print(
+            f"{what:6} after {chained} periods: median error {np.median(error):.1e}, largest {np.max(error):.1e}; "
+            f"beyond 1e-3 {np.mean(error > 1e-3):.2%}, beyond what sensitivity explains {np.mean(beyond):.2%}"
+        )
+
+
 def main() -> None:
     """Measure what the command line asks for, print it, and save the raw rows."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -203,6 +248,7 @@ def main() -> None:
     which.add_argument(
         "--large", action="store_const", const=large, dest="measure", help="time and memory of 1024 x 1024"
     )
+    which.add_argument("--ode", action="store_const", const=ode, dest="measure", help="the ode engine and its peer")
     parser.add_argument("--quick", action="store_true", help="small sizes, seconds in all: does it run?")
     parser.add_argument("--rows", type=Path, default=HERE / "rows", help="folder for the raw rows")
     parser.set_defaults(measure=against_peer)

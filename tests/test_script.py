@@ -185,7 +185,8 @@ def test_methods_and_membranes_arrive(planned):
     assert planned().method is None
 
 
-def test_from_arguments_to_store_and_picture(folder):
+def test_from_arguments_to_store_and_picture(folder, monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that the script keeps its programs where it does by itself
     process = started([*TINY, "--out", "map.zarr", "--plot", "map.png"], folder)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
