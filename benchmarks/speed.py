@@ -9,10 +9,10 @@ The plane: d 0.05..0.3, kappa 3..400 (log), r 0.5, start (0, 0.4), impacts per p
 whole calls of `vijax.sweep`, from axes to labelled dataset. Typical printout, two cores:
 
     2 cores, cpu, JAX 0.10.2
-    vijax          0.2410 us per cell-period   101.4 ns per impact   0.395 s warm    7.4 s to compile
-    vijax with P   0.3444 us per cell-period   144.9 ns per impact   0.564 s warm    7.3 s to compile
-    peer           0.5901 us per cell-period   248.8 ns per impact   0.967 s warm    2.7 s to compile
-    vijax is 2.6 times faster (2.4 to 2.7)
+    vijax          0.1271 us per cell-period    53.5 ns per impact   0.208 s warm    9.1 s to compile
+    vijax with P   0.1554 us per cell-period    65.4 ns per impact   0.255 s warm   11.9 s to compile
+    peer           0.5840 us per cell-period   246.2 ns per impact   0.957 s warm    3.1 s to compile
+    vijax is 4.6 times faster (4.2 to 4.8)
 """
 
 import argparse
