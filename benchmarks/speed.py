@@ -206,9 +206,19 @@ def ode(quick: bool) -> Iterator[Row]:
     found: dict[str, Any] = {}
 
     def ours() -> Any:
-        grid = dict(zip(("d", "kappa"), axes(side), strict=True))
-        plane = {"until": "window", "outputs": ("impacts_per_period",), "method": "ode", "rtol": rtol}
-        return vijax.sweep(**grid, r=R, u0=U0, v0=V0, periods=periods, **plane)
+        d_axis, kappa_axis = axes(side)
+        return vijax.sweep(
+            d=d_axis,
+            kappa=kappa_axis,
+            r=R,
+            u0=U0,
+            v0=V0,
+            until="window",
+            periods=periods,
+            outputs=("impacts_per_period",),
+            method="ode",
+            rtol=rtol,
+        )
 
     def theirs() -> dict[str, Any]:
         found["chain"] = diffrax_chain(d, kappa, R, 0.0, U0, V0, chained, rtol)
@@ -226,8 +236,8 @@ def ode(quick: bool) -> Iterator[Row]:
     print(f"ode is {ratio:.1f} times faster")
     exact = vijax.trajectory(pair, U0, V0, chained, max_impacts=64).states
     near = vijax.trajectory(pair, U0, V0 * (1 + 1e-9), chained, max_impacts=64).states
-    run = vijax.trajectory(pair, U0, V0, chained, max_impacts=64, method="ode", rtol=rtol).states
-    found["ode"] = tuple(np.asarray(x)[:, -1] for x in (run.u, run.v))
+    stepped = vijax.trajectory(pair, U0, V0, chained, max_impacts=64, method="ode", rtol=rtol).states
+    found["ode"] = tuple(np.asarray(x)[:, -1] for x in (stepped.u, stepped.v))
     true = [np.asarray(x)[:, -1] for x in (exact.u, exact.v)]
     # How far a change of 1e-9 at the start goes tells what a cell's sensitivity explains.
     growth = np.hypot(*(np.asarray(x)[:, -1] - y for x, y in zip((near.u, near.v), true, strict=True))) / (1e-9 * V0)
