@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from speed import HERE, U0, V0, R, axes
+from speed import HERE, U0, V0, R, Row, axes
 
 import vijax
 
@@ -48,21 +48,6 @@ class Contender(NamedTuple):
 
     call: Callable[[], Any]
     against: str | None
-
-
-class Row(NamedTuple):
-    """One timed call, as it goes to the CSV file."""
-
-    what: str
-    cells: int
-    periods: int
-    repeat: int
-    seconds: float
-
-    @property
-    def cell_period(self) -> float:
-        """Microseconds per cell-period."""
-        return 1e6 * self.seconds / (self.cells * self.periods)
 
 
 def contenders(side: int, periods: int) -> dict[str, Contender]:
@@ -93,9 +78,10 @@ def timed(what: str, call: Callable[[], Any], side: int, periods: int, repeat: i
     start = time.perf_counter()
     found = call()
     seconds = time.perf_counter() - start
-    if lost := int(found["impacts_per_period"].isnull().sum()):
+    counted = found["impacts_per_period"]
+    if lost := int(counted.isnull().sum()):
         raise SystemExit(f"{what}: {lost} cells without a number")
-    return Row(what, side * side, periods, repeat, seconds)
+    return Row(what, side * side, periods, repeat, seconds, float(counted.sum()) * periods)
 
 
 def measure(side: int, periods: int, repeats: int) -> Iterator[Row]:

@@ -197,6 +197,21 @@ def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
     return worst
 
 
+def both_ways(hit, out) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """What a fast step found of an impact, and what the careful step did, by name."""
+    impact = out.impact
+    return {
+        "flight": (hit.flight, out.flight),
+        "duration": (hit.duration, out.stay),
+        "v_in": (hit.v_in, impact.v_in),
+        "v_out": (hit.v_out, impact.v_out),
+        "depth": (hit.depth, impact.depth),
+        "work": (hit.work, impact.work),
+        "u": (hit.after.u, out.state.u),
+        "v": (hit.after.v, out.state.v),
+    }
+
+
 class Extrema(NamedTuple):
     """Constructed turning points close to a wall: true height beyond it, time to it, and the run of the engine."""
 

@@ -108,7 +108,7 @@ def test_samples_are_of_fourth_order_away_from_the_walls_and_know_no_other_time(
 COARSE = Ode("Tsit5", 1e-3, 1e-5, Linear())  # steps that see several events
 
 
-def agree(cases, method, tolerance, t0=0.0, count=6):
+def assert_agreement(cases, method, tolerance, t0=0.0, count=6):
     """The first impacts of the exact engine, on the same walls."""
     exact, ran = follow(cases, None, t0), follow(cases, method, t0)
     for lane, case in enumerate(cases):
@@ -120,7 +120,7 @@ def agree(cases, method, tolerance, t0=0.0, count=6):
 
 def test_of_two_walls_in_one_step_the_first_is_met():
     # The gap is crossed in a fraction of the longest step.
-    agree(
+    assert_agreement(
         [(0.01, 30.0, 0.5, 0.0, 0.004, -0.6), (0.02, 300.0, 0.9, 0.0, 0.0, 0.9), (0.005, 9.0, 0.7, 0.1, 0.0, 0.5)],
         COARSE,
         2e-2,
@@ -157,14 +157,14 @@ def test_a_velocity_that_turns_twice_in_one_step_is_seen():
 
 
 def test_slow_bounces_shorter_than_a_step_do_not_stop_time():
-    agree([(0.2, 40.0, 0.5, 0.0, 0.1, -v) for v in (1e-3, 1e-6, 1e-9)], FINE, 1e-8, t0=1.3, count=4)
+    assert_agreement([(0.2, 40.0, 0.5, 0.0, 0.1, -v) for v in (1e-3, 1e-6, 1e-9)], FINE, 1e-8, t0=1.3, count=4)
     # Pressed against a wall and thrown at it slowly.
-    agree([(0.2, 40.0, 0.5, 0.0, 0.1 - 1e-9, v) for v in (1e-3, 1e-6, 1e-9)], FINE, 1e-8, t0=0.1, count=4)
+    assert_agreement([(0.2, 40.0, 0.5, 0.0, 0.1 - 1e-9, v) for v in (1e-3, 1e-6, 1e-9)], FINE, 1e-8, t0=0.1, count=4)
 
 
 def test_a_start_inside_a_wall_is_a_contact_without_onset():
     cases = [(0.2, 8.0, 0.5, 0.0, 0.15, 0.1), (0.2, 8.0, 0.5, 0.0, -0.15, 0.1), (0.2, 8.0, 0.5, 0.0, 0.1, 0.2)]
-    agree(cases, FINE, 1e-9)
+    assert_agreement(cases, FINE, 1e-9)
 
 
 def test_contacts_and_flights_without_end_are_said():
