@@ -490,3 +490,15 @@ def test_rigid_walls_in_single_precision():
     # Eq. (35): the depth goes as 1/kappa, and a small one's energy as its square.
     np.testing.assert_allclose(found["max_penetration"].sel(kappa=200.0), 2 * found["max_penetration"].sel(kappa=400.0))
     np.testing.assert_allclose(found["restitution"], 0.5, rtol=1e-5)
+
+
+def test_a_flight_that_drifts_beyond_the_last_period_is_not_silence():
+    # Each of these was called silent, with P = 0, for a flight that only ends long after the last period.
+    found = [
+        sweep(d=d, kappa=kappa, periods=1000, outputs=["P", "impacts_per_period"])
+        for d, kappa in ((0.22258064516129034, 3.07741935483871), (0.22580645161290322, 3.1548387096774193))
+    ]
+    for cell in found:
+        assert int(cell.status) != Status.NO_IMPACT
+        assert float(cell.P) > 0
+        assert float(cell.impacts_per_period) > 0
