@@ -1,6 +1,8 @@
 """Periodic orbits, stable and unstable: from states or impact sequences, by Newton, each verified by the impact map."""
 
+import itertools
 import os
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -20,6 +22,7 @@ from vijax.shooting import Sequence
 from vijax.trajectory import trajectory
 
 _SAME = 1e-6  # how closely the impact map must meet the next impact of a real orbit
+_FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
 _TILE = 4096  # orbits of one compiled call
 
 
@@ -49,6 +52,13 @@ class Orbit(eqx.Module):
     def count(self) -> Int[Array, "orbit"]:
         """Impacts until it closes (half of all where it closes onto its mirror image)."""
         return self.sequence.real.sum(axis=-1)
+
+    def __getitem__(self, index: Any) -> "Orbit":
+        """Some of the orbits, by an index array, a mask or a slice."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __len__(self) -> int:
+        return self.knots.shape[0]
 
 
 def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
@@ -82,6 +92,7 @@ def _solve(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impa
     flown = next_impacts(wide, passage.side.reshape(-1), passage.speed.reshape(-1), phase.reshape(-1), level=level)
     flown = jax.tree.map(lambda leaf: leaf.reshape(real.shape), flown)
     miss = jnp.abs(flown.t + 2 * periods - passage.next_t) + jnp.abs(flown.side * flown.v_in - passage.next_speed)
+    miss = miss + jnp.abs(flown.duration - passage.next_stay)
     met = flown.real & (flown.side == passage.next_side) & (miss < _SAME)
     verified = found & (met | ~real).all(axis=1)
     status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
@@ -128,3 +139,107 @@ def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -
     twins = jnp.stack([half + 1j * root, half - 1j * root], axis=1)
     values = jnp.where((spread >= 0)[:, None], pair, twins)
     return jnp.where(mirrored[:, None], values * values, values)
+
+
+def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1) -> Orbit:
+    """Periodic orbits near some states: each is flown once around to learn its impacts, then corrected by Newton.
+
+    Args:
+        pair: One cell, or one a state.
+        u, v, t: Displacements, velocities and phases in [0, 2).
+        period: Forcing periods of the orbits.
+
+    Returns:
+        One orbit a state, stable or not; NO_ORBIT where Newton found none, or the state meets no wall.
+
+    Raises:
+        ValueError: period below 1, or an inadmissible pair or state.
+    """
+    if period < 1:
+        raise ValueError(f"period must be at least 1; got {period}")
+    u, v, t = (jnp.atleast_1d(jnp.asarray(x, float)) for x in (u, v, t))
+    shape = jnp.broadcast_shapes(u.shape, v.shape, t.shape, *(jnp.shape(x) for x in jax.tree.leaves(pair)))
+    pair = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), pair)
+    u, v, t = (jnp.broadcast_to(x, shape) for x in (u, v, t))
+    # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
+    found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
+    onset = 2.0 * found.n + found.t
+    inside = np.asarray(onset < onset[:, :1] + 2 * period - _SAME)
+    width = 1 << max(int(inside.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
+    mask = jnp.asarray(inside[:, :width])
+    side = jnp.where(mask, found.side[:, :width], 0)
+    knots = jnp.stack([onset[:, :width], jnp.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
+    span = jnp.full(shape, 2.0 * period)
+    return solve(pair, Sequence(side, span, jnp.zeros(shape, bool)), knots)
+
+
+def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
+    """Every orbit found with a given impact sequence, stable or unstable, from random guesses.
+
+    Args:
+        pair: One cell.
+        impacts: Walls in order, such as "RLL" (R right, L left), or a label n:m or n:m/pT: n impacts on the left, m on
+            the right, in any order.
+        period: Forcing periods; 1, or the label's.
+        guesses: Random guesses a sequence.
+        seed: Of the guesses.
+
+    Returns:
+        The distinct orbits, each once.
+
+    Raises:
+        ValueError: Neither a sequence nor a label, or a period that does not agree with it.
+
+    Source: Eqs. (28)-(29) ask for one sequence from one guess.
+    """
+    sequences, period = _sequences(impacts, period)
+    draw = np.random.default_rng(seed)
+    found = [_search(pair, walls, period, guesses, draw) for walls in sequences]
+    return distinct(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found))
+
+
+def _sequences(impacts: str, period: int | None) -> tuple[list[tuple[int, ...]], int]:
+    """Cyclically distinct sequences of walls, and the period."""
+    walls = {"L": -1, "R": 1}
+    if impacts and set(impacts.upper()) <= set(walls):
+        return [tuple(walls[letter] for letter in impacts.upper())], 1 if period is None else period
+    match = re.fullmatch(r"(\d+):(\d+)(?:/(\d*)T)?", impacts)
+    if match is None or int(match[1]) + int(match[2]) == 0:
+        raise ValueError(f"impacts must be walls such as RLL or a label such as 1:2/2T; got {impacts!r}")
+    named = int(match[3] or 1)
+    if period not in (None, named):
+        raise ValueError(f"period must agree with the label {impacts}; got {period}")
+    left, right = int(match[1]), int(match[2])
+    places = itertools.combinations(range(left + right), left)
+    every = (tuple(-1 if i in lefts else 1 for i in range(left + right)) for lefts in places)
+    return sorted({min(walls[i:] + walls[:i] for i in range(len(walls))) for walls in every}), named
+
+
+def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int, draw: np.random.Generator) -> Orbit:
+    """Orbits of one sequence from random guesses: times in any proportion, speeds up to what the forcing can give."""
+    count = len(walls)
+    gaps = draw.dirichlet(np.ones(count), guesses) * 2 * period
+    t = draw.uniform(0, 2, (guesses, 1)) + np.cumsum(gaps, axis=1) - gaps[:, :1]
+    speed = draw.uniform(0, _FASTEST, (guesses, count))
+    free = np.zeros(()) if pair.kappa is None else np.pi / np.asarray(pair.omega1)
+    knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
+    wide = jax.tree.map(lambda x: jnp.broadcast_to(x, guesses), pair)
+    side = jnp.broadcast_to(jnp.asarray(walls, jnp.int32), (guesses, count))
+    span = jnp.full(guesses, 2.0 * period)
+    return solve(wide, Sequence(side, span, jnp.zeros(guesses, bool)), jnp.asarray(knots))
+
+
+def distinct(orbit: Orbit) -> Orbit:
+    """The orbits that are there, each once whichever impact it was begun with."""
+    good = np.flatnonzero(np.asarray(orbit.status) == Status.OK)
+    marks = np.round(np.asarray(_marks(orbit))[good] / _SAME)
+    _, first = np.unique(marks, axis=0, return_index=True)
+    return orbit[np.sort(good[first])]
+
+
+def _marks(orbit: Orbit) -> Float[Array, "orbit 4"]:
+    """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
+    t, speed, stay = jnp.moveaxis(orbit.knots, -1, 0)
+    signed = orbit.sequence.side * speed
+    parts = [signed * jnp.cos(jnp.pi * t), signed * jnp.sin(jnp.pi * t), signed + speed, stay * speed]
+    return jnp.stack([jnp.nansum(part, axis=-1) for part in parts], axis=-1)

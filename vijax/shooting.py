@@ -133,6 +133,7 @@ class Passage(NamedTuple):
     next_side: Float[Array, "impact"]
     next_t: Float[Array, "impact"]
     next_speed: Float[Array, "impact"]
+    next_stay: Float[Array, "impact"]
 
 
 def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
@@ -140,7 +141,8 @@ def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
     side, wall, joined = _joined(sequence, knots)
     t, speed, stay, next_t, next_speed = joined.T
     rate = jax.vmap(lambda side, knot: _contact(pair, side, knot)[1])(side, joined)
-    return Passage(side, -rate, t + stay, wall, next_t, next_speed)
+    next_stay = knots[_following(sequence)[0], 2]
+    return Passage(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
 
 
 def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, ""]:
