@@ -13,7 +13,8 @@ from vijax.model import ImpactPair
 from vijax.quick import Lanes, Wall
 
 _HORIZON = 64.0  # periods in which an impact must come
-_WIDTH = 512  # lanes; a tile is a whole number of them
+_TILES = (512, 8192)  # balls of one compiled call: two sizes, so that two programs serve every number
+_LANES = 256
 
 
 class Next(eqx.Module):
@@ -125,9 +126,13 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
     """
     kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
     rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, side.astype(pair.d.dtype), speed, t], axis=1)
-    count = rows.shape[0]
-    tile = 1 << max(count - 1, 127).bit_length()
     plan = Plan("window", None, pair.kappa is None, level, True, False, False, 1)
-    rows = jnp.concatenate([rows, jnp.broadcast_to(rows[:1], (tile - count, rows.shape[1]))])
-    table = _compiled(plan, min(_WIDTH, tile))(rows, jnp.asarray(count, jnp.int32))[:count]
+    tile = _TILES[0] if rows.shape[0] <= _TILES[0] else _TILES[1]
+    parts = []
+    for start in range(0, rows.shape[0], tile):
+        part = rows[start : start + tile]
+        count = part.shape[0]
+        part = jnp.concatenate([part, jnp.broadcast_to(part[:1], (tile - count, part.shape[1]))])
+        parts.append(_compiled(plan, _LANES)(part, jnp.asarray(count, jnp.int32))[:count])
+    table = jnp.concatenate(parts)
     return Next(*table[:, :-1].T, table[:, -1] != 0)

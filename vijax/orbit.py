@@ -23,7 +23,7 @@ from vijax.trajectory import trajectory
 
 _SAME = 1e-6  # how closely the impact map must meet the next impact of a real orbit
 _FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
-_TILE = 4096  # orbits of one compiled call
+_TILES = (32, 256, 4096)  # orbits of one compiled call
 
 
 class Orbit(eqx.Module):
@@ -71,20 +71,61 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impac
     Returns:
         Orbits in the order of the guesses, each with its `status`.
     """
-    level = bool((np.asarray(pair.gamma) == 0).all())
-    parts = [jax.tree.map(lambda leaf, s=part: leaf[s], (pair, sequence, knots)) for part in _tiles(knots.shape[0])]
+    level = _level(pair)
+    return _by_tiles(lambda part: _solve(*part, level), (pair, sequence, knots))
+
+
+def _level(pair: ImpactPair) -> bool:
+    return bool((np.asarray(pair.gamma) == 0).all())
+
+
+def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
+    """The work on every row, in padded tiles of few sizes so that few programs are compiled, a thread a core."""
+    count = jax.tree.leaves(rows)[0].shape[0]
+    tile = next((size for size in _TILES if size >= count), _TILES[-1])
+
+    def part(start: int) -> Orbit:
+        index = np.minimum(np.arange(start, start + tile), count - 1)
+        return work(jax.tree.map(lambda leaf: leaf[index], rows))[: count - start]
+
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        solved = list(pool.map(lambda part: _solve(*part, level), parts))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *solved)
-
-
-def _tiles(count: int) -> list[slice]:
-    return [slice(start, start + _TILE) for start in range(0, count, _TILE)]
+        found = list(pool.map(part, range(0, count, tile)))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
 
 
 def _solve(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"], level: bool) -> Orbit:
-    """One tile: Newton, then one flight and contact from every impact, which must meet the next one."""
-    knots, residual, multipliers, passage = _shoot(pair, sequence, guess)
+    """One tile: Newton, then the proof."""
+    return _verify(pair, sequence, *_shoot(pair, sequence, guess), level)
+
+
+@jax.jit
+def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]):
+    knots, residual = shooting.newton(pair, sequence, guess)
+    return knots, residual, _once_around(pair, sequence, knots)
+
+
+def _once_around(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
+    """Multipliers, and the passages to verify."""
+    around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
+    return floquet(around, sequence.mirrored), jax.vmap(shooting.passages)(pair, sequence, knots)
+
+
+def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
+    """Orbits from knots that solve the equations already, as the points of a branch do, even where Newton is singular."""
+    level = _level(pair)
+    return _by_tiles(lambda part: _verify(*part, *_measured(*part), level), (pair, sequence, knots))
+
+
+@jax.jit
+def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
+    """Residuals, and what `_once_around` says."""
+    residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
+    return residual, _once_around(pair, sequence, knots)
+
+
+def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level: bool) -> Orbit:
+    """Fly from the end of every contact: the impact map must meet the next impact, and end its contact in time."""
+    multipliers, passage = around
     found = jnp.isfinite(residual)
     real = sequence.real
     wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], real.shape).reshape(-1), pair)
@@ -94,34 +135,25 @@ def _solve(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impa
     miss = jnp.abs(flown.t + 2 * periods - passage.next_t) + jnp.abs(flown.side * flown.v_in - passage.next_speed)
     miss = miss + jnp.abs(flown.duration - passage.next_stay)
     met = flown.real & (flown.side == passage.next_side) & (miss < _SAME)
-    verified = found & (met | ~real).all(axis=1)
-    status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
-    good = verified[:, None] & real
+    whole = found & (met | ~real).all(axis=1)
+    status = jnp.where(whole, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
+    good = whole[:, None] & real
     # What was flown to is the impact after each.
-    last = jnp.maximum(real.sum(axis=1) - 1, 0)
-    before = jnp.where(jnp.arange(real.shape[1]) == 0, last[:, None], jnp.arange(real.shape[1])[None] - 1)
+    place = jnp.arange(real.shape[1])
+    before = jnp.where(place == 0, real.sum(axis=1)[:, None] - 1, place - 1)
     depth, work = (jnp.take_along_axis(leaf, before, axis=1) for leaf in (flown.depth, flown.work))
-    blank = jnp.where(real[..., None], knots, jnp.nan)
+    # The first impact is put into the first period.
+    knots = knots.at[..., 0].add(-2 * jnp.floor(0.5 * knots[:, :1, 0]))
     return Orbit(
         pair=pair,
         sequence=sequence,
-        knots=blank,
+        knots=jnp.where(real[..., None], knots, jnp.nan),
         depth=jnp.where(good, depth, jnp.nan),
         work=jnp.where(good, work, jnp.nan),
         multipliers=jnp.where(found[:, None], multipliers, jnp.nan),
         residual=residual,
         status=status,
     )
-
-
-@jax.jit
-def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]):
-    """Newton; then multipliers, and the passages to verify."""
-    knots, residual = shooting.newton(pair, sequence, guess)
-    # The first impact within the first period.
-    knots = knots.at[..., 0].add(-2 * jnp.floor(0.5 * knots[:, :1, 0]))
-    around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
-    return knots, residual, floquet(around, sequence.mirrored), jax.vmap(shooting.passages)(pair, sequence, knots)
 
 
 def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
@@ -243,3 +275,61 @@ def _marks(orbit: Orbit) -> Float[Array, "orbit 4"]:
     signed = orbit.sequence.side * speed
     parts = [signed * jnp.cos(jnp.pi * t), signed * jnp.sin(jnp.pi * t), signed + speed, stay * speed]
     return jnp.stack([jnp.nansum(part, axis=-1) for part in parts], axis=-1)
+
+
+def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[Array, "orbit"]:
+    """Whether each orbit is its own mirror image, half a span later."""
+    count = orbit.count
+    index = jnp.arange(orbit.knots.shape[1])
+    half = jnp.where(index < (count // 2)[:, None], index + (count // 2)[:, None], index)
+    wait = jnp.array([0.5, 0.0, 0.0]) * orbit.sequence.span[:, None, None]
+    moved = jnp.take_along_axis(orbit.knots, half[..., None], axis=1) - orbit.knots - wait
+    opposite = jnp.take_along_axis(orbit.sequence.side, half, axis=1) == -orbit.sequence.side
+    first = index < (count // 2)[:, None]
+    same = (jnp.abs(moved).max(axis=2) < tolerance) & opposite
+    return orbit.sequence.mirrored | ((count % 2 == 0) & (orbit.pair.gamma == 0) & (same | ~first).all(axis=1))
+
+
+def halved(orbit: Orbit) -> Orbit:
+    """Symmetric orbits closed half way, onto their mirror image: half the impacts, and a pitchfork becomes a flip.
+
+    Raises:
+        ValueError: An orbit that is not symmetric.
+    """
+    if not bool(symmetric(orbit).all()):
+        raise ValueError(f"orbit must be symmetric to be closed half way; got {np.asarray(symmetric(orbit))}")
+    if bool(orbit.sequence.mirrored.all()):
+        return orbit
+    index = jnp.arange(orbit.knots.shape[1])
+    kept = index < (orbit.count // 2)[:, None]
+    width = orbit.knots.shape[1] // 2
+    side = jnp.where(kept, orbit.sequence.side, 0)[:, :width]
+    sequence = Sequence(side, 0.5 * orbit.sequence.span, jnp.ones_like(orbit.sequence.mirrored))
+    return solve(orbit.pair, sequence, jnp.where(kept[..., None], orbit.knots, 0.0)[:, :width])
+
+
+def doubled(orbit: Orbit) -> Orbit:
+    """Orbits run through twice, or in full where they were closed half way."""
+    return _unfolded(orbit, jnp.ones_like(orbit.sequence.mirrored))
+
+
+def unfolded(orbit: Orbit) -> Orbit:
+    """Orbits in full, those closed half way too."""
+    return _unfolded(orbit, orbit.sequence.mirrored) if bool(orbit.sequence.mirrored.any()) else orbit
+
+
+def _unfolded(orbit: Orbit, twice: Bool[Array, "orbit"]) -> Orbit:
+    """The second turn appended to the first where asked."""
+    count, width = orbit.count[:, None], orbit.knots.shape[1]
+    index = jnp.arange(2 * width)
+    again = index >= count
+    from_first = jnp.where(again, index - count, index)
+    there = (index < count) | (twice[:, None] & again & (index < 2 * count))
+    from_first = jnp.clip(from_first, 0, width - 1)
+    side = jnp.take_along_axis(orbit.sequence.side, from_first, axis=1)
+    side = jnp.where(again & orbit.sequence.mirrored[:, None], -side, side)
+    knots = jnp.take_along_axis(orbit.knots, from_first[..., None], axis=1)
+    knots = knots.at[..., 0].add(jnp.where(again, orbit.sequence.span[:, None], 0.0))
+    span = jnp.where(twice, 2 * orbit.sequence.span, orbit.sequence.span)
+    sequence = Sequence(jnp.where(there, side, 0), span, orbit.sequence.mirrored & ~twice)
+    return proven(orbit.pair, sequence, jnp.where(there[..., None], knots, 0.0))

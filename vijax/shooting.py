@@ -46,10 +46,10 @@ class Sequence(eqx.Module):
 
 
 class Linear(NamedTuple):
-    """The equations at a guess: what is missing, by how much it changes with the knots, and with a parameter."""
+    """The equations at a guess: what is missing, and how it changes with every knot (and a parameter, last)."""
 
     gap: Float[Array, "3*impact"]
-    slope: Float[Array, "3*impact 3*impact"]
+    slope: Float[Array, "3*impact unknown"]
 
 
 def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]):
@@ -103,12 +103,19 @@ def gap(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "3*i
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
 
-def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Linear:
-    """The equations and their derivatives in the knots, block by block: each involves two neighbours only."""
+def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactPair | None = None) -> Linear:
+    """The equations and their derivatives in the knots, block by block: each involves two neighbours only.
+
+    Args:
+        moved: Change of the pair along a parameter, whose derivative becomes the last column.
+    """
     side, wall, joined = _joined(sequence, knots)
+    if moved is not None:
+        joined = jnp.concatenate([joined, jnp.zeros_like(joined[:, :1])], axis=1)
 
     def both(knot, side, wall):
-        value = _pieces(pair, side, wall, knot)
+        there = pair if moved is None else jax.tree.map(lambda x, dx: x + knot[5] * dx, pair, moved)
+        value = _pieces(there, side, wall, knot[:5])
         return value, value
 
     blocks, pieces = jax.vmap(jax.jacfwd(both, has_aux=True))(joined, side, wall)
@@ -117,11 +124,14 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Linear:
     there = jax.nn.one_hot(_following(sequence)[0], width, dtype=knots.dtype)
     # Entry (impact, equation, impact, knot).
     full = here[:, None, :, None] * blocks[:, :, None, :3]
-    full = full.at[..., :2].add(there[:, None, :, None] * blocks[:, :, None, 3:])
+    full = full.at[..., :2].add(there[:, None, :, None] * blocks[:, :, None, 3:5])
     idle = here[:, None, :, None] * jnp.eye(3, dtype=knots.dtype)[None, :, None, :]
     full = jnp.where(real[:, None, None, None], full, idle)
-    missing = jnp.where(real[:, None], pieces, 0.0)
-    return Linear(missing.reshape(-1), full.reshape(3 * width, 3 * width))
+    slope, missing = full.reshape(3 * width, 3 * width), jnp.where(real[:, None], pieces, 0.0).reshape(-1)
+    if moved is not None:
+        change = jnp.where(real[:, None], blocks[..., 5], 0.0)
+        slope = jnp.concatenate([slope, change.reshape(-1, 1)], axis=1)
+    return Linear(missing, slope)
 
 
 class Passage(NamedTuple):
