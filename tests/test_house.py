@@ -45,14 +45,15 @@ ROOMS: dict[str, set[str]] = {
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
     "compare": {"model", "dataset", "grid"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
-    "chart": {"store"},
-    "plot": {"model", "axes", "dataset", "store", "grid", "compare"},
+    "style": set(),
+    "chart": {"store", "style"},
+    "plot": {"model", "axes", "dataset", "store", "grid", "compare", "style"},
 }
 ROOMS["__init__"] = set(ROOMS)
 
 ONLY_IN = {
     "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
-    "matplotlib": {"vijax/plot.py"},
+    "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py"},
 }
 NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]
 IMPORT_SECONDS = 1.5
