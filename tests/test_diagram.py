@@ -129,6 +129,20 @@ def test_an_orbit_is_taken_to_the_end_of_its_periods(periods):
     assert abs(ds.u_strobe[0, 0] - ds.u_strobe[0, 1]) > 1e-3
 
 
+@pytest.mark.parametrize("wall", ["soft", "rigid"])
+def test_the_last_state_recorded_is_handed_on(wall):
+    """Of orbits of periods 1 to 8 and of chaos; the record is flown from elsewhere on them."""
+    settings = {"direction": "down", "periods": 101, "keep": 3, "wall": wall, "dtype": "float64"}
+    asked = diagram.plan("d", [0.3, 0.19, 0.18, 0.175, 0.16, 0.12], {"kappa": 400.0}, None, **settings)
+    ds = diagram.run(asked)
+    assert {1, 2} < set(ds.period.values.tolist())
+    end = diagram._follow(asked.planned, diagram._table(asked), 8, 101, 3).handover
+    aloft = end.t[0] == 0
+    assert aloft.sum() >= 5
+    np.testing.assert_allclose(end.u[0, aloft], ds.u_strobe.values[aloft, -1], atol=1e-9)
+    np.testing.assert_allclose(end.v[0, aloft], ds.v_strobe.values[aloft, -1], atol=1e-9)
+
+
 # --- the dataset ----------------------------------------------------------------------------------
 
 
