@@ -8,6 +8,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 from vijax.compare import compare
+from vijax.diagram import orbit_diagram
 from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
 from vijax.membrane import HuntCrossley
@@ -26,6 +27,7 @@ __all__ = [
     "harvested_energy",
     "impact_pair",
     "load",
+    "orbit_diagram",
     "save",
     "summarise",
     "sweep",
