@@ -39,10 +39,12 @@ ROOMS: dict[str, set[str]] = {
     "trajectory": {"model", "flow", "exact", "ode", "rk4", "membrane", "method"},
     "axes": {"model"},
     "dataset": {"model", "method", "axes", "simulate"},
+    "label": {"model"},
     "store": set(),
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
-    "compare": {"model", "dataset", "grid"},
-    "plot": {"model", "axes", "dataset", "store", "grid", "compare"},
+    "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
+    "compare": {"model", "dataset", "label", "grid"},
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "attractor", "compare"},
 }
 ROOMS["__init__"] = set(ROOMS)
 
