@@ -44,7 +44,7 @@ ROOMS: dict[str, set[str]] = {
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
     "compare": {"model", "dataset", "label", "grid"},
-    "plot": {"model", "axes", "dataset", "label", "store", "grid", "attractor", "compare"},
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare"},
 }
 ROOMS["__init__"] = set(ROOMS)
 

@@ -42,7 +42,7 @@ _TEXTS = {
     "fraction": "part of all starts",
 }
 # What stands past the last attractor of a cell, by kind of value and for those that are counts.
-_BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "U": ""}
+_BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "O": ""}
 _NONE = {"starts": 0, "fraction": 0.0}
 # Its growth from the identity is no stretching along the motion: the difference to a longer window is.
 _WARM_UP = 100
@@ -339,7 +339,7 @@ def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
 
 
 def _flat(variable: "xr.Variable", dims: tuple[str, ...], over: tuple[str, ...]) -> np.ndarray:
-    """Values of every start, cell by cell, on the last axis; dimensions that the motion does not depend on before it."""
+    """Values of every start, cell by cell, on the last axis; dimensions that leave the motion alone before it."""
     further = [dim for dim in variable.dims if dim not in (*dims, *over)]
     values = variable.transpose(*further, *dims, *over).values
     return values.reshape(*values.shape[: len(further)], -1)
@@ -356,7 +356,8 @@ def _entries(
         for name in _MEASURES
     }
     return {
-        "label": label(first["period"], left, right, first["status"]),
+        # Objects, as zarr has no lasting format for strings of fixed length.
+        "label": label(first["period"], left, right, first["status"]).astype(object),
         **first,
         "impacts_left": left,
         "impacts_right": right,
@@ -379,7 +380,7 @@ def _described(text: str) -> dict[str, Any]:
     return {"units": "1", "long_name": text}
 
 
-# --- chaos, and what only looks like it ---------------------------------------------------------------------------------
+# --- chaos, and what only looks like it -------------------------------------------------------------------------------
 
 
 def lyapunov(
