@@ -267,3 +267,9 @@ def test_chaos_that_ends_at_random_has_its_mean_lifetime(monkeypatch):
     np.testing.assert_array_equal(found.lifetime_stderr[1:], [np.inf, np.nan])
     np.testing.assert_allclose(found.survival[0], 0.75 * np.exp(-found.after / mean), atol=0.03)
     assert np.all(found.survival[1] == 1)
+
+
+def test_an_attractor_survives():
+    found = survival(d=0.12, kappa=400.0, r=0.5, wall="rigid", starts=20, periods=80)
+    assert np.all(found.survival == 1)
+    assert np.isinf(found.lifetime)

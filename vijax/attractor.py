@@ -491,7 +491,7 @@ def survival(
     alive = []
     for done, instant in enumerate(after):
         settings = planned.settings | {"until": "window", "transient": int(instant)}
-        watched = replace(planned, settings=settings, outputs=("impacts_per_period", "lyapunov"))
+        watched = replace(planned, settings=settings, outputs=("impacts_per_period", "lyapunov", "status"))
         found = grid.run(watched, _share_of(progress, done, _INSTANTS))
         alive.append((found["lyapunov"] * _WATCHED > _GROWN) & (found["impacts_per_period"] > _RARE))
     chaotic = xr.concat(alive, xr.Variable("after", after, _described("forcing periods")))

@@ -483,7 +483,7 @@ def _shade(figure: Figure, dataset: "xr.Dataset", panels: "list[tuple[Axes, xr.D
 def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]]:
     """Every word's place among the categories, and these: the commonest labels, the others, and what is no orbit."""
     kinds, which, counts = np.unique(words, return_inverse=True, return_counts=True)
-    orbits = [place for place in np.argsort(-counts) if kinds[place] not in _NO_ORBIT]
+    orbits = [place for place in np.argsort(-counts, kind="stable") if kinds[place] not in _NO_ORBIT]
     ranked = [[place] for place in orbits[:_MOST_NAMED]] + [orbits[_MOST_NAMED:]]
     colours = [*_COLOURS[: len(ranked) - 1], _OTHERS]
     texts = [str(kinds[place[0]]) for place in ranked[:-1]] + [f"{len(ranked[-1])} other labels"]
