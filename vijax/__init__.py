@@ -7,6 +7,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from vijax.attractor import basin_fractions, basins, lyapunov, survival
 from vijax.compare import compare
 from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
@@ -22,12 +23,16 @@ __all__ = [
     "ImpactPair",
     "State",
     "Status",
+    "basin_fractions",
+    "basins",
     "compare",
     "harvested_energy",
     "impact_pair",
     "load",
+    "lyapunov",
     "save",
     "summarise",
+    "survival",
     "sweep",
     "trajectory",
 ]
