@@ -102,11 +102,9 @@ def _run(diagram: "Diagram") -> "xr.Dataset":
 
 def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
     """What the diagram holds, in a few lines: points by how they ended and by label, the time."""
-    periods, left, right = (dataset[name].values.ravel() for name in ("period", "impacts_left", "impacts_right"))
-    named = {0: "aperiodic", -1: "undecided"}
-    labels = Counter(
-        named.get(p, f"{n}:{m}" + (f"/{p}T" if p > 1 else "")) for p, n, m in zip(periods, left, right, strict=True)
-    )
+    from vijax.label import label
+
+    labels = Counter(label(*(dataset[name] for name in ("period", "impacts_left", "impacts_right", "status"))).ravel())
     common = labels.most_common(_COMMON)
     rest = count - sum(number for _, number in common)
     return "\n".join(

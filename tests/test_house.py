@@ -41,13 +41,15 @@ ROOMS: dict[str, set[str]] = {
     "record": {"model", "exact", "lanes", "trajectory"},
     "axes": {"model"},
     "dataset": {"model", "method", "axes", "simulate"},
+    "label": {"model"},
     "store": set(),
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
-    "compare": {"model", "dataset", "grid"},
+    "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
+    "compare": {"model", "dataset", "label", "grid"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
     "style": set(),
     "chart": {"store", "style"},
-    "plot": {"model", "axes", "dataset", "store", "grid", "compare", "style"},
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style"},
 }
 ROOMS["__init__"] = set(ROOMS)
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
 from vijax.store import replacing
-from vijax.style import STYLE, check_format, label, symbol, title, units
+from vijax.style import STYLE, axis_label, check_format, symbol, title, units
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -118,7 +118,7 @@ def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantit
         if quantity in _LOGARITHMIC:
             most = float(dataset[quantity].max())
             panels[0].set(yscale="log", ylim=(most / 10**_DECADES, 2 * most) if most > 0 else None)
-        panels[-1].set_xlabel(label(dataset[along]))
+        panels[-1].set_xlabel(axis_label(dataset[along]))
         figure.suptitle(title(dataset, _FURTHER), fontsize="medium")
         _explain(figure, dataset, others, ways)
         if path is not None:

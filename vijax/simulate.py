@@ -160,6 +160,7 @@ def summarise(
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=bool(outputs & DEEP),
         energies=bool(outputs & ENERGY),
+        asymmetry="asymmetry" in outputs,
         tangent=until == "attractor" or "lyapunov" in outputs,
         variants=scale.length_variant.shape[0],
     )
@@ -255,6 +256,7 @@ def follow(
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=True,
         energies=True,
+        asymmetry=False,
         tangent=True,
         variants=1,
         chained=True,

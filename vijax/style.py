@@ -33,7 +33,7 @@ def title(dataset: "xr.Dataset", further: tuple[str, ...] = ()) -> str:
     return ", ".join([*wall, equations(dataset, names)])
 
 
-def label(coordinate: "xr.DataArray") -> str:
+def axis_label(coordinate: "xr.DataArray") -> str:
     """Symbol and units of a coordinate: omega [rad/s]."""
     written = units(coordinate)
     return symbol(coordinate) + (f" [{written}]" if written else "")
