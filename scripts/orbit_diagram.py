@@ -104,7 +104,9 @@ def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
     """What the diagram holds, in a few lines: points by how they ended and by label, the time."""
     from vijax.label import label
 
-    labels = Counter(label(*(dataset[name] for name in ("period", "impacts_left", "impacts_right", "status"))).ravel())
+    labels = Counter(
+        label(*(dataset[name].values for name in ("period", "impacts_left", "impacts_right", "status"))).ravel()
+    )
     common = labels.most_common(_COMMON)
     rest = count - sum(number for _, number in common)
     return "\n".join(
