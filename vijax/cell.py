@@ -35,8 +35,10 @@ class Plan(eqx.Module):
     level: bool = eqx.field(static=True)  # gamma = 0 everywhere
     deep: bool = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
+    asymmetry: bool = eqx.field(static=True)
     tangent: bool = eqx.field(static=True)
     variants: int = eqx.field(static=True)
+    chained: bool = eqx.field(static=True, default=False)  # a cell starts in the last one's state (`relay`)
 
 
 class Settings(eqx.Module):
@@ -48,6 +50,7 @@ class Settings(eqx.Module):
     method: Method | None
     length_variant: Float[Array, "variant"]
     speed_variant: Float[Array, "variant"]
+    keep: Float[Array, ""] | None = None  # chained: periods at the end whose impacts are wanted
 
 
 class Tally(eqx.Module):
@@ -59,6 +62,7 @@ class Tally(eqx.Module):
     rebound_right: Lane
     contact: Lane
     fastest: Lane
+    momentum: Lane | None  # sum of v_in, signed
     deepest: Lane | None
     energy: Float[Array, "lane variant"] | None  # of the running batch
     energy_past: Float[Array, "lane variant"] | None  # of the full batches
@@ -97,6 +101,17 @@ class Course(eqx.Module):
     passage: Passage
 
 
+class Relay(eqx.Module):
+    """What a chained cell needs to be handed on, and to go on as if no round had been tried."""
+
+    start: Lanes
+    mark: Lanes  # the last exit before the kept periods
+    held: Lane  # mode at the mark
+    origin: Lanes  # where the search stood when the first round began
+    last: Lanes  # exit of the latest impact before the end, if the round were repeated until then
+    latest: Lane  # the onset of that impact, in periods
+
+
 class Cell(eqx.Module):
     """A lane's cell: parameters, where the ball is, and what has been seen."""
 
@@ -120,6 +135,7 @@ class Cell(eqx.Module):
     tangent: tuple[Lane, Lane, Lane, Lane] | None
     exponent: Lane | None
     multiplier: Lane | None
+    relay: Relay | None = None
 
 
 class Event(eqx.Module):
@@ -138,7 +154,8 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
     wide = jnp.zeros((*like.shape, plan.variants), like.dtype) if plan.energies else None
     stuck = jnp.zeros(like.shape, bool) if plan.rigid else None
     deepest = zero if plan.deep else None
-    return Tally(zero, zero, zero, zero, zero, zero, deepest, wide, wide, wide, wide, stuck)
+    momentum = zero if plan.asymmetry else None
+    return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, wide, wide, wide, wide, stuck)
 
 
 def last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:

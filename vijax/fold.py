@@ -9,6 +9,7 @@ from vijax.flow import share
 from vijax.model import Status
 from vijax.quick import Hit
 from vijax.recurrence import recur
+from vijax.relay import note
 
 _BUDGET = 512  # impacts per period before a cell is stopped
 
@@ -40,7 +41,18 @@ def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     candidate, found = recur(settings, cell, hit, kept, count)
     stop = over | ended | spent | broken | found
     return eqx.tree_at(
-        lambda c: (c.ball, c.running, c.status, c.count, c.batch, c.tally, c.candidate, c.tangent, c.exponent),
+        lambda c: (
+            c.ball,
+            c.running,
+            c.status,
+            c.count,
+            c.batch,
+            c.tally,
+            c.candidate,
+            c.tangent,
+            c.exponent,
+            c.relay,
+        ),
         cell,
         (
             choose(kept, hit.after, cell.ball),
@@ -52,6 +64,7 @@ def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
             candidate,
             tangent,
             exponent,
+            note(settings, cell, hit, kept, end),
         ),
         is_leaf=lambda x: x is None,
     )
@@ -104,6 +117,7 @@ def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, traci
         rebound_right=old.rebound_right + jnp.where(right, rebound, 0.0),
         contact=old.contact + jnp.where(counted, hit.duration, 0.0),
         fastest=jnp.maximum(old.fastest, speed),
+        momentum=old.momentum + jnp.where(counted, hit.v_in, 0.0) if plan.asymmetry else None,
         deepest=jnp.where(counted, jnp.maximum(old.deepest, hit.depth), old.deepest) if plan.deep else None,
         energy=gain,
         energy_past=past,

@@ -1,9 +1,8 @@
-"""Pictures of maps, for print; the only room that loads matplotlib."""
+"""Pictures of maps, for print."""
 
 import itertools
 import math
-import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -11,7 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, QuadMesh
-from matplotlib.colors import LogNorm
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap, LogNorm, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -20,25 +19,17 @@ from matplotlib.ticker import EngFormatter
 
 from vijax.compare import Label, Model
 from vijax.dataset import best
+from vijax.label import label
 from vijax.store import replacing
+from vijax.style import STYLE, axis_label, check_format, equations, title
 
 if TYPE_CHECKING:
     import xarray as xr
 
 NEEDS = ("P", "period", "admissible")
+LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
 MOST_PANELS = 36
 
-_STYLE: Any = {
-    "font.family": "STIXGeneral",
-    "mathtext.fontset": "stix",
-    "font.size": 9,
-    "axes.linewidth": 0.6,
-    "hatch.linewidth": 0.4,
-    "savefig.dpi": 250,
-}
-_ENDINGS = (".png", ".pdf", ".svg", ".eps")
-# Worth a place in the title: neither the start, nor a quantity under a second name.
-_CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
 # A wider scale would say more about its faintest cells than about those worth building.
 _DECADES = 4
 # Values count as evenly spaced if their steps differ by less than this part of their range.
@@ -57,6 +48,18 @@ _OUTLINE: dict[str, Any] = _LINE | {"color": "red", "linewidth": 1.2}
 _SINGLE = {"markersize": 4.0}  # of a mark that is not one of thousands
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "red", "mec": "white", "linestyle": "none"}
 _BARE: dict[str, Any] = {"color": "0.75"}
+# Of kinds: so many by name, in these colours; strong ones first, their pale sisters after them, without the greys.
+_MOST_NAMED = 12
+_COLOURS = [mpl.colormaps["tab20"](n) for n in (*range(0, 20, 2), *range(1, 20, 2)) if n not in (14, 15)]
+_OTHERS = "#fff3c4"
+_NO_ORBIT = {
+    "no impact": "0.93",
+    "permanent contact": "white",
+    "aperiodic": "0.35",
+    "undecided": "magenta",
+    "failed": "red",
+}
+_GREYS = LinearSegmentedColormap.from_list("greys", ["0.8", "black"])
 _VEIL: dict[str, Any] = {"facecolor": (1, 1, 1, 0.55), "edgecolor": "0.3", "hatch": "/////", "linewidth": 0}
 
 
@@ -83,10 +86,12 @@ def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
     return math.ceil(count / columns), columns
 
 
-def check_format(path: str | Path) -> None:
-    """Raise ValueError unless the path ends as a picture does."""
-    if Path(path).suffix not in _ENDINGS:
-        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {str(path)!r}")
+def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
+    """`layout` for a map of labels or basins, which a curve cannot show."""
+    drawn = [dim for dim, size in sizes.items() if size > 1]
+    if len(drawn) == 1:
+        raise ValueError(f"plot must have two axes of more than one value; got {drawn[0]} alone")
+    return layout(sizes)
 
 
 class _Mark(NamedTuple):
@@ -126,6 +131,72 @@ def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     return _picture(dataset, _POWER, path)
 
 
+def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """The plane coloured by attractor, n:m/pT; aperiodic cells are shaded by their Lyapunov exponent.
+
+    The commonest labels have a colour and a name each, the others are one group. Without gravity mirror images count as
+    one, by the smaller count first. Aperiodic means: without a period within the periods that were run.
+
+    Args:
+        dataset: A map with `period`, `impacts_left`, `impacts_right` and `status`, and with `lyapunov` for shades;
+            dimensions as in `power_map`, two at least.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    _need(dataset, LABEL_NEEDS)
+    period = dataset["period"]
+    level = (dataset["gamma"] == 0).broadcast_like(period).transpose(*period.dims)
+    words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
+    codes, categories = _named(words, int(dataset.attrs["periods"]))
+    drawn = dataset[["lyapunov"] if "lyapunov" in dataset else []].assign(
+        code=(period.dims, codes), aperiodic=period == 0
+    )
+    return _coded(drawn.assign_attrs(dataset.attrs), categories, path)
+
+
+def basin_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """The (u0, v0) plane coloured by the attractor on which each start ends, with a table of them beside it.
+
+    Args:
+        dataset: What `basins` returned for arrays u0 and v0; further axes make panels, each with a table of its own.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    _need(dataset, ("basin", "label", "fraction", "P"))
+    further = [dim for dim in dataset["P"].dims if dim not in (*dataset["basin"].dims, "attractor")]
+    dataset = dataset.isel(dict.fromkeys(further, 0))
+    drawn = dataset.assign(code=dataset["basin"].clip(max=_MOST_NAMED)).drop_vars("basin")
+    return _coded(drawn, None, path)
+
+
+def multistability_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """The plane of parameters coloured by the number of coexisting attractors.
+
+    Args:
+        dataset: What `basin_fractions` returned; dimensions as in `power_map`, two at least.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    _need(dataset, ("attractors",))
+    number = dataset["attractors"]
+    most = int(number.max())
+    shades = mpl.colormaps["viridis_r"](np.linspace(0, 1, most + 1))
+    shades[0] = to_rgba(_NO_ORBIT["undecided"])
+    texts = ["undecided", "1 attractor", *(f"{n} attractors" for n in range(2, most + 1))]
+    categories = [
+        _Category(tuple(shade), f"{_share((number == n).mean())} {text}")
+        for n, (shade, text) in enumerate(zip(shades, texts[: most + 1], strict=True))
+    ]
+    drawn = dataset[[]].assign(code=number).assign_attrs(dataset.attrs)
+    return _coded(drawn, categories, path)
+
+
 def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     """The relative difference in P between rigid and soft walls on a log colour scale.
 
@@ -142,86 +213,71 @@ def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Fig
     return _picture(dataset, _DIFFERENCE, path)
 
 
-def stability_map(found: Any, path: str | Path | None = None) -> Figure:
-    """Where an explicit method stays bounded over stiffness and steps per period, under the boundary of theory.
-
-    Args:
-        found: A record with `kappa` [K] and `steps` [S], both ascending, `stable` [S, K], and `least_steps` [K], the
-            boundary.
-        path: Where to write it, if anywhere; the ending chooses the format.
-
-    Raises:
-        ValueError: If the path does not end as a picture does.
-    """
-    if path is not None:
-        check_format(path)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(5.2, 3.8), layout="constrained")
-        axes = figure.subplots()
-        axes.set(xscale="log", yscale="log", xlabel=r"$\kappa$", ylabel="RK4 steps per period")
-        axes.pcolormesh(found.kappa, found.steps, found.stable, cmap="Blues_r", vmin=-1, vmax=1.5, rasterized=True)
-        axes.plot(found.kappa, found.least_steps, **_OUTLINE)
-        axes.set(xlim=found.kappa[[0, -1]], ylim=found.steps[[0, -1]])
-        shades = (Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4))
-        handles = [*shades, Line2D([], [], **_OUTLINE)]
-        texts = ["bounded", "blown up within 50 periods", "theory"]
-        figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
-        if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
-    return figure
+def _need(dataset: "xr.Dataset", names: tuple[str, ...]) -> None:
+    missing = [name for name in names if name not in dataset]
+    if missing:
+        raise ValueError(f"plot must have {', '.join(names)}; got a map without {', '.join(missing)}")
 
 
 def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
-    missing = [name for name in kind.needs if name not in dataset]
-    if missing:
-        raise ValueError(f"plot must have {', '.join(kind.needs)}; got a map without {', '.join(missing)}")
+    _need(dataset, kind.needs)
     if path is not None:
         check_format(path)
     whole = dataset[kind.coloured]
-    rows, columns = layout({str(dim): size for dim, size in whole.sizes.items()})
+    layout({str(dim): size for dim, size in whole.sizes.items()})
     names = [*kind.needs, *(name for name in kind.optional if name in dataset)]
     # A variable lacks the dimensions that it does not depend on; the picture wants them all.
     full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
     dataset = dataset.assign(full)[names].squeeze()
     dims = [str(dim) for dim in dataset[kind.coloured].dims]
-    with mpl.rc_context(_STYLE):
-        figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims, rows, columns)
+    with mpl.rc_context(STYLE):
+        figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
         if path is not None:
             with replacing(Path(path)) as part:
                 figure.savefig(part)
     return figure
 
 
-def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str], rows: int, columns: int) -> Figure:
+def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str]) -> Figure:
+    figure, panels = _panels(dataset, dims)
+    norm, peak = kind.colours(dataset), _peak(dataset)
+    for axes, panel in panels:
+        mesh = _panel(axes, panel, kind, dims[0], dims[1], norm)
+        if peak is not None and all(peak[dim] == panel[dim] for dim in dims[2:]):
+            axes.plot(peak[dims[0]], peak[dims[1]], **_STAR, clip_on=False, zorder=5)
+    figure.colorbar(mesh, ax=figure.axes, extend="both", label=kind.label)
+    _explain(figure, dataset, kind, peak)
+    return figure
+
+
+def _panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple[Axes, xr.Dataset]]]":
+    """A figure of empty panels with titles and labels, and what belongs into each, ascending and [y, x]."""
+    rows, columns = layout({dim: dataset.sizes[dim] for dim in dims})
     size = (5.2, 4.6) if rows * columns == 1 else (1.6 + 2.1 * columns, 1.6 + 1.9 * rows)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    norm, peak = kind.colours(dataset), _peak(dataset)
     # Panels by rows, cells by y: the dimensions backwards.
-    dataset = dataset.sortby(dims[:2]).transpose(*dims[::-1])
+    dataset = dataset.sortby(dims[:2]).transpose(*dims[::-1], ...)
     outer = dims[:1:-1]
+    panels = []
     for axes, index in itertools.zip_longest(grid.flat, np.ndindex(*(dataset.sizes[dim] for dim in outer))):
         if index is None:
             axes.set_visible(False)
             continue
         panel = dataset.isel(dict(zip(outer, index, strict=True)))
-        mesh = _panel(axes, panel, kind, dims[0], dims[1], norm)
-        axes.set_title(_values(panel, dims[2:]), fontsize="medium")
-        if peak is not None and all(peak[dim] == panel[dim] for dim in outer):
-            axes.plot(peak[dims[0]], peak[dims[1]], **_STAR, clip_on=False, zorder=5)
+        (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in dims[:2])
+        axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_BARE["color"])
+        axes.set_title(equations(panel, dims[2:]), fontsize="medium")
+        panels.append((axes, panel))
     for axes in grid[-1]:
-        axes.set_xlabel(_label(dataset[dims[0]]))
+        axes.set_xlabel(axis_label(dataset[dims[0]]))
     for axes in grid[:, 0]:
-        axes.set_ylabel(_label(dataset[dims[1]]))
-    figure.colorbar(mesh, ax=grid, extend="both", label=kind.label)
-    _explain(figure, dataset, kind, peak)
-    return figure
+        axes.set_ylabel(axis_label(dataset[dims[1]]))
+    return figure, panels
 
 
 def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: LogNorm) -> QuadMesh:
-    (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in (x, y))
-    axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_BARE["color"])
+    across, up = (_edges(panel[dim].values)[0] for dim in (x, y))
     # matplotlib takes infinities for missing.
     values = np.minimum(panel[kind.coloured].values, np.finfo(float).max)
     mesh = axes.pcolormesh(across, up, np.ma.masked_where(~(values > 0), values), norm=norm, rasterized=True)
@@ -237,7 +293,7 @@ def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
     figure = Figure(figsize=(5.2, 3.8), layout="constrained")
     axes, peak = figure.subplots(), _peak(dataset)
     across, xscale = _edges(places)
-    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=_label(dataset[x]), ylabel=kind.label)
+    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=axis_label(dataset[x]), ylabel=kind.label)
     drawn = (values > 0) & np.isfinite(values)
     axes.plot(places, np.where(drawn, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
     axes.margins(y=0.05)
@@ -327,11 +383,105 @@ _DIFFERENCE = _Kind(
 )
 
 
+class _Category(NamedTuple):
+    """One colour of a map of kinds, and what it means."""
+
+    colour: Any
+    text: str
+
+
+def _coded(dataset: "xr.Dataset", categories: list[_Category] | None, path: str | Path | None) -> Figure:
+    """A map of kinds, by their places `code` among the categories; those of every panel's own table if there are none.
+
+    Where it is `aperiodic`, the Lyapunov exponent shades it.
+    """
+    if path is not None:
+        check_format(path)
+    layout_of_kinds({str(dim): size for dim, size in dataset["code"].sizes.items()})
+    dataset = dataset.squeeze([dim for dim, size in dataset["code"].sizes.items() if size == 1])
+    dims = [str(dim) for dim in dataset["code"].dims]
+    with mpl.rc_context(STYLE):
+        figure, panels = _panels(dataset, dims)
+        figure.set_figwidth(figure.get_figwidth() + 1.5)
+        for axes, panel in panels:
+            kinds = _table_categories(panel) if categories is None else categories
+            across, up = (_edges(panel[dim].values)[0] for dim in dims[:2])
+            colours = ListedColormap([kind.colour for kind in kinds])
+            scale = BoundaryNorm(np.arange(len(kinds) + 1) - 0.5, len(kinds))
+            axes.pcolormesh(across, up, panel["code"].values, cmap=colours, norm=scale, rasterized=True)
+            if categories is None:
+                _list_categories(axes, kinds, loc="upper left", bbox_to_anchor=(1.0, 1.02))
+        if {"lyapunov", "aperiodic"} <= set(dataset) and dataset["aperiodic"].any():
+            _shade(figure, dataset, panels, dims)
+        if categories is not None:
+            _list_categories(figure, categories, loc="outside right upper")
+        figure.suptitle(title(dataset), fontsize="medium")
+        if path is not None:
+            with replacing(Path(path)) as part:
+                figure.savefig(part)
+    return figure
+
+
+def _shade(figure: Figure, dataset: "xr.Dataset", panels: "list[tuple[Axes, xr.Dataset]]", dims: list[str]) -> None:
+    """Aperiodic cells in greys, the darker the faster they forget their start."""
+    exponents = dataset["lyapunov"].where(dataset["aperiodic"])
+    scale = Normalize(0.0, float(exponents.max()))
+    for axes, panel in panels:
+        across, up = (_edges(panel[dim].values)[0] for dim in dims[:2])
+        shown = np.ma.masked_invalid(panel["lyapunov"].where(panel["aperiodic"]).values)
+        mesh = axes.pcolormesh(across, up, shown, cmap=_GREYS, norm=scale, rasterized=True)
+    figure.colorbar(mesh, ax=figure.axes, location="bottom", aspect=40, label="Lyapunov exponent per forcing period")
+
+
+def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]]:
+    """Every word's place among the categories, and these: the commonest labels, the others, and what is no orbit."""
+    kinds, which, counts = np.unique(words, return_inverse=True, return_counts=True)
+    orbits = [place for place in np.argsort(-counts, kind="stable") if kinds[place] not in _NO_ORBIT]
+    ranked = [[place] for place in orbits[:_MOST_NAMED]] + [orbits[_MOST_NAMED:]]
+    colours = [*_COLOURS[: len(ranked) - 1], _OTHERS]
+    texts = [str(kinds[place[0]]) for place in ranked[:-1]] + [f"{len(ranked[-1])} other labels"]
+    for word, colour in _NO_ORBIT.items():
+        ranked.append(list(np.flatnonzero(kinds == word)))
+        colours.append(colour)
+        texts.append(f"aperiodic within {periods} periods" if word == "aperiodic" else word)
+    shown = [n for n, places in enumerate(ranked) if places]
+    codes = np.empty(kinds.size, int)
+    for code, n in enumerate(shown):
+        codes[ranked[n]] = code
+    categories = [_Category(colours[n], f"{_share(counts[ranked[n]].sum() / words.size)} {texts[n]}") for n in shown]
+    return codes[which].reshape(words.shape), categories
+
+
+def _table_categories(panel: "xr.Dataset") -> list[_Category]:
+    """The attractors of one table, the commonest by name."""
+    found = panel.isel(attractor=panel["starts"].values > 0)
+    colours = iter(_COLOURS)
+    categories = []
+    for n in range(min(found.sizes["attractor"], _MOST_NAMED)):
+        entry = found.isel(attractor=n)
+        word = str(entry["label"].values)
+        colour = _NO_ORBIT[word] if word in _NO_ORBIT else next(colours)
+        if word == "aperiodic":
+            word += f" within {float(entry['periods_run']):g} periods"
+        power = f", $P$ = {EngFormatter('J', places=2)(float(entry['P']))}" if entry["P"] > 0 else ""
+        categories.append(_Category(colour, f"{_share(entry['fraction'])} {word}{power}"))
+    rest = found["fraction"].values[_MOST_NAMED:]
+    return [*categories, _Category(_OTHERS, f"{_share(rest.sum())} {rest.size} others")] if rest.size else categories
+
+
+def _list_categories(where: Figure | Axes, categories: list[_Category], **place: Any) -> None:
+    handles = [Patch(facecolor=kind.colour, edgecolor="0.3", linewidth=0.4) for kind in categories]
+    texts = [kind.text for kind in categories]
+    where.legend(handles, texts, frameon=False, handlelength=1.2, fontsize="small", **place)
+
+
+def _share(part: Any) -> str:
+    return f"{100 * float(part):.3g} %"
+
+
 def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataArray | None") -> None:
     """What the map holds constant above it, what its marks mean below; only the marks that it has."""
-    constants = [name for name in _CONSTANTS if name in dataset.coords and not dataset[name].ndim]
-    title = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
-    figure.suptitle(", ".join([*title, _values(dataset, constants)]), fontsize="medium")
+    figure.suptitle(title(dataset), fontsize="medium")
     shown = [(_handle(mark), mark.text) for mark in kind.marks(dataset) if mark.mask.any()]
     if peak is not None:
         amount = EngFormatter("J", places=2)(float(peak))
@@ -388,166 +538,3 @@ def _marks(mask: np.ndarray, x: np.ndarray, y: np.ndarray, *, most: bool) -> tup
     rows, columns = np.nonzero(2 * share > step**2 if most else share)
     centre = [np.minimum(start + step // 2, size - 1) for start, size in zip(starts, mask.shape, strict=True)]
     return x[centre[1][columns]], y[centre[0][rows]]
-
-
-def _label(coordinate: "xr.DataArray") -> str:
-    units = _units(coordinate)
-    return _symbol(coordinate) + (f" [{units}]" if units else "")
-
-
-def _symbol(coordinate: "xr.DataArray") -> str:
-    return f"${coordinate.attrs.get('symbol', coordinate.name)}$"
-
-
-def _values(dataset: "xr.Dataset", names: list[str]) -> str:
-    """The values of scalar coordinates: r = 0.5, omega = 3.14 rad/s."""
-    scalars = [dataset[name] for name in names]
-    return ", ".join(f"{_symbol(scalar)} = {float(scalar):.4g} {_units(scalar)}".strip() for scalar in scalars)
-
-
-def _units(coordinate: "xr.DataArray") -> str:
-    units = coordinate.attrs.get("units", "1")
-    return "" if units == "1" else re.sub(r"(-?\d+)", r"$^{\1}$", units)
-
-
-# --- work against precision -----------------------------------------------------------------------
-
-# The same colour for a method everywhere: vijax in strong colours and whole lines, its peers dashed.
-_METHODS: dict[str, tuple[str, str]] = {
-    "exact": ("#d62728", "-"),
-    "exact float32": ("#ff7f0e", "-"),
-    "ode Tsit5": ("#1f77b4", "-"),
-    "ode Dopri8": ("#17a2b8", "-"),
-    "ode Kvaerno5": ("#7b5fc7", "-"),
-    "rk4": ("#8c564b", "-"),
-    "numba RK4": ("#c49a6c", "--"),
-    "numba DP5 + events": ("#2ca02c", "--"),
-    "diffrax restarts": ("#6baed6", "--"),
-    "SciPy DOP853": ("0.35", "--"),
-    "SciPy Radau": ("0.6", "--"),
-}
-_MEASURES = {
-    "state": "error of the state",
-    "power": "bias of mean $P$ / standard error",
-    "gradient": "relative error of the gradient",
-}
-_HOW_TO_READ = (
-    "down and to the left is better; the grey stairs are the best there is at each cost\n"
-    "whole lines: vijax; dashed: its peers; crosses: no result"
-)
-_COLUMNS = 3
-_ROUNDING = 1e-16  # an error below is drawn there
-_NOISE = 2.0  # standard errors that mean nothing
-_LEAST = 1.0  # fewer are drawn as so many: there is no better and worse among them
-_LABEL_GAP = 0.052  # between labels, of the height of a panel
-
-
-def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
-    """Error against cost, a panel a scene: down and to the left is better, and the grey stairs are what can be had.
-
-    Args:
-        rows: Records with scene, measure ("state", "power", "gradient"), method, us (microseconds per cell-period),
-            error and noise (its standard error, of averages), in the order of panels and of settings. An infinite
-            error is drawn as a cross on the upper edge.
-        path: Picture to write.
-
-    Raises:
-        ValueError: A format that is none.
-    """
-    if path is not None:
-        check_format(path)
-    scenes: dict[str, list[Any]] = {}
-    for row in rows:
-        scenes.setdefault(row.scene, []).append(row)
-    columns = min(_COLUMNS, len(scenes))
-    lines = math.ceil(len(scenes) / columns)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.4 * columns, 3.0 * lines + 0.3), layout="constrained")
-        grid = figure.subplots(lines, columns, squeeze=False)
-        span = _decades([row.us for panel in scenes.values() for row in panel])
-        for axes, panel in itertools.zip_longest(grid.flat, scenes.items()):
-            if panel is None:
-                axes.set_visible(False)
-            else:
-                axes.set_xlim(span)
-                _work_panel(axes, *panel)
-        figure.suptitle(_HOW_TO_READ, fontsize="medium")
-        figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
-        if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
-    return figure
-
-
-def _decades(values: list[float]) -> tuple[float, float]:
-    """Limits of a logarithmic axis, with room for labels to the right."""
-    return min(values) / 2, max(values) * 20
-
-
-def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
-    measure = rows[0].measure
-    errors = [row.error / row.noise if row.noise else row.error for row in rows]
-    finite = [error for error in errors if math.isfinite(error)] or [1.0]
-    low, high = (_LEAST if measure == "power" else _ROUNDING), max(10.0, 10 * max(finite))
-    errors = [max(error, low) for error in errors]
-    axes.set(title=title, xscale="log", yscale="log", ylim=(low / 3, high), ylabel=_MEASURES[measure])
-    if measure == "power":
-        axes.axhspan(low / 3, _NOISE, color="0.94", zorder=0)
-        axes.text(0.98, 0.02, "noise", transform=axes.transAxes, ha="right", color="0.5", fontsize=7, in_layout=False)
-    axes.grid(color="0.9", linewidth=0.4)
-    axes.set_axisbelow(True)
-    points = [(row.us, error) for row, error in zip(rows, errors, strict=True) if math.isfinite(error)]
-    across, up = _stairs(points, axes.get_xlim()[1], high)
-    axes.plot(across, up, color="0.8", linewidth=4, solid_joinstyle="miter", zorder=1)
-    ends = []
-    for method in dict.fromkeys(row.method for row in rows):
-        colour, style = _METHODS[method]
-        chosen = [(row.us, error) for row, error in zip(rows, errors, strict=True) if row.method == method]
-        good = [(x, y) for x, y in chosen if math.isfinite(y)]
-        bad = [x for x, y in chosen if not math.isfinite(y)]
-        if good:
-            line: dict[str, Any] = {
-                "color": colour,
-                "linestyle": style,
-                "linewidth": 1.1,
-                "marker": "o",
-                "markersize": 2.5,
-            }
-            axes.plot(*zip(*good, strict=True), **line)
-            ends.append((*min(good, key=lambda point: point[1]), method, colour))
-        if bad:  # a line without points and clipping would count as one at the picture's corner
-            axes.plot(bad, [high] * len(bad), color=colour, marker="x", linestyle="none", clip_on=False)
-    _label_ends(axes, ends)
-
-
-def _stairs(points: list[tuple[float, float]], right: float, top: float) -> tuple[list[float], list[float]]:
-    """The least error that each cost buys."""
-    across, up, best_yet = [], [], top
-    for x, y in sorted(points):
-        if y < best_yet:
-            across += [x, x]
-            up += [best_yet, y]
-            best_yet = y
-    return [*across, right], [*up, best_yet]
-
-
-def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
-    """Name each line at its most accurate point; names that would collide give way downwards or upwards."""
-    (left, right), (low, high) = np.log(axes.get_xlim()), np.log(axes.get_ylim())
-    taken: list[tuple[float, float, float]] = []
-    for x, y, method, colour in sorted(ends, key=lambda end: end[1]):
-        place, height = (np.log(x) - left) / (right - left), (np.log(y) - low) / (high - low)
-        width = 0.02 * len(method)
-        begin = place + 0.015 if place + width < 1 else place - width - 0.015
-        height -= 0.03
-        while any(
-            abs(height - other) < _LABEL_GAP and begin < end and start < begin + width for start, end, other in taken
-        ):
-            height += 0.01
-        taken.append((begin, begin + width, height))
-        style: Any = {
-            "fontsize": 7,
-            "in_layout": False,
-            "path_effects": [Stroke(linewidth=2, foreground="white"), Normal()],
-        }
-        axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, **style)
