@@ -134,6 +134,7 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
         deep=True,
         energies=False,
         tangent=False,
+        asymmetry=False,
         variants=1,
     )
     tile = _TILES[0] if rows.shape[0] <= _TILES[0] else _TILES[1]
