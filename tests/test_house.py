@@ -31,12 +31,18 @@ ROOMS: dict[str, set[str]] = {
     "rk4": {"model", "flow", "membrane", "method"},
     "lanes": set(),
     "cell": {"model", "method", "quick"},
-    "recurrence": {"model", "flow", "method", "quick", "cell"},
-    "fold": {"model", "flow", "energy", "quick", "cell", "recurrence"},
-    "summary": {"model", "cell"},
+    "relay": {"model", "flow", "quick", "cell"},
+    "recurrence": {"model", "flow", "method", "quick", "cell", "relay"},
+    "fold": {"model", "flow", "energy", "quick", "cell", "relay", "recurrence"},
+    "summary": {"model", "quick", "cell", "relay"},
     "trips": {"model", "flow", "exact", "quick", "sampled", "ode", "rk4", "cell", "recurrence", "fold"},
-    "simulate": {"model", "exact", "quick", "lanes", "method", "cell", "recurrence", "summary", "trips"},
+    "simulate": {"model", "exact", "quick", "lanes", "method", "cell", "relay", "recurrence", "summary", "trips"},
     "trajectory": {"model", "flow", "exact", "ode", "rk4", "membrane", "method"},
+    "shooting": {"model", "flow"},
+    "impact_map": {"model", "quick", "sampled", "lanes", "cell", "trips"},
+    "orbit": {"model", "flow", "energy", "shooting", "impact_map", "trajectory"},
+    "branch": {"model", "flow", "shooting", "orbit"},
+    "record": {"model", "exact", "lanes", "trajectory"},
     "axes": {"model"},
     "dataset": {"model", "method", "axes", "simulate"},
     "label": {"model"},
@@ -44,13 +50,16 @@ ROOMS: dict[str, set[str]] = {
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
     "compare": {"model", "dataset", "label", "grid"},
-    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare"},
+    "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
+    "style": set(),
+    "chart": {"store", "style"},
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style"},
 }
 ROOMS["__init__"] = set(ROOMS)
 
 ONLY_IN = {
     "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
-    "matplotlib": {"vijax/plot.py"},
+    "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py"},
 }
 NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]
 IMPORT_SECONDS = 1.5

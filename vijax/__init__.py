@@ -9,6 +9,7 @@ jax.config.update("jax_enable_x64", True)
 
 from vijax.attractor import basin_fractions, basins, lyapunov, survival
 from vijax.compare import compare
+from vijax.diagram import orbit_diagram
 from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
 from vijax.membrane import HuntCrossley
@@ -30,6 +31,7 @@ __all__ = [
     "impact_pair",
     "load",
     "lyapunov",
+    "orbit_diagram",
     "save",
     "summarise",
     "survival",
