@@ -30,6 +30,37 @@ def reference_trajectories() -> list[dict[str, Any]]:
     return json.loads((DATA / "trajectories.json").read_text())["cases"]
 
 
+class ReferenceOrbit(NamedTuple):
+    """A periodic orbit solved in 50 digits: parameters, walls and knots of its impacts, what else is known."""
+
+    pair: ImpactPair
+    side: tuple[int, ...]
+    knots: np.ndarray
+    depth: np.ndarray
+    multipliers: np.ndarray
+    P: float
+
+
+def reference_rows() -> list[dict[str, Any]]:
+    """The 50-digit period-1 orbits as they are written down."""
+    return json.loads((DATA / "gradients.json").read_text())["orbits"]
+
+
+def reference_orbits() -> list[ReferenceOrbit]:
+    """The 50-digit period-1 orbits."""
+    found = []
+    for row in reference_rows():
+        v, t, stay, depth = (np.array([float(x) for x in row[name]]) for name in ("v_in", "t_in", "contact", "dmax"))
+        order = np.argsort(t)
+        pair = ImpactPair(*(jnp.asarray(float(row[name])) for name in ("d", "kappa", "r", "gamma")))
+        knots = np.stack([t, np.abs(v), stay], axis=1)[order]
+        multipliers = np.array([complex(*map(float, parts)) for parts in row["multipliers_mp_contact_map"]])
+        found.append(
+            ReferenceOrbit(pair, tuple(np.sign(v[order]).astype(int)), knots, depth[order], multipliers, float(row["P_J"]))
+        )
+    return found
+
+
 # --- the exact engine on many starts -------------------------------------------------------------------------------
 
 

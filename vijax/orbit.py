@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vijax import flow, shooting
@@ -51,7 +52,7 @@ class Orbit(eqx.Module):
     @property
     def count(self) -> Int[Array, "orbit"]:
         """Impacts until it closes (half of all where it closes onto its mirror image)."""
-        return self.sequence.real.sum(axis=-1)
+        return self.sequence.real.sum(axis=-1, dtype=jnp.int32)
 
     def __getitem__(self, index: Any) -> "Orbit":
         """Some of the orbits, by an index array, a mask or a slice."""
@@ -146,8 +147,8 @@ def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level
     status = jnp.where(whole, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
     good = whole[:, None] & real
     # What was flown to is the impact after each.
-    place = jnp.arange(real.shape[1])
-    before = jnp.where(place == 0, real.sum(axis=1)[:, None] - 1, place - 1)
+    place = jnp.arange(real.shape[1], dtype=jnp.int32)
+    before = jnp.where(place == 0, real.sum(axis=1, dtype=jnp.int32)[:, None] - 1, place - 1)
     depth, work = (jnp.take_along_axis(leaf, before, axis=1) for leaf in (flown.depth, flown.work))
     # The first impact is put into the first period.
     knots = knots.at[..., 0].add(-2 * jnp.floor(0.5 * knots[:, :1, 0]))
@@ -174,9 +175,9 @@ def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -
     root = jnp.sqrt(jnp.abs(spread))
     large = half + jnp.where(half < 0, -root, root)
     small = product / jnp.where(large == 0, 1.0, large)
-    pair = jnp.stack([large, small], axis=1).astype(complex)
-    twins = jnp.stack([half + 1j * root, half - 1j * root], axis=1)
-    values = jnp.where((spread >= 0)[:, None], pair, twins)
+    real = (spread >= 0)[:, None]
+    parts = jnp.where(real, jnp.stack([large, small], axis=1), half[:, None])
+    values = lax.complex(parts, jnp.where(real, 0.0, jnp.stack([root, -root], axis=1)))
     return jnp.where(mirrored[:, None], values * values, values)
 
 
@@ -207,7 +208,7 @@ def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 
         u, v, t = last.u, last.v, jnp.zeros_like(t)
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
     found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
-    onset = 2.0 * found.n + found.t
+    onset = 2 * found.n.astype(found.t.dtype) + found.t
     inside = np.asarray(onset < onset[:, :1] + 2 * period - _SAME)
     width = 1 << max(int(inside.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
     mask = jnp.asarray(inside[:, :width])
@@ -284,15 +285,15 @@ def distinct(orbit: Orbit) -> Orbit:
 def marks(orbit: Orbit) -> Float[Array, "orbit 4"]:
     """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
     t, speed, stay = jnp.moveaxis(orbit.knots, -1, 0)
-    signed = orbit.sequence.side * speed
+    signed = orbit.sequence.side.astype(speed.dtype) * speed
     parts = [signed * jnp.cos(jnp.pi * t), signed * jnp.sin(jnp.pi * t), signed + speed, stay * speed]
     return jnp.stack([jnp.nansum(part, axis=-1) for part in parts], axis=-1)
 
 
 def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[Array, "orbit"]:
-    """Whether each orbit is its own mirror image, half a span later."""
+    """Whether each orbit, run through once, is its own mirror image half a span later."""
     count = orbit.count
-    index = jnp.arange(orbit.knots.shape[1])
+    index = jnp.arange(orbit.knots.shape[1], dtype=jnp.int32)
     half = jnp.where(index < (count // 2)[:, None], index + (count // 2)[:, None], index)
     wait = jnp.array([0.5, 0.0, 0.0]) * orbit.sequence.span[:, None, None]
     moved = jnp.take_along_axis(orbit.knots, half[..., None], axis=1) - orbit.knots - wait
@@ -312,7 +313,7 @@ def halved(orbit: Orbit) -> Orbit:
         raise ValueError(f"orbit must be symmetric to be closed half way; got {np.asarray(symmetric(orbit))}")
     if bool(orbit.sequence.mirrored.all()):
         return orbit
-    index = jnp.arange(orbit.knots.shape[1])
+    index = jnp.arange(orbit.knots.shape[1], dtype=jnp.int32)
     kept = index < (orbit.count // 2)[:, None]
     width = orbit.knots.shape[1] // 2
     side = jnp.where(kept, orbit.sequence.side, 0)[:, :width]
@@ -333,7 +334,7 @@ def unfolded(orbit: Orbit) -> Orbit:
 def _unfolded(orbit: Orbit, twice: Bool[Array, "orbit"]) -> Orbit:
     """The second turn appended to the first where asked."""
     count, width = orbit.count[:, None], orbit.knots.shape[1]
-    index = jnp.arange(2 * width)
+    index = jnp.arange(2 * width, dtype=jnp.int32)
     again = index >= count
     from_first = jnp.where(again, index - count, index)
     there = (index < count) | (twice[:, None] & again & (index < 2 * count))
@@ -360,7 +361,7 @@ def counts(orbit: Orbit) -> Counts:
     full = unfolded(orbit)
     side, number = full.sequence.side, full.count
     period = jnp.round(0.5 * full.sequence.span).astype(jnp.int32)
-    index = jnp.arange(side.shape[1])
+    index = jnp.arange(side.shape[1], dtype=jnp.int32)
     turns = jnp.ones_like(period)
     for parts in range(2, int(period.max(initial=1)) + 1):
         shift = jnp.where(number % parts == 0, number // parts, 0)[:, None]
@@ -380,13 +381,13 @@ def impacts(orbit: Orbit) -> Impact:
     passage = jax.jit(jax.vmap(shooting.passages))(full.pair, full.sequence, full.knots)
     side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
     phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
-    blank = jnp.where(side == 0, jnp.nan, 0.0)
+    blank, wall = jnp.where(side == 0, jnp.nan, 0.0), side.astype(t.dtype)
     return Impact(
         n=n.astype(jnp.int32),
         t=phase + blank,
         side=side,
-        v_in=side * speed + blank,
-        v_out=-side * passage.speed + blank,
+        v_in=wall * speed + blank,
+        v_out=-wall * passage.speed + blank,
         depth=full.depth,
         duration=stay,
         work=full.work,

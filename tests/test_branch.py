@@ -1,0 +1,113 @@
+"""Branches: the bifurcations of the rigid wall at their known places, each with the multiplier that makes it one."""
+
+import numpy as np
+import pytest
+
+from vijax import branch, chart
+from vijax import orbit as orbits
+from vijax.model import Harvester, Status, impact_pair
+
+SPAN = (0.1, 0.3)
+# Of the issue's reference: where the symmetric orbit breaks, and where two left and one right impact fold.
+PITCHFORK, FOLD = 0.2634316, 0.20158
+
+
+@pytest.fixture(scope="module")
+def family():
+    """Period-1 orbits of one right and one left impact at d = 0.2, rigid walls, and what bifurcates from them."""
+    found = orbits.search(impact_pair(0.2, None, 0.5), "RL", guesses=256)
+    return branch.family(found, "d", SPAN)
+
+
+def largest(point):
+    return complex(point.orbit.multipliers[0, 0])
+
+
+def points(branches, kind):
+    return [point for one in branches for point in one.points if point.kind == kind]
+
+
+def test_symmetry_breaks_where_it_is_known_to(family):
+    broken = points(family, "pitchfork")
+    # Once on the symmetric branch; the branch of mirror images turns there.
+    assert len(broken) == 2
+    for point in broken:
+        assert point.value == pytest.approx(PITCHFORK, abs=5e-8)
+        assert abs(largest(point) - 1) < 1e-6
+    assert broken[0].value == pytest.approx(broken[1].value, abs=1e-8)
+
+
+def test_both_mirror_images_flip_and_double_alike(family):
+    flips = points(family, "flip")
+    assert len(flips) == 2
+    assert flips[0].value == pytest.approx(flips[1].value, abs=1e-10)
+    for point in flips:
+        assert abs(largest(point) + 1) < 1e-7
+    # The doubled branch begins there, has twice the impacts, and inherits the stability that the other loses.
+    doubled = family[-1]
+    assert [int(x[0]) for x in orbits.counts(doubled.orbit[-1:])] == [2, 2, 2]
+    assert doubled.values[0] == pytest.approx(flips[0].value, abs=1e-8)
+    assert doubled.stable[1:].all()
+
+
+def test_every_orbit_is_one_and_the_multiplier_decides_between_stable_and_not(family):
+    for one in family:
+        assert (np.asarray(one.orbit.status) == Status.OK).all()
+        assert (np.asarray(one.orbit.residual) < 1e-13).all()
+        assert np.abs(np.diff(one.values)).max() < 0.01 * (SPAN[1] - SPAN[0])
+    symmetric = family[0]
+    np.testing.assert_array_equal(symmetric.stable, symmetric.values > PITCHFORK)
+    assert symmetric.ends == ("low", "high")
+
+
+def test_grazing_ends_a_branch_where_the_ball_just_touches(family):
+    ends = points(family, "grazing flight")
+    assert {one.ends[1] for one in family[1:]} == {"grazing flight"}
+    for point in ends[:2]:
+        _, u, _ = orbits.path(point.orbit, samples=2001)
+        turning = np.sort(np.abs(u[0][1:-1][(np.diff(u[0])[1:] * np.diff(u[0])[:-1]) <= 0]))
+        # A third turning point at the wall, besides the two impacts.
+        assert np.abs(turning - 0.5 * point.value).min() < 1e-6
+
+
+def test_a_branch_goes_through_its_fold():
+    found = orbits.search(impact_pair(0.19, None, 0.5), "RLL", guesses=256)
+    (one,) = branch.follow(found[:1], "d", SPAN, direction="up")
+    (fold,) = (point for point in one.points if point.kind == "fold")
+    assert fold.value == pytest.approx(FOLD, abs=5e-6)
+    assert abs(largest(fold) - 1) < 1e-5
+    assert one.values.max() <= fold.value
+    assert one.values[-1] < one.values.max() - 0.001
+
+
+def test_the_dataset_and_its_picture(family, tmp_path):
+    found = branch.dataset(family, Harvester())
+    assert found.sizes["branch"] == len(family)
+    assert found["d"].attrs["units"] == "1"
+    first = family[0]
+    np.testing.assert_allclose(found["P"][0, : len(first.values)], orbits.power(first.orbit, Harvester()))
+    assert sorted(k for k in found["event"].values.flat if k) == sorted(p.kind for b in family for p in b.points)
+    chart.branches(found, tmp_path / "branches.png")
+    assert (tmp_path / "branches.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"along": "omega0"}, "along must be one of"),
+        ({"along": "kappa"}, "a rigid wall has no kappa"),
+        ({"within": (0.3, 0.1)}, "within must be two bounds"),
+        ({"within": (0.25, 0.3)}, "within must hold the start"),
+        ({"direction": "sideways"}, "direction must be"),
+        ({"along": "gamma", "within": (-0.1, 0.1)}, "orbit must be closed in full"),
+    ],
+)
+def test_bad_input_is_told(family, change, message):
+    start = family[0].orbit[len(family[0].values) // 2 :][:1]
+    with pytest.raises(ValueError, match=message):
+        branch.follow(start, **{"along": "d", "within": SPAN} | change)
+
+
+def test_nothing_begins_at_a_grazing(family):
+    with pytest.raises(ValueError, match="point must be a flip"):
+        branch.switch(points(family, "grazing flight")[0], "d", SPAN)

@@ -1,0 +1,133 @@
+"""Periodic orbits: 50-digit ones found again, stable or not; nothing called an orbit that the ball does not follow."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import reference_orbits, reference_rows
+
+import vijax
+from vijax import orbit as orbits
+from vijax.model import Harvester, Status, impact_pair
+from vijax.shooting import Sequence
+
+
+def guessed(knots, walls, pair, period=1):
+    """Solve from knots of one orbit."""
+    wide = jax.tree.map(lambda leaf: jnp.atleast_1d(leaf), pair)
+    walls = Sequence(jnp.asarray([walls], jnp.int32), jnp.array([2.0 * period]), jnp.array([False]))
+    return orbits.solve(wide, walls, jnp.asarray(knots)[None])
+
+
+@pytest.mark.parametrize("reference", reference_orbits(), ids=lambda orbit: f"kappa {float(orbit.pair.kappa)}")
+def test_reference_orbits(reference):
+    found = guessed(reference.knots * (1 + 0.02 * np.array([1, -1, 1])), reference.side, reference.pair)
+    assert found.status[0] == Status.OK
+    assert found.residual[0] < 1e-13
+    np.testing.assert_allclose(found.knots[0], reference.knots, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.depth[0], reference.depth, rtol=0, atol=1e-12)
+    # The reference lists a pair in no order.
+    mine, theirs = (np.sort_complex(np.round(np.asarray(x), 9)) for x in (found.multipliers[0], reference.multipliers))
+    np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-8)
+    # Its length unit is a metre: A = 1 and omega = pi.
+    np.testing.assert_allclose(orbits.power(found, Harvester()), reference.P, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def rigid():
+    """Orbits with one right and two left impacts, rigid walls, d = 0.18, where the paper names an unstable one."""
+    return orbits.search(impact_pair(0.18, None, 0.5), "RLL", guesses=256)
+
+
+def test_the_unstable_orbit_is_found(rigid):
+    assert len(rigid) == 1
+    # Unstable by a flip.
+    assert rigid.multipliers[0, 0].real < -1.1
+    assert orbits.counts(rigid) == orbits.Counts(*(np.array([n]) for n in (2, 1, 1)))
+    # One turn of the careful engine comes back to it, but for what its instability makes of rounding.
+    hits = orbits.impacts(rigid)
+    again = vijax.trajectory(rigid.pair, 0.09, hits.v_out[:, 0], periods=5, t0=hits.t[:, 0])
+    np.testing.assert_allclose(again.impacts.v_in[0, :3], np.roll(hits.v_in[0, :3], -1), rtol=1e-9)
+
+
+def test_a_virtual_orbit_is_called_so():
+    # The equations hold at a later zero of the penetration too, when the ball would have left long before.
+    knots = np.array([[0.27339045, 0.55932403, 0.00806447], [0.93596282, 0.46122295, 0.56511451]])
+    found = guessed(knots, (-1, 1), impact_pair(0.18, 400.0, 0.5))
+    assert found.residual[0] < 1e-12
+    assert found.status[0] == Status.VIRTUAL
+    assert np.isnan(found.depth).all()
+
+
+def test_from_states_to_orbits_and_their_labels():
+    # The first two states lie near 50-digit orbits, the last meets no wall.
+    rows = reference_rows()
+    u, v = (np.array([row["strobe"][i] for row in rows[:2]] + [0.0]) for i in (0, 1))
+    d, kappa = np.array([0.2, 0.2, 0.3]), np.array([12.65, 40.0, 40.0])
+    found = orbits.from_state(impact_pair(d, kappa, 0.5), u + 0.002, v, period=2)
+    np.testing.assert_array_equal(found.status, [Status.OK, Status.OK, Status.NO_ORBIT])
+    # Flown for two periods, but of period one.
+    assert [tuple(int(x) for x in row) for row in np.transpose(orbits.counts(found))][:2] == [(1, 1, 1)] * 2
+    np.testing.assert_allclose(orbits.power(found, Harvester())[:2], [float(r["P_J"]) for r in rows[:2]], rtol=1e-12)
+    assert np.isinf(found.residual[2])
+
+
+def test_a_symmetric_orbit_closed_half_way_is_the_same():
+    reference = reference_orbits()[0]
+    full = guessed(reference.knots, reference.side, reference.pair)
+    half = orbits.halved(full)
+    assert half.count[0] == 1
+    assert half.status[0] == Status.OK
+    np.testing.assert_allclose(np.sort_complex(half.multipliers[0]), np.sort_complex(full.multipliers[0]), atol=1e-12)
+    for again in (orbits.unfolded(half), orbits.doubled(half)):
+        np.testing.assert_allclose(again.knots, full.knots, rtol=0, atol=1e-13)
+    with pytest.raises(ValueError, match="orbit must be symmetric"):
+        orbits.halved(guessed(reference_orbits()[1].knots, reference_orbits()[1].side, reference_orbits()[1].pair))
+
+
+def test_an_impact_at_phase_0_is_no_obstacle():
+    # Between these stiffnesses the onset passes through the phase at which a stroboscopic section would be taken.
+    reference = reference_orbits()[0]
+    kappa = np.linspace(12.65, 8.0, 32)
+    knots, phase = jnp.asarray(reference.knots), []
+    for value in kappa:
+        found = guessed(knots, reference.side, impact_pair(0.2, value, 0.5))
+        assert found.status[0] == Status.OK
+        knots = found.knots[0]
+        phase.append(float(knots[0, 0]))
+    assert min(phase) < 0.01
+    assert max(phase) > 1.99
+
+
+def test_the_path_is_the_motion():
+    reference = reference_orbits()[0]
+    t, u, v = (x[0] for x in orbits.path(guessed(reference.knots, reference.side, reference.pair), samples=401))
+    assert (np.diff(t) >= 0).all()
+    assert t[-1] - t[0] == pytest.approx(2.0)
+    assert (u[0], v[0]) == pytest.approx((u[-1], v[-1]))
+    assert u.max() - 0.5 * 0.2 == pytest.approx(reference.depth.max(), abs=1e-6)
+    # Displacement is the integral of the velocity.
+    np.testing.assert_allclose(np.diff(u), 0.5 * (v[1:] + v[:-1]) * np.diff(t), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p: orbits.search(p, "RXL"), "impacts must be walls"),
+        (lambda p: orbits.search(p, "0:0"), "impacts must be walls"),
+        (lambda p: orbits.search(p, "1:2/2T", 3), "period must agree"),
+        (lambda p: orbits.from_state(p, 0.0, 0.1, period=0), "period must be at least 1"),
+        (lambda p: orbits.from_state(p, 0.0, 0.1, settle=-1), "settle must be at least 0"),
+    ],
+)
+def test_bad_input_is_told(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(impact_pair(0.2, 40.0, 0.5))
+
+
+def test_labels_become_cyclically_distinct_sequences():
+    assert orbits.sequences("1:2") == ([(-1, 1, 1)], 1)
+    assert orbits.sequences("rll", 3) == ([(1, -1, -1)], 3)
+    every, period = orbits.sequences("2:2/3T")
+    assert period == 3
+    assert every == [(-1, -1, 1, 1), (-1, 1, -1, 1)]
