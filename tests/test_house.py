@@ -36,6 +36,7 @@ ROOMS: dict[str, set[str]] = {
     "summary": {"model", "cell"},
     "trips": {"model", "flow", "exact", "quick", "sampled", "ode", "rk4", "cell", "recurrence", "fold"},
     "simulate": {"model", "exact", "quick", "lanes", "method", "cell", "recurrence", "summary", "trips"},
+    "curve": {"model", "flow"},
     "trajectory": {"model", "flow", "exact", "ode", "rk4", "membrane", "method"},
     "axes": {"model"},
     "dataset": {"model", "method", "axes", "simulate"},
