@@ -1,0 +1,183 @@
+"""The paper's figures computed and drawn: runs -> orbit diagrams -> panels -> a picture."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vijax.curve import Curve, curve
+from vijax.diagram import orbit_diagram
+from vijax.model import ImpactPair, impact_pair
+from vijax.paper import FIGURES, PaperFigure, Run, Source, View
+from vijax.portrait import Layer, Panel, phase_plane, small_multiples, time_series
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+MICRO = 1e6
+SERIES_PERIODS = 4  # of a time series
+CHAOS_PERIODS = 100  # of the gray orbit behind a Poincare section
+
+
+class Quantity(NamedTuple):
+    """What a panel of an orbit diagram shows: a variable, its label, a factor, powers of the units it is given in.
+
+    The units of length and time are A pi^2/omega^2 [m] and pi/omega [s]; where both powers are 0, nothing is converted.
+    """
+
+    variable: str
+    label: str
+    factor: float = 1.0
+    length: int = 0
+    time: int = 0
+
+
+QUANTITIES = {
+    "speed": Quantity("v_in", r"$\dot{u}_j$"),
+    "speed in m/s": Quantity("v_in", r"$U'_j$ [m/s]", length=1, time=-1),
+    "strobe": Quantity("v_strobe", r"$\dot{u}$ at phase 0"),
+    "strobe in m": Quantity("u_strobe", r"$U$ at phase 0 [m]", length=1),
+    "restitution": Quantity("restitution", r"$\rho_j$"),
+    "phase": Quantity("phase", r"$\phi_j$ [rad]", factor=np.pi),
+    "duration": Quantity("duration", r"$\Delta t_j$"),
+    "duration in s": Quantity("duration", r"$\Delta\tau_j$ [s]", time=1),
+    "energy": Quantity("E", r"$E_j$ [$\mu$J]", factor=MICRO),
+    "power": Quantity("P", r"$P$ [$\mu$J]", factor=MICRO),
+}
+_NAMES = {"d": "$d$", "kappa": r"$\kappa$", "omega": r"$\omega$ [rad/s]", "r": "$r$"}
+_LOGARITHMIC = {"energy", "power"}
+
+
+@lru_cache(maxsize=16)
+def diagram(run: Run) -> "xr.Dataset":
+    """The orbit diagram of a run; computed once."""
+    axes = {name: np.asarray(values) if isinstance(values, tuple) else values for name, values in run.axes}
+    return orbit_diagram(
+        along=run.along,
+        values=np.array(run.values),
+        direction=run.direction,
+        wall=run.wall,
+        periods=run.periods,
+        keep=run.keep,
+        **axes,
+    )
+
+
+def selected(source: Source) -> "xr.Dataset":
+    """The part of a diagram that a source names; the points nearest to its values."""
+    found = diagram(source.run)
+    return found.sel({name: value for name, value in source.where.items() if name in found.dims}, method="nearest")
+
+
+def pair_of(point: "xr.Dataset", wall: str) -> ImpactPair:
+    """The cell of a single point of a diagram."""
+    d, kappa, r, gamma = (float(point[name]) for name in ("d", "kappa", "r", "gamma"))
+    return impact_pair(d, None if wall == "rigid" else kappa, r, gamma)
+
+
+def motion(source: Source, periods: int | None = None) -> Curve:
+    """The dense curve through the kept impacts of a single point; of its first `periods` if given."""
+    point = selected(source)
+    t = point["phase"].values + 2.0 * point["period_number"].values
+    t = np.where(np.isfinite(point["v_in"].values), t, np.nan)
+    if periods is not None:
+        t = np.where(t - t[0] < 2.0 * periods, t, np.nan)
+    impacts = (point[name].values for name in ("side", "v_in", "v_out", "duration"))
+    return curve(pair_of(point, source.run.wall), t, *impacts)
+
+
+def panels(number: int) -> dict[str, Panel]:
+    """Every panel of a figure, by letter."""
+    figure = FIGURES[number]
+    return {view.letter: _SHOWS.get(view.shows, _sweep)(figure, view) for view in figure.views}
+
+
+def draw(number: int, path: str | Path | None = None) -> "Figure":
+    """Draw a figure of the paper.
+
+    Args:
+        number: 3 to 16.
+        path: Where to write it, if anywhere.
+    """
+    figure = FIGURES[number]
+    caption = f"Fig. {number}. {figure.title}. {figure.chosen}"
+    return small_multiples(panels(number), figure.layout, caption, path)
+
+
+# --- panels ---------------------------------------------------------------------------------------
+
+
+def _sweep(figure: PaperFigure, view: View) -> Panel:
+    """A quantity over the swept axis."""
+    if view.shows == "energies":
+        shown = [(source, name) for source in view.sources for name in ("energy", "power")]
+    else:
+        shown = [(source, view.shows) for source in view.sources]
+    layers = [_points(source, name) for source, name in shown]
+    run, label = view.sources[0].run, QUANTITIES[shown[0][1]].label
+    if view.shows == "energies":
+        layers[1] = layers[1]._replace(colour="green", text="$P$, mean over the orbit")
+        label = r"$E_j$, $P$ [$\mu$J]"
+    return Panel(
+        view.title,
+        _NAMES[run.along],
+        label,
+        layers,
+        upright=figure.marks if view.shows.startswith("speed") else (),
+        level=[(np.pi, "tab:blue")] if view.shows == "phase" else (),
+        log=("x" if run.along == "kappa" else "") + ("y" if view.shows in _LOGARITHMIC else ""),
+        span=(min(run.values), max(run.values)),
+    )
+
+
+def _points(source: Source, shows: str) -> Layer:
+    """Every value of a quantity over the swept axis."""
+    quantity, found = QUANTITIES[shows], selected(source)
+    length = found["A"] * np.pi**2 / found["omega"] ** 2
+    time = np.pi / found["omega"]
+    values = found[quantity.variable] * quantity.factor * length**quantity.length * time**quantity.time
+    values = values.where(values > 0) if shows in _LOGARITHMIC else values
+    x, y = np.broadcast_arrays(found[source.run.along], values.transpose(..., source.run.along))
+    return Layer(x, y, source.colour, "dots", source.text)
+
+
+def _phase_plane(figure: PaperFigure, view: View) -> Panel:
+    layers, gaps = [], set()
+    for source in view.sources:
+        line = motion(source)
+        layers.append(Layer(line.u, line.v, source.colour, "line", source.text))
+        gaps.add(float(selected(source)["d"]))
+    return phase_plane(view.title, layers, gaps.pop() if len(gaps) == 1 else None)
+
+
+def _section(figure: PaperFigure, view: View) -> Panel:
+    points = [(selected(source), source) for source in view.sources]
+    layers = [Layer(point["u_strobe"], point["v_strobe"], source.colour, "dots") for point, source in points]
+    return phase_plane(view.title, layers, float(points[0][0]["d"]))
+
+
+def _chaos(figure: PaperFigure, view: View) -> Panel:
+    """The orbit in gray under its Poincare section."""
+    (source,) = view.sources
+    line, section = motion(source, CHAOS_PERIODS), _section(figure, view)
+    return section._replace(layers=[Layer(line.u, line.v, "0.75", "line"), *section.layers])
+
+
+def _time_series(figure: PaperFigure, view: View) -> Panel:
+    (source,) = view.sources
+    point, line = selected(source), motion(source, SERIES_PERIODS)
+    side, t = point["side"].values, point["phase"].values + 2.0 * point["period_number"].values
+    again = np.append(False, side[1:] == side[:-1]) & (t <= line.t[-1])
+    gap = float(point["d"])
+    return time_series(view.title, line, (t[again], 0.5 * gap * side[again]), gap)
+
+
+_SHOWS: dict[str, Callable[[PaperFigure, View], Panel]] = {
+    "phase plane": _phase_plane,
+    "section": _section,
+    "chaos": _chaos,
+    "time series": _time_series,
+}
