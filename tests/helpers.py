@@ -4,7 +4,6 @@ Nothing here calls the engine but `march`, which runs many starts in one compile
 """
 
 import functools
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ from vijax import exact
 from vijax.model import ImpactPair, State
 
 DATA = Path(__file__).parent / "data"
-SCRIPT = Path(__file__).parent.parent / "scripts" / "grid.py"
+SCRIPTS = Path(__file__).parent.parent / "scripts"
 EPS = float(np.finfo(float).eps)
 LONG_PI = np.longdouble("3.14159265358979323846264338327950288")
 TILE, STEPS = 64, 16  # the one shape in which the exact engine is compiled
@@ -29,16 +28,6 @@ DIGITS = 50
 def reference_trajectories() -> list[dict[str, Any]]:
     """The 50-digit impact sequences."""
     return json.loads((DATA / "trajectories.json").read_text())["cases"]
-
-
-def grid_script() -> Any:
-    """`scripts/grid.py` as a module."""
-    spec = importlib.util.spec_from_file_location("grid_script", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 # --- the exact engine on many starts -------------------------------------------------------------------------------

@@ -2,10 +2,10 @@
 
 import math
 
+import grid as script
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import grid_script
 
 from vijax import grid, plot
 from vijax.compare import SURE, Label, Model, cheapest_model, compare, plan, rigid_from, run
@@ -209,7 +209,6 @@ def test_a_comparison_comes_back_equal_and_is_drawn(found, tmp_path):
 
 
 def test_from_arguments_to_store_and_picture(found, tmp_path, monkeypatch, capsys):
-    script = grid_script()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(script, "keep_compiled", lambda: None)
     axes = [part for name, values in AXES.items() for part in (f"--{name}", ",".join(map(str, values)))]

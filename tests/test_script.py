@@ -6,18 +6,14 @@ import signal
 import subprocess
 import sys
 
+import grid as script
 import numpy as np
 import pytest
-from helpers import SCRIPT, grid_script
+from helpers import SCRIPTS
 
 from vijax import dataset, grid
 
 TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
-
-
-@pytest.fixture(scope="module")
-def script():
-    return grid_script()
 
 
 @pytest.fixture
@@ -28,13 +24,14 @@ def folder(tmp_path, monkeypatch):
 
 # A background job of a shell ignores SIGINT, and so would its children.
 INTERRUPTIBLE = (
-    "import runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
+    "import os, runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "sys.argv = sys.argv[1:]; sys.path[0] = os.path.dirname(sys.argv[0]); "
+    "runpy.run_path(sys.argv[0], run_name='__main__')"
 )
 
 
 def started(arguments, folder):
-    command = [sys.executable, "-c", INTERRUPTIBLE, str(SCRIPT), *arguments]
+    command = [sys.executable, "-c", INTERRUPTIBLE, str(SCRIPTS / "grid.py"), *arguments]
     environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache")}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
@@ -98,7 +95,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("arguments", "say"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_is_one_line_and_exit_code_2(script, folder, capsys, monkeypatch, arguments, say):
+def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, monkeypatch, arguments, say):
     monkeypatch.setattr(grid, "run", None)  # nothing may run
     assert script.main(arguments) == 2
     out, err = capsys.readouterr()
@@ -110,7 +107,7 @@ def test_bad_input_is_one_line_and_exit_code_2(script, folder, capsys, monkeypat
 
 
 @pytest.mark.parametrize(("option", "name"), [("--out", "map.zarr"), ("--plot", "map.png")])
-def test_what_exists_is_found_before_the_run(script, folder, capsys, monkeypatch, option, name):
+def test_what_exists_is_found_before_the_run(folder, capsys, monkeypatch, option, name):
     monkeypatch.setattr(grid, "run", None)
     (folder / name).write_text("precious")
     assert script.main([option, name]) == 2
@@ -119,7 +116,7 @@ def test_what_exists_is_found_before_the_run(script, folder, capsys, monkeypatch
 
 
 @pytest.fixture
-def planned(script, monkeypatch, folder):
+def planned(monkeypatch, folder):
     """What the script asks `run` for."""
     plans = []
 
@@ -129,7 +126,7 @@ def planned(script, monkeypatch, folder):
 
     monkeypatch.setattr(grid, "run", run)
     monkeypatch.setattr(script, "keep_compiled", lambda: None)
-    monkeypatch.setattr(script.os, "_exit", lambda code: None)
+    monkeypatch.setattr(os, "_exit", lambda code: None)
 
     def plan(*arguments):
         script.main(list(arguments))
@@ -161,7 +158,7 @@ def test_default_plane(planned):
         (["--k", "300,560", "--d", "0.1,0.2", "--beta=-0.1,0.1"], {"k": 2, "d": 2, "beta": 2}),
     ],
 )
-def test_axes_in_the_order_given(script, planned, arguments, sizes):
+def test_axes_in_the_order_given(planned, arguments, sizes):
     if sizes is None:
         assert script.main(arguments) == 2
     else:

@@ -1,0 +1,201 @@
+"""What the scripts share: axes, device and files on the command line, progress, the closing lines, exit codes.
+
+A script is a click command whose body is one `door`, one run under `progress`, and one `finish`.
+"""
+
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vijax.model import Harvester
+
+_STARTED = time.perf_counter()
+VALUES = (
+    "VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --u0=-0.1:0.1:9); a number "
+    "may be a multiple of pi, as in 6pi."
+)
+AXES = {
+    "d": "gap, dimensionless",
+    "kappa": "stiffness, dimensionless",
+    "r": "coefficient of restitution [0.5]",
+    "gamma": "gravity along the axis over forcing amplitude [0]",
+    "omega": "frequency of the forcing, rad/s [pi]",
+    "s": "gap, m [0.3]",
+    "omega0": "natural frequency of ball and membrane, rad/s [400]",
+    "k": "stiffness, N/m [560]",
+    "A": "amplitude of the forcing, m/s^2 [1]",
+    "beta": "inclination, rad [0]",
+    "u0": "displacement at the start, dimensionless [min(0.05853, 0.49 d)]",
+    "v0": "velocity at the start, dimensionless [-0.47898]",
+}
+# One physical name among these, and the plane is the device's: what is not given is taken from Tables I and II.
+PHYSICAL = {"s", "omega0", "k"}
+
+
+def axis_options(**changed: str | None) -> list[click.Parameter]:
+    """An option for every axis.
+
+    Args:
+        changed: Another help text for an axis; None where there is no such option.
+    """
+    helps = AXES | changed
+    return [click.Option([f"--{name}", name], metavar="VALUES", help=text) for name, text in helps.items() if text]
+
+
+def device_options() -> list[click.Parameter]:
+    """Constants of the device that are no axes."""
+    text = "any other constant of the device"
+    return [click.Option(["--set", "constants"], multiple=True, metavar="NAME=VALUE", help=text)]
+
+
+def file_options() -> list[click.Parameter]:
+    """The store, the picture, and whether they may replace what is there."""
+    return [
+        click.Option(["--out"], metavar="FILE.zarr", help="store to write"),
+        click.Option(["--plot"], metavar="FILE.png", help="picture to write"),
+        click.Option(["--overwrite"], is_flag=True, help="replace what is there"),
+    ]
+
+
+def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, Any]:
+    """Values of the axes, taken out of what was given.
+
+    Args:
+        given: What click parsed, by name; the axes leave it.
+        defaults: Texts of axes that count as given where no physical name is among those that are.
+    """
+    from vijax.axes import parse_axis
+
+    axes = {name: given.pop(name) for name in list(given) if name in AXES}
+    texts = {name: text for name, text in axes.items() if text is not None}
+    # The defaults come first, so that what is given besides makes panels of their plane.
+    if not PHYSICAL & set(texts):
+        texts = {name: text for name, text in defaults.items() if name not in texts} | texts
+    return {name: parse_axis(name, text) for name, text in texts.items()}
+
+
+def device(constants: Iterable[str]) -> "Harvester":
+    """The device of Tables I and II with other constants, each written NAME=VALUE."""
+    from vijax.model import Harvester, with_constants
+
+    values = {}
+    for text in constants:
+        name, _, value = text.partition("=")
+        if name in AXES:
+            raise ValueError(
+                f"set must name a constant that has no option of its own; got {text!r}; give --{name}={value}"
+            )
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}") from None
+    return with_constants(Harvester(), **values)
+
+
+def targets(
+    out: str | None, plot: str | None, defaults: tuple[str, str], overwrite: bool
+) -> tuple[Path | None, Path | None]:
+    """Store and picture to write, both defaults where neither was given; raises unless they can be written."""
+    from vijax.store import check_output
+
+    if out is None and plot is None:
+        out, plot = defaults
+    if out is not None and not out.endswith(".zarr"):
+        raise ValueError(f"out must end in .zarr; got {out!r}")
+    return (
+        None if out is None else check_output("out", out, overwrite),
+        None if plot is None else check_output("plot", plot, overwrite),
+    )
+
+
+@contextmanager
+def door() -> Iterator[None]:
+    """What is raised within becomes one line and exit code 2: bad input, before anything runs."""
+    try:
+        yield
+    except (ValueError, TypeError, OSError) as error:
+        raise click.UsageError(str(error)) from None
+
+
+def keep_compiled() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX was told of another."""
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "vijax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+@contextmanager
+def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], None]]:
+    """A progress bar, as the callback (done, in all) that runs take."""
+    from tqdm import tqdm
+
+    with tqdm(total=total, desc="compiling", unit=unit, unit_scale=True) as bar:
+
+        def show(done: int, total: int) -> None:
+            if done:
+                bar.set_description(unit, refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def finish(
+    dataset: "xr.Dataset",
+    summary: str,
+    out: Path | None,
+    plot: Path | None,
+    picture: "Callable[[xr.Dataset, Path], Any]",
+    overwrite: bool,
+) -> None:
+    """Write the store and the picture, then say what the run found, what was written and how long it all took."""
+    if out is not None:
+        from vijax.store import save
+
+        save(dataset, out, overwrite=overwrite)
+    if plot is not None:
+        picture(dataset, plot)
+    click.echo(summary)
+    click.echo(f"wrote {', '.join(str(path) for path in (out, plot) if path)}")
+    click.echo(f"{time.perf_counter() - _STARTED:.1f} s from start to end")
+
+
+def pace(count: int, seconds: float, unit: str = "cells") -> str:
+    """How much was done in what time."""
+    return f"{count:,} {unit} in {seconds:.2f} s, {count / seconds:,.0f} {unit}/s"
+
+
+def flags(variable: "xr.DataArray") -> str:
+    """How often each value of a variable with CF flags occurs."""
+    names = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
+    return tally(names[value] for value in variable.values.flat)
+
+
+def tally(words: Iterable[str]) -> str:
+    """How often each word occurs, in the order of their first."""
+    return ", ".join(f"{word} {n:,}" for word, n in Counter(words).items())
+
+
+def run(command: click.Command, arguments: list[str] | None = None) -> int:
+    """Exit code of a script: 0, or 2 after bad input, when nothing was run; after Ctrl-C the process ends with 130."""
+    try:
+        command.main(arguments, standalone_mode=False)
+    except click.ClickException as error:
+        click.echo(f"error: {error.format_message()}", err=True)
+        return 2
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("stopped; nothing half-written is left", err=True)
+        # A compiled call cannot be stopped: leave without waiting for it.
+        os._exit(130)
+    return 0
