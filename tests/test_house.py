@@ -43,13 +43,16 @@ ROOMS: dict[str, set[str]] = {
     "store": set(),
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
     "compare": {"model", "dataset", "grid"},
+    "paper": set(),
+    "portrait": {"store"},
+    "figures": {"model", "curve", "paper", "portrait", "diagram"},
     "plot": {"model", "axes", "dataset", "store", "grid", "compare"},
 }
 ROOMS["__init__"] = set(ROOMS)
 
 ONLY_IN = {
     "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
-    "matplotlib": {"vijax/plot.py"},
+    "matplotlib": {"vijax/plot.py", "vijax/portrait.py"},
 }
 NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]
 IMPORT_SECONDS = 1.5

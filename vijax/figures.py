@@ -26,6 +26,7 @@ class Quantity(NamedTuple):
     """What a panel of an orbit diagram shows: a variable, its label, a factor, powers of the units it is given in.
 
     The units of length and time are A pi^2/omega^2 [m] and pi/omega [s]; where both powers are 0, nothing is converted.
+    A panel ends at `top`, if that is given.
     """
 
     variable: str
@@ -33,6 +34,7 @@ class Quantity(NamedTuple):
     factor: float = 1.0
     length: int = 0
     time: int = 0
+    top: float | None = None
 
 
 QUANTITIES = {
@@ -40,7 +42,7 @@ QUANTITIES = {
     "speed in m/s": Quantity("v_in", r"$U'_j$ [m/s]", length=1, time=-1),
     "strobe": Quantity("v_strobe", r"$\dot{u}$ at phase 0"),
     "strobe in m": Quantity("u_strobe", r"$U$ at phase 0 [m]", length=1),
-    "restitution": Quantity("restitution", r"$\rho_j$"),
+    "restitution": Quantity("restitution", r"$\rho_j$", top=2.0),
     "phase": Quantity("phase", r"$\phi_j$ [rad]", factor=np.pi),
     "duration": Quantity("duration", r"$\Delta t_j$"),
     "duration in s": Quantity("duration", r"$\Delta\tau_j$ [s]", time=1),
@@ -117,7 +119,12 @@ def _sweep(figure: PaperFigure, view: View) -> Panel:
     else:
         shown = [(source, view.shows) for source in view.sources]
     layers = [_points(source, name) for source, name in shown]
-    run, label = view.sources[0].run, QUANTITIES[shown[0][1]].label
+    run, quantity = view.sources[0].run, QUANTITIES[shown[0][1]]
+    label, level = quantity.label, [(np.pi, "tab:blue")] if view.shows == "phase" else []
+    for source in view.levels:
+        rigid, stiffest = selected(source), selected(view.sources[-1]).isel({run.along: 0})
+        speeds = _image(rigid, stiffest) * rigid["v_in"].values
+        level += [(speed, "red") for speed in np.unique(speeds[np.isfinite(speeds)].round(6))]
     if view.shows == "energies":
         layers[1] = layers[1]._replace(colour="green", text="$P$, mean over the orbit")
         label = r"$E_j$, $P$ [$\mu$J]"
@@ -127,9 +134,11 @@ def _sweep(figure: PaperFigure, view: View) -> Panel:
         label,
         layers,
         upright=figure.marks if view.shows.startswith("speed") else (),
-        level=[(np.pi, "tab:blue")] if view.shows == "phase" else (),
+        level=level,
         log=("x" if run.along == "kappa" else "") + ("y" if view.shows in _LOGARITHMIC else ""),
-        span=(min(run.values), max(run.values)),
+        top=quantity.top
+        if max(np.nanmax(layer.y, initial=0.0) for layer in layers) > (quantity.top or np.inf)
+        else None,
     )
 
 
@@ -147,10 +156,18 @@ def _points(source: Source, shows: str) -> Layer:
 def _phase_plane(figure: PaperFigure, view: View) -> Panel:
     layers, gaps = [], set()
     for source in view.sources:
-        line = motion(source)
-        layers.append(Layer(line.u, line.v, source.colour, "line", source.text))
-        gaps.add(float(selected(source)["d"]))
+        point, line = selected(source), motion(source)
+        # Of attractors that are mirror images of each other, soft and rigid walls may settle on either.
+        image = _image(point, selected(view.sources[-1])) if source.run.wall == "rigid" else 1
+        layers.append(Layer(image * line.u, image * line.v, source.colour, "line", source.text))
+        gaps.add(float(point["d"]))
     return phase_plane(view.title, layers, gaps.pop() if len(gaps) == 1 else None)
+
+
+def _image(point: "xr.Dataset", other: "xr.Dataset") -> int:
+    """-1 where two attractors lean to opposite sides, so that the mirror image of one is like the other."""
+    lean, reference = (float(each["v_in"].mean()) for each in (point, other))
+    return -1 if lean * reference < 0 else 1
 
 
 def _section(figure: PaperFigure, view: View) -> Panel:

@@ -61,12 +61,13 @@ class Source(NamedTuple):
 
 
 class View(NamedTuple):
-    """A panel: its letter in the layout, what it shows, of what, and its title."""
+    """A panel: its letter in the layout, what it shows, of what, its title, and speeds drawn as dashed red levels."""
 
     letter: str
     shows: str
     sources: tuple[Source, ...]
     title: str = ""
+    levels: tuple[Source, ...] = ()
 
 
 class PaperFigure(NamedTuple):
@@ -109,7 +110,6 @@ STIFF = run("d", *GAPS, r=0.5, kappa=400.0)
 BY_GAP = {r: run("d", *GAPS, r=r, kappa=STIFFNESSES) for r in RESTITUTIONS}
 SOFTENED = run("kappa", *STIFFNESS_SWEEP, r=0.5, d=(0.2, 0.18, 0.16, 0.12))
 STIFFENED = run("kappa", *STIFFNESS_SWEEP, r=0.5, d=(0.2, 0.18, 0.16, 0.12), direction="up")
-RIGID_LEVELS = run("r", 0.5, d=(0.2, 0.18, 0.16), wall="rigid")
 BY_FREQUENCY = {r: run("omega", *FREQUENCIES, s=0.2, r=r, k=SPRINGS, direction="up") for r in RESTITUTIONS}
 RIGID_BY_FREQUENCY = run("omega", *FREQUENCIES, s=0.2, r=0.5, direction="up", wall="rigid")
 
@@ -120,6 +120,7 @@ FREQUENCY_SECTION = _chaos("omega", 7.79, s=0.2, r=0.5, k=560.0)
 
 # --- the captions ---------------------------------------------------------------------------------
 
+_SLOW = r"Slow impacts may have $\rho_j$ above the frame of (b)."
 _ENERGY = "Energies are microjoules, as Eq. (34) with Tables I and II gives them; the paper's mJ cannot be meant."
 
 
@@ -167,8 +168,8 @@ def _at_frequencies(r: float) -> PaperFigure:
         rf"Soft walls over $\omega$, $r = {r}$, $s = 0.2$ m",
         ("aabb", "aabb", "ccdd", "ccdd", "eeff", "eeff"),
         tuple(_each("abcdef", shows, _by_spring(r))),
-        r"$\omega$ rises from 0.5 to 15 rad/s by 0.03, as the captions name no range. " + _ENERGY + " On the softer "
-        "membranes the formula gives more than the ball puts in.",
+        r"$\omega$ rises from 0.5 to 15 rad/s by 0.03, as the captions name no range. " + _SLOW + " " + _ENERGY + " On "
+        "the softer membranes the formula gives more than the ball puts in.",
     )
 
 
@@ -185,13 +186,14 @@ def _series(letter: str, d: float) -> View:
 def _sweep_of_stiffness(letter: str, d: float) -> View:
     down = Source(SOFTENED, {"d": d}, "black", r"$\kappa$ falling")
     up = Source(STIFFENED, {"d": d}, "tab:blue", r"$\kappa$ rising")
+    levels = (Source(RIGID, {"d": d}, "red"),) if d in PHASE_PLANES else ()
     # The paper shows the way up at d = 0.2 alone.
-    return View(letter, "speed", (up, down) if d == 0.2 else (down,), f"$d = {d}$")
+    return View(letter, "speed", (up, down) if d == 0.2 else (down,), f"$d = {d}$", levels)
 
 
 def _softening(letter: str, d: float, *kappas: float) -> View:
     sources = tuple(
-        Source(SOFTENED, {"d": d, "kappa": kappa}, colour, rf"({letter}) $\kappa = {kappa:.4g}$")
+        Source(SOFTENED, {"d": d, "kappa": kappa}, colour, rf"$\kappa = {kappa:.4g}$")
         for kappa, colour in zip(kappas, COLOURS, strict=False)
     )
     return View(letter, "phase plane", sources, f"$d = {d}$")
@@ -247,7 +249,7 @@ FIGURES: dict[int, PaperFigure] = {
             *_planes("def", _HARD, _SOFT),
             *_each("ghij", ("restitution", "duration", "energies", "phase"), (_SOFT,)),
         ),
-        "The rigid walls start as in Fig. 3, so that either may settle on the mirror image of the other. " + _ENERGY,
+        "The rigid walls start as in Fig. 3 and may settle on mirror images; (d) to (f) show like ones. " + _ENERGY,
         unstable=("RL", "RLL", "RRL"),
         marks=(0.12, *PHASE_PLANES),
     ),
@@ -255,7 +257,7 @@ FIGURES: dict[int, PaperFigure] = {
         r"Soft walls over $\kappa = 400/n$, $r = 0.5$",
         ("aabb", "aabb", "ccdd", "ccdd"),
         tuple(_sweep_of_stiffness(letter, d) for letter, d in zip("abcd", (0.2, 0.18, 0.16, 0.12), strict=True)),
-        "Dashed red: rigid walls from the same start; none at $d = 0.12$, where they are chaotic.",
+        "Dashed red: rigid walls, by the sweep of Fig. 3; none at $d = 0.12$, where they are chaotic.",
     ),
     7: PaperFigure(
         r"Phase planes of the sweeps over $\kappa$, $r = 0.5$",
@@ -265,8 +267,8 @@ FIGURES: dict[int, PaperFigure] = {
                 "a",
                 "phase plane",
                 (
-                    Source(run("kappa", 3.0, d=0.2, r=0.5), {"kappa": 3.0}, "tab:blue", "(a) 2:2/3T"),
-                    Source(run("kappa", 3.0, d=0.2, r=0.5, u0=-0.1, v0=0.0), {"kappa": 3.0}, "black", "(a) 1:1"),
+                    Source(run("kappa", 3.0, d=0.2, r=0.5), {"kappa": 3.0}, "tab:blue", "2:2/3T"),
+                    Source(run("kappa", 3.0, d=0.2, r=0.5, u0=-0.1, v0=0.0), {"kappa": 3.0}, "black", "1:1"),
                 ),
                 r"$d = 0.2$, $\kappa = 3$",
             ),

@@ -1,6 +1,6 @@
 """Small multiples of a moving ball: panels of orbit diagrams, phase planes, Poincare sections and time series."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from vijax.store import replacing
 
@@ -19,12 +20,14 @@ _STYLE: Any = {
     "axes.linewidth": 0.6,
     "axes.titlesize": "medium",
     "axes.titlepad": 3.0,
-    "axes.formatter.limits": (-3, 4),
+    "axes.formatter.limits": (-4, 5),
+    "axes.xmargin": 0.02,
+    "legend.frameon": False,
     "lines.linewidth": 0.8,
     "savefig.dpi": 200,
 }
 _LOOKS: dict[str, dict[str, Any]] = {
-    "dots": {"linestyle": "none", "marker": ".", "markersize": 1.2, "mew": 0},
+    "dots": {"linestyle": "none", "marker": ".", "markersize": 1.7, "mew": 0},
     "line": {"linestyle": "-"},
     "thick": {"linestyle": "-", "linewidth": 1.6},
     "rings": {"linestyle": "none", "marker": "o", "markersize": 5.0, "mfc": "none", "mew": 0.8},
@@ -32,7 +35,7 @@ _LOOKS: dict[str, dict[str, Any]] = {
 _WALL: dict[str, Any] = {"color": "firebrick", "linewidth": 1.4, "zorder": 0.5}
 _MARK: dict[str, Any] = {"linestyle": (0, (4, 3)), "linewidth": 0.7, "zorder": 0.6}
 _UNIT_WIDTH, _UNIT_HEIGHT = 1.75, 1.85  # inches of one letter of a layout
-_CAPTION_LETTERS = 17  # of a caption's line, for each inch of the figure
+_CAPTION_LETTERS = 21  # of a caption's line, for each inch of the figure
 
 
 class Layer(NamedTuple):
@@ -64,6 +67,7 @@ class Panel(NamedTuple):
         level: Heights of dashed horizontal lines, with their colour.
         log: Which axes are logarithmic: "", "x", "y" or "xy".
         span: Limits of x; None for those of the points.
+        top: Upper limit of y; None for that of the points.
     """
 
     title: str
@@ -75,6 +79,7 @@ class Panel(NamedTuple):
     level: Sequence[tuple[float, str]] = ()
     log: str = ""
     span: tuple[float, float] | None = None
+    top: float | None = None
 
 
 def phase_plane(title: str, layers: Sequence[Layer], d: float | None) -> Panel:
@@ -112,7 +117,7 @@ def time_series(title: str, line: Any, impacts: tuple[Any, Any], d: float) -> Pa
 def small_multiples(
     panels: dict[str, Panel], layout: Sequence[str], caption: str = "", path: str | Path | None = None
 ) -> Figure:
-    """Panels side by side under one legend and one caption.
+    """Panels side by side over one legend and one caption; a legend each where a colour has several meanings.
 
     Args:
         panels: By the letter that stands for each in the layout; a capital continues the panel of the small letter.
@@ -131,26 +136,29 @@ def small_multiples(
         figure = Figure(figsize=(width, height), layout="constrained")
         grid = figure.subplot_mosaic("\n".join(layout))
         for letter, panel in panels.items():
-            _draw(grid[letter], letter, panel)
-        texts = _legend(layer for panel in panels.values() for layer in panel.layers)
+            _draw(grid[letter], letter, panel, max(row.count(letter) for row in layout))
+        keys = {letter: _key(panel) for letter, panel in panels.items()}
+        together = {text: handle for key in keys.values() for text, handle in key.items()}
+        if len({handle.get_color() for handle in together.values()}) < len(together):
+            for letter, key in keys.items():
+                grid[letter].legend(key.values(), key, fontsize="small", handlelength=1.2)
+            together = {}
         below = _wrapped(caption, int(_CAPTION_LETTERS * width))
-        if texts or below:
-            handles = list(texts.values())
-            columns = max(1, min(len(texts), int(width)))
-            legend = figure.legend(
-                handles, list(texts), loc="outside lower center", ncols=columns, frameon=False, title=below
-            )
-            legend.get_title().set_fontsize("small")
+        legend = figure.legend(
+            together.values(), together, loc="outside lower center", ncols=max(1, len(together)), title=below
+        )
+        legend.get_title().set_fontsize("small")
         if path is not None:
             with replacing(Path(path)) as part:
                 figure.savefig(part)
     return figure
 
 
-def _draw(axes: Axes, letter: str, panel: Panel) -> None:
+def _draw(axes: Axes, letter: str, panel: Panel, columns: int) -> None:
     name = f"({letter}) " if letter.islower() else ""
     axes.set_title(name + panel.title, loc="left")
     axes.set(xlabel=panel.x, ylabel=panel.y)
+    axes.xaxis.set_major_locator(MaxNLocator(2 * columns + 1))
     for axis in panel.log:
         axes.set(**{f"{axis}scale": "log"})
     for layer in panel.layers:
@@ -164,13 +172,15 @@ def _draw(axes: Axes, letter: str, panel: Panel) -> None:
         axes.axhline(height, color=colour, **_MARK)
     if panel.span is not None:
         axes.set_xlim(panel.span)
+    if panel.top is not None:
+        axes.set_ylim(top=panel.top)
 
 
-def _legend(layers: Iterable[Layer]) -> dict[str, Line2D]:
-    """A handle for every text among the layers."""
+def _key(panel: Panel) -> dict[str, Line2D]:
+    """A handle for every text among a panel's layers."""
     return {
         layer.text: Line2D([], [], color=layer.colour, **_LOOKS["rings" if layer.look == "rings" else "thick"])
-        for layer in layers
+        for layer in panel.layers
         if layer.text
     }
 
