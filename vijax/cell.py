@@ -37,6 +37,7 @@ class Plan(eqx.Module):
     energies: bool = eqx.field(static=True)
     tangent: bool = eqx.field(static=True)
     variants: int = eqx.field(static=True)
+    chained: bool = eqx.field(static=True, default=False)  # a cell starts in the last one's state (`relay`)
 
 
 class Settings(eqx.Module):
@@ -48,6 +49,7 @@ class Settings(eqx.Module):
     method: Method | None
     length_variant: Float[Array, "variant"]
     speed_variant: Float[Array, "variant"]
+    keep: Float[Array, ""] | None = None  # chained: periods at the end whose impacts are wanted
 
 
 class Tally(eqx.Module):
@@ -97,6 +99,17 @@ class Course(eqx.Module):
     passage: Passage
 
 
+class Relay(eqx.Module):
+    """What a chained cell needs to be handed on, and to go on as if no round had been tried."""
+
+    start: Lanes
+    mark: Lanes  # the last exit before the kept periods
+    held: Lane  # mode at the mark
+    origin: Lanes  # where the search stood when the first round began
+    last: Lanes  # exit of the latest impact before the end, if the round were repeated until then
+    latest: Lane  # the onset of that impact, in periods
+
+
 class Cell(eqx.Module):
     """A lane's cell: parameters, where the ball is, and what has been seen."""
 
@@ -120,6 +133,7 @@ class Cell(eqx.Module):
     tangent: tuple[Lane, Lane, Lane, Lane] | None
     exponent: Lane | None
     multiplier: Lane | None
+    relay: Relay | None = None
 
 
 class Event(eqx.Module):

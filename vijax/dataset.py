@@ -106,12 +106,18 @@ def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
         dims = of.dynamic + (of.variant if values.ndim > 1 else ())
         found[name] = xr.Variable(dims, values.reshape([of.sizes[dim] for dim in dims]))
     variables = {name: _variable(name, found, planned) for name in planned.outputs}
-    variables["status"] = variables["status"].astype(np.int8)
-    variables["status"].attrs |= {
+    variables["status"] = flagged(variables["status"])
+    return xr.Dataset(variables, coords=coordinates(of), attrs=provenance(planned))
+
+
+def flagged(status: "xr.Variable") -> "xr.Variable":
+    """A variable of `Status` codes that says what they mean."""
+    found = status.astype(np.int8)
+    found.attrs = status.attrs | {
         "flag_values": [int(status) for status in Status],
         "flag_meanings": " ".join(status.name.lower() for status in Status),
     }
-    return xr.Dataset(variables, coords=_coordinates(of), attrs=_provenance(planned))
+    return found
 
 
 def best(dataset: "xr.Dataset") -> "xr.DataArray | None":
@@ -131,16 +137,18 @@ def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":
     return values
 
 
-def _coordinates(of: Cells) -> "dict[str, xr.Variable]":
-    coordinates = {}
+def coordinates(of: Cells) -> "dict[str, xr.Variable]":
+    """The axes as given and the quantities of the cells, with symbols and units."""
+    found = {}
     for name, values in {**of.given, **of.quantities}.items():
         axis = AXES[name]
-        coordinates[name] = values.transpose(*(dim for dim in of.sizes if dim in values.dims))
-        coordinates[name].attrs = {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
-    return coordinates
+        found[name] = values.transpose(*(dim for dim in of.sizes if dim in values.dims))
+        found[name].attrs = {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
+    return found
 
 
-def _provenance(planned: Plan) -> dict[str, Any]:
+def provenance(planned: Plan) -> dict[str, Any]:
+    """How a map was made: versions, commit, machine, settings, constants, tolerances."""
     accelerator = jax.devices()[0]
     # The constants that axes stand for are coordinates.
     constants = [field.name for field in fields(planned.device) if field.name not in (*AXES, "penetration_limit")]

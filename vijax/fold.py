@@ -9,6 +9,7 @@ from vijax.flow import share
 from vijax.model import Status
 from vijax.quick import Hit
 from vijax.recurrence import recur
+from vijax.relay import note
 
 _BUDGET = 512  # impacts per period before a cell is stopped
 
@@ -40,7 +41,18 @@ def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     candidate, found = recur(settings, cell, hit, kept, count)
     stop = over | ended | spent | broken | found
     return eqx.tree_at(
-        lambda c: (c.ball, c.running, c.status, c.count, c.batch, c.tally, c.candidate, c.tangent, c.exponent),
+        lambda c: (
+            c.ball,
+            c.running,
+            c.status,
+            c.count,
+            c.batch,
+            c.tally,
+            c.candidate,
+            c.tangent,
+            c.exponent,
+            c.relay,
+        ),
         cell,
         (
             choose(kept, hit.after, cell.ball),
@@ -52,6 +64,7 @@ def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
             candidate,
             tangent,
             exponent,
+            note(settings, cell, hit, kept, end),
         ),
         is_leaf=lambda x: x is None,
     )

@@ -17,6 +17,7 @@ Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
 
 TRIPS = 16  # quick trips between two rounds of serving, reviewing and refilling
+_CHAIN_TRIPS = 4  # likewise, where lanes are few and a lane that waits holds up its chain
 _SHARE = 16  # one lane in so many makes a batch to serve or to refill: a larger one keeps slow cells waiting
 _CPU_OPTIONS = {
     # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
@@ -116,23 +117,14 @@ def _put(carry: Carry, part: Carry, place: Int[Array, "lane"], chosen: Bool[Arra
     return jax.tree.map(merge, carry, part)
 
 
-def run(
-    program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int
-) -> Float[Array, "cell out"]:
-    """Run the first `count` cells to their end; rows past `count` come back as zeros.
+def _worker(program: Program, width: int, trips: int) -> Callable[[Int[Array, "lane"], Carry], Carry]:
+    """One round of trips, service and review, of the lanes that have a cell.
 
     Args:
         program: What a cell is.
-        cells: One row of parameters a cell.
-        count: How many are real; the table may be padded.
-        outputs: Length of a result row.
-        lanes: How many cells are worked on at once.
-
-    A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same
-    elementwise arithmetic wherever it sits.
+        width: How many lanes are served together.
+        trips: Most trips of a round.
     """
-    width = max(lanes // _SHARE, 1)
-
     service = program.service
 
     def declined(cell, carry):
@@ -159,6 +151,42 @@ def run(
         full = ((asking & ~hard).sum() >= width) | ((asking & hard).sum() >= width)
         return full | (asking.any() & (asking.sum() >= able(cell, carry)))
 
+    def keeps_on(cell, at_first, state):
+        """Up to so many trips, fewer once half the lanes that set out wait for something else."""
+        trip, carry = state
+        return (trip < trips) & (2 * able(cell, carry) > at_first)
+
+    def one_trip(state):
+        return state[0] + 1, program.trip(state[1])
+
+    def round_trip(cell, carry):
+        going = partial(keeps_on, cell, able(cell, carry))
+        _, carry = lax.while_loop(going, one_trip, (0, carry))
+        if service:
+            carry = lax.while_loop(partial(to_serve, cell), partial(serve, cell), carry)
+        return program.review(carry)
+
+    return round_trip
+
+
+def run(
+    program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int
+) -> Float[Array, "cell out"]:
+    """Run the first `count` cells to their end; rows past `count` come back as zeros.
+
+    Args:
+        program: What a cell is.
+        cells: One row of parameters a cell.
+        count: How many are real; the table may be padded.
+        outputs: Length of a result row.
+        lanes: How many cells are worked on at once.
+
+    A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same
+    elementwise arithmetic wherever it sits.
+    """
+    width = max(lanes // _SHARE, 1)
+    round_trip = _worker(program, width, TRIPS)
+
     def free(queue: _Queue) -> Bool[Array, "lane"]:
         """Lanes whose cell is done, or that wait for their first."""
         return jnp.where(queue.cell >= 0, program.done(queue.carry), queue.waiting < count)
@@ -181,21 +209,9 @@ def run(
         enough = jnp.where(queue.waiting < count, width, 1)
         return free(queue).sum() >= enough
 
-    def keeps_on(cell, at_first, state):
-        """Up to `TRIPS` trips, fewer once half the lanes that set out wait for something else."""
-        trip, carry = state
-        return (trip < TRIPS) & (2 * able(cell, carry) > at_first)
-
-    def one_trip(state):
-        return state[0] + 1, program.trip(state[1])
-
-    def round_trip(queue: _Queue) -> _Queue:
+    def advance(queue: _Queue) -> _Queue:
         queue = lax.while_loop(to_refill, refill, queue)
-        going = partial(keeps_on, queue.cell, able(queue.cell, queue.carry))
-        _, carry = lax.while_loop(going, one_trip, (0, queue.carry))
-        if service:
-            carry = lax.while_loop(partial(to_serve, queue.cell), partial(serve, queue.cell), carry)
-        return queue._replace(carry=program.review(carry))
+        return queue._replace(carry=round_trip(queue.cell, queue.carry))
 
     # Every cell is loaded by `refill`, the first ones too: another compiled copy of `load` may round otherwise.
     queue = _Queue(
@@ -204,4 +220,63 @@ def run(
         waiting=jnp.asarray(0, jnp.int32),
         results=jnp.zeros((cells.shape[0], outputs), cells.dtype),
     )
-    return lax.while_loop(lambda q: (q.cell >= 0).any() | (q.waiting < count), round_trip, queue).results
+    return lax.while_loop(lambda q: (q.cell >= 0).any() | (q.waiting < count), advance, queue).results
+
+
+class _Chains(NamedTuple):
+    """The loop's state: lanes, the link of its chain that each one works on (-1: none is left), the results."""
+
+    carry: Carry
+    link: Int[Array, "lane"]
+    results: Float[Array, "lane link out"]
+
+
+def chain(
+    program: Program,
+    succeed: Callable[[Carry, Float[Array, "lane in"]], Float[Array, "lane in"]],
+    links: Float[Array, "lane link in"],
+    count: Int[Array, ""],
+    length: Int[Array, ""],
+    outputs: int,
+) -> Float[Array, "lane link out"]:
+    """Run chains of cells, a lane each: every cell but the first begins where the last one ended.
+
+    Args:
+        program: What a cell is.
+        succeed: Carries that are done, and the rows of the next cells -> these rows, with what is handed on.
+        links: The rows of every chain in order.
+        count, length: How many lanes and links are real; the others come back as zeros.
+        outputs: Length of a result row.
+
+    No lane waits for another's link to end. Lanes being few, what an operation costs hardly depends on how many work
+    at it: all that decline are served together, and at once.
+    """
+    lanes, most, _ = links.shape
+    round_trip = _worker(program, lanes, _CHAIN_TRIPS)
+    lane = jnp.arange(lanes, dtype=jnp.int32)
+
+    def ended(state: _Chains) -> Bool[Array, "lane"]:
+        return (state.link >= 0) & program.done(state.carry)
+
+    def pass_on(state: _Chains) -> _Chains:
+        done = ended(state)
+        results = state.results.at[lane, jnp.where(done, state.link, most)].set(
+            program.unload(state.carry), mode="drop"
+        )
+        after = state.link + 1
+        goes_on = done & (after < length)
+        fresh = program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)]))
+        carry = _put(state.carry, fresh, lane, goes_on)
+        return _Chains(carry, jnp.where(goes_on, after, jnp.where(done, -1, state.link)), results)
+
+    def advance(state: _Chains) -> _Chains:
+        due = ended(state).any()
+        state = lax.cond(due, pass_on, lambda state: state, state)
+        return state._replace(carry=round_trip(state.link, state.carry))
+
+    start = _Chains(
+        carry=program.load(links[:, 0]),
+        link=jnp.where(lane < count, 0, -1).astype(jnp.int32),
+        results=jnp.zeros((lanes, most, outputs), links.dtype),
+    )
+    return lax.while_loop(lambda state: (state.link >= 0).any(), advance, start).results

@@ -10,6 +10,7 @@ from vijax.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Setting
 from vijax.method import Ode
 from vijax.model import Status
 from vijax.quick import Hit, Lanes
+from vijax.relay import come_back, depart
 
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
 _ROUNDS = 8  # Newton rounds on one candidate
@@ -151,7 +152,7 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
     )
     one, zero = jnp.ones_like(size), jnp.zeros_like(size)
     return eqx.tree_at(
-        lambda x: (x.candidate, x.ball, x.tally, x.tangent, x.exponent, x.running),
+        lambda x: (x.candidate, x.ball, x.tally, x.tangent, x.exponent, x.running, x.relay),
         cell,
         (
             new,
@@ -160,7 +161,9 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
             choose(begin, (one, zero, zero, one), cell.tangent),
             choose(begin, zero, cell.exponent),
             cell.running | begin,
+            depart(cell, begin, first),
         ),
+        is_leaf=lambda x: x is None,
     )
 
 
@@ -168,6 +171,7 @@ def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] |
     """A candidate that is no attractor: go on from where the round ended, with a tolerance a hundred times tighter."""
     c = cell.candidate
     zero = jnp.zeros_like(cell.since)
+    ball = come_back(cell, bad)
     new = eqx.tree_at(
         lambda x: (x.tracing, x.tolerance, x.anchor_v, x.next_anchor),
         c,
@@ -179,13 +183,14 @@ def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] |
         ),
     )
     return eqx.tree_at(
-        lambda x: (x.candidate, x.tally, x.since, x.batch, x.running),
+        lambda x: (x.candidate, x.ball, x.tally, x.since, x.batch, x.running),
         cell,
         (
             new,
+            ball,
             choose(bad, blank_tally(plan, zero), cell.tally),
             # The round spoiled the window's sums: it starts again here.
-            jnp.where(bad, jnp.maximum(cell.since, cell.ball.n + 1), cell.since),
+            jnp.where(bad, jnp.maximum(cell.since, ball.n + 1), cell.since),
             jnp.where(bad, -1.0, cell.batch),
             cell.running | bad,
         ),

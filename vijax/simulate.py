@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax import exact, lanes, quick, trips
+from vijax import exact, lanes, quick, relay, trips
 from vijax.cell import TRANSIENT_SHARE, Cell, Plan, Settings, blank_tally
 from vijax.method import Method, Ode
 from vijax.model import Harvester, ImpactPair
@@ -34,12 +34,12 @@ class Scale(eqx.Module):
 
 
 def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell:
-    """Fresh cells from rows (d, kappa, r, gamma, length, speed, u0, v0)."""
-    d, kappa, r, gamma, length, speed, u, v = rows.T
+    """Fresh cells from rows (d, kappa, r, gamma, length, speed, u0, v0) and, of chained cells, the phase t0."""
+    d, kappa, r, gamma, length, speed, u, v, *phase = rows.T
     pair = ImpactPair(d, None if plan.rigid else kappa, r, gamma)
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
-    ball = Lanes(u, v, zero, zero)
-    held = exact.start_mode(pair, u, v, zero)
+    ball = Lanes(u, v, *phase, zero) if phase else Lanes(u, v, zero, zero)
+    held = exact.start_mode(pair, u, v, ball.t)
     start = settings.transient + zero
     eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None
     attractor = plan.until == "attractor"
@@ -64,6 +64,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
         tangent=eye,
         exponent=zero if plan.tangent else None,
         multiplier=zero if plan.tangent else None,
+        relay=relay.begin(ball, held) if plan.chained else None,
     )
 
 
@@ -174,3 +175,103 @@ def summarise(
         speed_variant=scale.speed_variant.astype(dtype),
     )
     return _compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)
+
+
+class Starts(eqx.Module):
+    """Where chains start: displacement, velocity and phase."""
+
+    u: Float[Array, "chain"]
+    v: Float[Array, "chain"]
+    t: Float[Array, "chain"]
+
+
+class Growth(eqx.Module):
+    """Units of displacement and of velocity of the cell before, in those of each cell."""
+
+    u: Float[Array, "chain link"]
+    v: Float[Array, "chain link"]
+
+
+def _succeed(plan: Plan, settings: Settings, cell: Cell, rows: Float[Array, "lane in"]) -> Float[Array, "lane in"]:
+    """Rows of the next cells, with the start that the last ones hand on in the place of their growth."""
+    end = unload(plan, settings, cell).handover
+    return _start(plan, rows, end.u, end.v, end.t)
+
+
+def _start(plan: Plan, rows: Float[Array, "lane in"], u, v, t) -> Float[Array, "lane in"]:
+    """Rows that hold a growth, with the start that it makes of a state."""
+    u = relay.within(None if plan.rigid else 1.0, rows[:, 0], u * rows[:, -3])
+    return jnp.concatenate([rows[:, :-3], jnp.stack([u, v * rows[:, -2], t], axis=1)], axis=1)
+
+
+@lru_cache(maxsize=32)
+def _compiled_chains(plan: Plan):
+    """The jitted program of chains: all their links in one call."""
+
+    def follow(links, starts, count, length, settings):
+        first = _start(plan, links[:, 0], starts.u, starts.v, starts.t)
+        links = links.at[:, 0].set(first)
+        succeed = partial(_succeed, plan, settings)
+        table = lanes.chain(_program(plan, settings), succeed, links, count, length, columns(plan))
+        flat = unpack(plan, table.reshape(-1, table.shape[-1]))
+        return jax.tree.map(lambda x: x.reshape(table.shape[:2] + x.shape[1:]), flat)
+
+    return jax.jit(follow, compiler_options=lanes.compiler_options())
+
+
+def follow(
+    pair: ImpactPair,
+    starts: Starts,
+    growth: Growth,
+    length: Float[Array, "chain link"],
+    speed: Float[Array, "chain link"],
+    device: Harvester,
+    *,
+    periods: int = 400,
+    keep: int = 25,
+    count: int | None = None,
+    links: int | None = None,
+) -> Summary:
+    """Run chains of cells, each cell starting in the state in which the last one ended, in one jitted call.
+
+    Args:
+        pair: Cells [chain, link]; `kappa=None` for rigid walls.
+        starts: Starts of the first cells, at any phase, in contact too, in the units of the cells before them.
+        growth: How the handed-on state grows as its units change; of the first cells too.
+        length, speed: SI sizes of the units of every cell; see `Scale`.
+        device: Electrical constants, mass and penetration limit.
+        periods: Forcing periods of a cell; one whose attractor is certain ends there, as if it had run them all.
+        keep: Periods at the end whose impacts will be wanted.
+        count, links: How many chains and links are real, the rest being padding; all unless given.
+
+    Returns:
+        The summary of every cell, with its `handover`.
+    """
+    dtype = pair.d.dtype
+    plan = Plan(
+        until="attractor",
+        stepping=None,
+        rigid=pair.kappa is None,
+        level=bool((np.asarray(pair.gamma) == 0).all()),
+        deep=True,
+        energies=True,
+        tangent=True,
+        variants=1,
+        chained=True,
+    )
+    kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
+    zero = jnp.zeros_like(pair.d)
+    rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, length, speed, growth.u, growth.v, zero], axis=2)
+    chains, most = pair.d.shape
+    one = jnp.ones(1, dtype)
+    settings = Settings(
+        periods=jnp.asarray(periods, dtype),
+        transient=jnp.asarray(jnp.floor(TRANSIENT_SHARE * periods), dtype),
+        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        method=None,
+        length_variant=one,
+        speed_variant=one,
+        keep=jnp.asarray(keep, dtype),
+    )
+    number, long = (jnp.asarray(x, jnp.int32) for x in (count or chains, links or most))
+    return _compiled_chains(plan)(rows, starts, number, long, settings)

@@ -1,5 +1,7 @@
 """What is kept of a cell that has ended, and its row in the table of results."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,10 @@ from jaxtyping import Array, Float, Int
 
 from vijax.cell import TANGENT_SCALE, Cell, Lane, Mask, Plan, Settings, batch_length, last_period
 from vijax.model import Status
+from vijax.quick import Lanes
+from vijax.relay import Handover, hand_over
 
+_HANDOVER = 8  # numbers of a Handover
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
 
 
@@ -31,6 +36,7 @@ class Summary(eqx.Module):
     lyapunov: Float[Array, "cell"] | None
     periods_run: Float[Array, "cell"]
     status: Int[Array, "cell"]
+    handover: Handover | None = None  # of chained cells
 
 
 def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
@@ -97,6 +103,7 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
         lyapunov=lyapunov,
         periods_run=jnp.where(periodic, ran, jnp.where(failed | still, jnp.minimum(ran, end), end)),
         status=status,
+        handover=hand_over(settings, cell, periodic, failed, end) if plan.chained else None,
     )
 
 
@@ -156,9 +163,15 @@ def unpack(plan: Plan, table: Float[Array, "cell out"]) -> Summary:
         lyapunov=take(None) if plan.tangent else None,
         periods_run=take(None),
         status=whole(),
+        handover=_unpack_handover(take) if plan.chained else None,
     )
+
+
+def _unpack_handover(take: Callable[[None], Lane]) -> Handover:
+    u, v, t, *mark, held = (take(None) for _ in range(_HANDOVER))
+    return Handover(u, v, t, Lanes(*mark), held)
 
 
 def columns(plan: Plan) -> int:
     """Length of a row of `pack`."""
-    return 12 + 3 * plan.variants * plan.energies + plan.deep + plan.tangent
+    return 12 + 3 * plan.variants * plan.energies + plan.deep + plan.tangent + _HANDOVER * plan.chained

@@ -49,7 +49,7 @@ def _time(state: State) -> Float[Array, "..."]:
     return 2.0 * state.n.astype(state.t.dtype) + state.t
 
 
-def _at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Array, ""]) -> tuple:
+def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Array, ""]) -> tuple:
     """Displacement, velocity and mode at a time `when` after the start of a step."""
     aloft = (when <= out.flight) | out.quiet
     rise, v = flow.flight(pair.gamma, start.t, start.v, jnp.where(aloft, when, 0.0))
@@ -101,7 +101,7 @@ def _one(periods: int, max_impacts: int, pair: ImpactPair, u0, v0, t0) -> Trajec
         first, happened = jax.tree.map(lambda leaf: leaf[index], (begun, out))
         known = now <= until[index]
         when = jnp.where(known, 2.0 * (k - first.n).astype(u0.dtype) - first.t, 0.0)
-        u, v, mode = _at(pair, first, happened, when)
+        u, v, mode = ball_at(pair, first, happened, when)
         blank = jnp.where(known, 0.0, jnp.nan)
         return State(u + blank, v + blank, jnp.zeros_like(u), k, mode)
 
