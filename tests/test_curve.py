@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax.curve import curve
+from vijax.curve import curve, states
 
 PERIODS = 6
 
@@ -14,7 +14,8 @@ def drawn(wall: str, gamma: float):
     path = vijax.trajectory(pair, 0.02, 0.3, PERIODS)
     found = path.impacts
     t = np.asarray(found.t) + 2.0 * np.asarray(found.n)
-    return pair, path, curve(pair, t, found.side, found.v_in, found.v_out, found.duration, samples=400)
+    impacts = (t, found.side, found.v_in, found.v_out, found.duration)
+    return pair, path, impacts, curve(pair, *impacts, samples=400)
 
 
 @pytest.fixture(scope="module", params=[("soft", 0.0), ("soft", 0.2), ("rigid", 0.0)], ids=str)
@@ -23,17 +24,17 @@ def case(request):
 
 
 def test_the_curve_passes_through_the_stroboscopic_states(case):
-    _, path, line = case
+    _, path, _, line = case
     clock = 2.0 * np.arange(1, PERIODS)  # the last impact ends before the last period does
     apart = np.diff(line.t) > 0
-    for values, states in ((line.u, path.states.u), (line.v, path.states.v)):
+    for values, strobes in ((line.u, path.states.u), (line.v, path.states.v)):
         # Between samples 1/400 of a flight apart a straight line errs by less than this.
         between = np.interp(clock, line.t[1:][apart], values[1:][apart])
-        np.testing.assert_allclose(between, np.asarray(states)[: PERIODS - 1], atol=2e-5)
+        np.testing.assert_allclose(between, np.asarray(strobes)[: PERIODS - 1], atol=2e-5)
 
 
 def test_contacts_begin_and_end_on_the_wall(case):
-    pair, path, line = case
+    pair, path, _, line = case
     count = int(path.filled)
     u, v = (part.reshape(count, 2, -1) for part in (line.u, line.v))
     wall = 0.5 * float(pair.d) * np.asarray(path.impacts.side[:count])
@@ -42,6 +43,16 @@ def test_contacts_begin_and_end_on_the_wall(case):
     np.testing.assert_allclose(v[:, 0, 0], path.impacts.v_in[:count], atol=1e-14)
     np.testing.assert_allclose(v[:, 1, 0], path.impacts.v_out[:count], atol=1e-14)
     np.testing.assert_allclose(u[:-1, 1, -1], wall[1:], atol=1e-14)
+
+
+def test_states_at_given_times_are_those_of_the_engine(case):
+    pair, path, impacts, line = case
+    u, v = states(pair, *impacts, 2.0 * np.arange(PERIODS))
+    np.testing.assert_allclose(u[1:], path.states.u[: PERIODS - 1], atol=1e-13)
+    np.testing.assert_allclose(v[1:], path.states.v[: PERIODS - 1], atol=1e-12)
+    assert np.isnan([u[0], v[0]]).all()  # before the first impact
+    u, v = states(pair, *impacts, line.t[:400])  # in contact
+    np.testing.assert_allclose([u, v], [line.u[:400], line.v[:400]], atol=1e-13)
 
 
 def test_no_impact_draws_nothing():

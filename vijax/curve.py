@@ -36,18 +36,41 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
 
     Source: `vijax.flow`, Eqs. (6)-(7) and (20)-(21) corrected.
     """
-    rows = [np.asarray(row, float) for row in (t, side, v_in, v_out, duration)]
-    there = np.isfinite(rows[0])
-    count = int(there.sum())
+    (t, side, v_in, v_out, duration), count = _padded(t, side, v_in, v_out, duration)
     if not count:
         return Curve(*np.empty((3, 0)))
-    # Padded, as every new length would compile anew.
-    width = 1 << (count - 1).bit_length()
-    t, side, v_in, v_out, duration = (np.resize(row[there], width) for row in rows)
     until = np.append(t[1:], t[-1])
     until[count - 1] = t[count - 1] + duration[count - 1]
     pieces = _pieces(pair, t, side, v_in, v_out, duration, until, samples)
     return Curve(*(np.asarray(piece)[:count].ravel() for piece in pieces))
+
+
+def states(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
+    (t, side, v_in, v_out, duration), count = _padded(t, side, v_in, v_out, duration)
+    index = np.searchsorted(t[:count], when, side="right") - 1
+    last = np.maximum(index, 0)
+    u, v = _at(pair, *(row[last] for row in (t, side, v_in, v_out, duration)), np.asarray(when, float))
+    return tuple(np.where(index < 0, np.nan, x) for x in (u, v))
+
+
+def _padded(*rows) -> tuple[list[np.ndarray], int]:
+    """Rows without what is not there, repeated to a power of two, as every new length would compile anew."""
+    rows = [np.asarray(row, float) for row in rows]
+    there = np.isfinite(rows[0])
+    count = int(there.sum())
+    width = 1 << max(count - 1, 0).bit_length()
+    return [np.resize(row[there], width) for row in rows], count
+
+
+@jax.jit
+def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, Array]:
+    """The ball a time after each impact."""
+    inside = when - t <= duration
+    held = jax.vmap(partial(_contact, pair))(t, side, v_in, jnp.where(inside, when - t, 0.0))
+    rise, v = flow.flight(pair.gamma, t + duration, v_out, jnp.where(inside, 0.0, when - t - duration))
+    free = 0.5 * side * pair.d + rise, v
+    return tuple(jnp.where(inside, *both) for both in zip(held, free, strict=True))
 
 
 @partial(jax.jit, static_argnames="samples")

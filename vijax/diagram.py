@@ -137,9 +137,7 @@ class Diagram:
         return math.prod(self.dims.values())
 
 
-def plan(
-    along: str, values: Any, axes: Mapping[str, Any], device: Harvester | None = None, **settings: Any
-) -> Diagram:
+def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | None = None, **settings: Any) -> Diagram:
     """Check what an orbit diagram is asked for; runs nothing.
 
     Args:
@@ -223,9 +221,7 @@ def _table(diagram: Diagram) -> dict[str, np.ndarray]:
     return table
 
 
-def _simulate_all(
-    diagram: Diagram, table: dict[str, np.ndarray]
-) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Indices and fields of every tile of chains, as the tiles are done."""
     level = (table["gamma"] == 0).all(axis=1)
     workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1

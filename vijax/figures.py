@@ -1,13 +1,13 @@
 """The paper's figures computed and drawn: runs -> orbit diagrams -> panels -> a picture."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vijax.curve import Curve, curve
+from vijax.curve import Curve, curve, states
 from vijax.diagram import orbit_diagram
 from vijax.model import ImpactPair, impact_pair
 from vijax.paper import FIGURES, PaperFigure, Run, Source, View
@@ -70,8 +70,32 @@ def diagram(run: Run) -> "xr.Dataset":
 
 def selected(source: Source) -> "xr.Dataset":
     """The part of a diagram that a source names; the points nearest to its values."""
-    found = diagram(source.run)
+    found = _mirrored(source.run) if source.mirror else diagram(source.run)
     return found.sel({name: value for name, value in source.where.items() if name in found.dims}, method="nearest")
+
+
+@lru_cache(maxsize=2)
+def _mirrored(run: Run) -> "xr.Dataset":
+    """The mirror image (u, t) -> (-u, t + 1) of a diagram along one axis: its strobes are half a period away."""
+    found = diagram(run)
+    later = np.floor(found["phase"])  # of two half periods, the second becomes the first of the next period
+    image = {name: -found[name] for name in ("v_in", "v_out", "side")}
+    image |= {"phase": found["phase"] + 1 - 2 * later, "period_number": found["period_number"] + later}
+    halfway = 2.0 * np.arange(1, run.keep + 1) - 1.0
+    strobes = [states(pair_of(point, run.wall), *_impacts(point), halfway) for point in _points_of(found, run)]
+    u, v = (np.stack(rows) for rows in zip(*strobes, strict=True))
+    dims = found["u_strobe"].dims
+    return found.assign(image).assign(u_strobe=(dims, -u), v_strobe=(dims, -v))
+
+
+def _points_of(found: "xr.Dataset", run: Run) -> Iterator["xr.Dataset"]:
+    return (found.isel({run.along: i}) for i in range(len(run.values)))
+
+
+def _impacts(point: "xr.Dataset") -> tuple[np.ndarray, ...]:
+    """Times on one clock, walls, velocities and contact times of the impacts of a single point."""
+    t = (point["phase"] + 2.0 * point["period_number"]).where(point["v_in"].notnull())
+    return t.values, *(point[name].values for name in ("side", "v_in", "v_out", "duration"))
 
 
 def pair_of(point: "xr.Dataset", wall: str) -> ImpactPair:
@@ -83,12 +107,10 @@ def pair_of(point: "xr.Dataset", wall: str) -> ImpactPair:
 def motion(source: Source, periods: int | None = None) -> Curve:
     """The dense curve through the kept impacts of a single point; of its first `periods` if given."""
     point = selected(source)
-    t = point["phase"].values + 2.0 * point["period_number"].values
-    t = np.where(np.isfinite(point["v_in"].values), t, np.nan)
+    t, *rest = _impacts(point)
     if periods is not None:
         t = np.where(t - t[0] < 2.0 * periods, t, np.nan)
-    impacts = (point[name].values for name in ("side", "v_in", "v_out", "duration"))
-    return curve(pair_of(point, source.run.wall), t, *impacts)
+    return curve(pair_of(point, source.run.wall), t, *rest)
 
 
 def panels(number: int) -> dict[str, Panel]:

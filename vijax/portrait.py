@@ -67,7 +67,7 @@ class Panel(NamedTuple):
         level: Heights of dashed horizontal lines, with their colour.
         log: Which axes are logarithmic: "", "x", "y" or "xy".
         span: Limits of x; None for those of the points.
-        top: Upper limit of y; None for that of the points.
+        top: Upper limit of a y from 0 on; None for that of the points.
     """
 
     title: str
@@ -173,7 +173,7 @@ def _draw(axes: Axes, letter: str, panel: Panel, columns: int) -> None:
     if panel.span is not None:
         axes.set_xlim(panel.span)
     if panel.top is not None:
-        axes.set_ylim(top=panel.top)
+        axes.set_ylim(-0.05 * panel.top, panel.top)
 
 
 def _key(panel: Panel) -> dict[str, Line2D]:
