@@ -55,7 +55,7 @@ def _options() -> list[click.Parameter]:
         click.Option(["--chi"], type=float, help="of hunt-crossley: damping over stiffness"),
         click.Option(["--exponent"], type=float, help="of hunt-crossley: exponent of the penetration [1.5]"),
         click.Option(["--dtype"], default="float64", show_default=True, help="float64 or float32"),
-        click.Option(["--outputs"], metavar="NAME,NAME", help="variables wanted [all but lyapunov]"),
+        click.Option(["--outputs"], metavar="NAME,NAME", help="variables wanted [all but asymmetry, lyapunov]"),
         *command.file_options(),
     ]
 

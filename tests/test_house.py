@@ -42,15 +42,17 @@ ROOMS: dict[str, set[str]] = {
     "record": {"model", "exact", "lanes", "trajectory"},
     "axes": {"model"},
     "dataset": {"model", "method", "axes", "simulate"},
+    "label": {"model"},
     "store": set(),
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
-    "compare": {"model", "dataset", "grid"},
+    "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
+    "compare": {"model", "dataset", "label", "grid"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
     "paper": set(),
     "portrait": {"store"},
     "figures": {"model", "curve", "paper", "portrait", "diagram"},
     "chart": {"store"},
-    "plot": {"model", "axes", "dataset", "store", "grid", "compare"},
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "attractor", "compare"},
 }
 ROOMS["__init__"] = set(ROOMS)
 

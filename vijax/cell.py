@@ -35,6 +35,7 @@ class Plan(eqx.Module):
     level: bool = eqx.field(static=True)  # gamma = 0 everywhere
     deep: bool = eqx.field(static=True)
     energies: bool = eqx.field(static=True)
+    asymmetry: bool = eqx.field(static=True)
     tangent: bool = eqx.field(static=True)
     variants: int = eqx.field(static=True)
     chained: bool = eqx.field(static=True, default=False)  # a cell starts in the last one's state (`relay`)
@@ -61,6 +62,7 @@ class Tally(eqx.Module):
     rebound_right: Lane
     contact: Lane
     fastest: Lane
+    momentum: Lane | None  # sum of v_in, signed
     deepest: Lane | None
     energy: Float[Array, "lane variant"] | None  # of the running batch
     energy_past: Float[Array, "lane variant"] | None  # of the full batches
@@ -152,7 +154,8 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
     wide = jnp.zeros((*like.shape, plan.variants), like.dtype) if plan.energies else None
     stuck = jnp.zeros(like.shape, bool) if plan.rigid else None
     deepest = zero if plan.deep else None
-    return Tally(zero, zero, zero, zero, zero, zero, deepest, wide, wide, wide, wide, stuck)
+    momentum = zero if plan.asymmetry else None
+    return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, wide, wide, wide, wide, stuck)
 
 
 def last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:

@@ -14,6 +14,7 @@ import numpy as np
 from vijax import grid
 from vijax.dataset import Plan
 from vijax.grid import Axes
+from vijax.label import ordered
 from vijax.model import Harvester, Status
 
 if TYPE_CHECKING:
@@ -161,9 +162,10 @@ def _label(found: "xr.Dataset") -> "xr.DataArray":
     soft, rigid = (
         [found[f"{name}_{wall}"] for name in ("period", "impacts_left", "impacts_right")] for wall in ("soft", "rigid")
     )
-    alike = (soft[1] == rigid[1]) & (soft[2] == rigid[2])
-    mirrored = (soft[1] == rigid[2]) & (soft[2] == rigid[1]) & (found["gamma"] == 0)
-    agrees = (soft[0] == rigid[0]) & (alike | mirrored)
+    (soft_few, soft_many), (rigid_few, rigid_many) = (
+        ordered(left, right, found["gamma"] == 0) for _, left, right in (soft, rigid)
+    )
+    agrees = (soft[0] == rigid[0]) & (soft_few == rigid_few) & (soft_many == rigid_many)
     known = (soft[0] >= 0) & (rigid[0] >= 0)
     return _flags(
         agrees.where(known, Label.UNDECIDED), Label, "whether period and impacts agree, mirror images as one", found

@@ -78,6 +78,11 @@ OUTPUTS = {
     "impacts_per_period": Output("1", "impacts on both walls per forcing period", ("impacts_per_period",)),
     "max_penetration": Output("m", "greatest penetration of the membrane", ("deepest",), _penetration),
     "max_impact_speed": Output("m s-1", "greatest speed at the onset of an impact", ("fastest",), _speed),
+    "asymmetry": Output(
+        "1",
+        "mean velocity at the onset of an impact over the greatest; mirror images differ in its sign",
+        ("asymmetry",),
+    ),
     "restitution": Output("1", "mean of -v_out / v_in over all impacts, NaN without impacts", ("restitution",)),
     "restitution_left": Output("1", "mean of -v_out / v_in over left impacts", ("restitution_left",)),
     "restitution_right": Output("1", "mean of -v_out / v_in over right impacts", ("restitution_right",)),
@@ -94,6 +99,8 @@ OUTPUTS = {
     "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
     "status": Output("1", "how the cell ended", ("status",)),
 }
+# Few ask for them.
+ON_REQUEST = ("asymmetry", "lyapunov")
 
 
 def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":

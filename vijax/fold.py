@@ -117,6 +117,7 @@ def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, traci
         rebound_right=old.rebound_right + jnp.where(right, rebound, 0.0),
         contact=old.contact + jnp.where(counted, hit.duration, 0.0),
         fastest=jnp.maximum(old.fastest, speed),
+        momentum=old.momentum + jnp.where(counted, hit.v_in, 0.0) if plan.asymmetry else None,
         deepest=jnp.where(counted, jnp.maximum(old.deepest, hit.depth), old.deepest) if plan.deep else None,
         energy=gain,
         energy_past=past,

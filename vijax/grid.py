@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike
 from vijax import method as methods
 from vijax import simulate
 from vijax.axes import cells
-from vijax.dataset import OUTPUTS, Plan, label
+from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
 from vijax.store import load, save
@@ -99,8 +99,8 @@ def sweep(
         membrane: Of "ode" and "rk4": `HuntCrossley(chi)` for the linear membrane. It takes no r: the map's
             `restitution` is what came out.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
-        outputs: The variables wanted, of those in `vijax.dataset.OUTPUTS`; all but `lyapunov` unless given. What is not
-            wanted is not computed. `status` always comes.
+        outputs: The variables wanted, of those in `vijax.dataset.OUTPUTS`; all but `asymmetry` and `lyapunov` unless
+            given. What is not wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
         progress: Called with (cells done, cells in all) from the calling thread, first with 0 done.
@@ -159,7 +159,7 @@ def plan(
     options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
     method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
     if outputs is None:
-        outputs = (name for name in OUTPUTS if name != "lyapunov")
+        outputs = (name for name in OUTPUTS if name not in ON_REQUEST)
     wanted = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     for name in wanted:
         if name not in OUTPUTS:

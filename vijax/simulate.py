@@ -160,6 +160,7 @@ def summarise(
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=bool(outputs & DEEP),
         energies=bool(outputs & ENERGY),
+        asymmetry="asymmetry" in outputs,
         tangent=until == "attractor" or "lyapunov" in outputs,
         variants=scale.length_variant.shape[0],
     )

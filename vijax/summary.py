@@ -24,6 +24,7 @@ class Summary(eqx.Module):
     energy_ratio: Float[Array, "cell variant"] | None  # largest E_j/W_j
     deepest: Float[Array, "cell"] | None
     fastest: Float[Array, "cell"]
+    asymmetry: Float[Array, "cell"] | None  # mean of v_in over the greatest speed
     period: Int[Array, "cell"]
     impacts_left: Int[Array, "cell"]
     impacts_right: Int[Array, "cell"]
@@ -91,6 +92,7 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
         energy_ratio=ratio,
         deepest=jnp.where(failed, jnp.nan, jnp.where(silent, 0.0, t.deepest)) if plan.deep else None,
         fastest=measured(t.fastest),
+        asymmetry=per(t.momentum, hits * t.fastest) if plan.asymmetry else None,
         period=period,
         impacts_left=jnp.where(labelled, jnp.where(still, 0.0, jnp.round(t.left * prime / span)), -1.0),
         impacts_right=jnp.where(labelled, jnp.where(still, 0.0, jnp.round(t.right * prime / span)), -1.0),
@@ -151,6 +153,7 @@ def unpack(plan: Plan, table: Float[Array, "cell out"]) -> Summary:
         energy_ratio=take(wide) if plan.energies else None,
         deepest=take(None) if plan.deep else None,
         fastest=take(None),
+        asymmetry=take(None) if plan.asymmetry else None,
         period=whole(),
         impacts_left=whole(),
         impacts_right=whole(),
@@ -174,4 +177,5 @@ def _unpack_handover(take: Callable[[None], Lane]) -> Handover:
 
 def columns(plan: Plan) -> int:
     """Length of a row of `pack`."""
-    return 12 + 3 * plan.variants * plan.energies + plan.deep + plan.tangent + _HANDOVER * plan.chained
+    scales, chained = 3 * plan.variants * plan.energies, _HANDOVER * plan.chained
+    return 12 + scales + plan.deep + plan.asymmetry + plan.tangent + chained

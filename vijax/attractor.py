@@ -1,0 +1,501 @@
+"""Coexisting attractors: their basins, what share of all starts each one takes, Lyapunov exponents, long transients.
+
+All of it is the one line of a sweep over many starts; here the cells that ended on the same attractor are found, by
+what was measured on it.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from vijax import grid
+from vijax.axes import cells
+from vijax.dataset import Plan
+from vijax.grid import Axes
+from vijax.label import FAILED, label, ordered
+from vijax.method import whole
+from vijax.model import Harvester, Status
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["basin_fractions", "basins", "label", "lyapunov", "survival"]
+
+SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
+_START_POINTS = 256
+# Invariants of polished orbits agree to 3e-11 from start to start on a dozen planes of 4096 starts, and differ between
+# attractors by 2e-2 and more; single precision loses nine digits.
+_SAME = {"float64": 1e-6, "float32": 1e-3}
+_COUNTS = ("impacts_left", "impacts_right")
+_ENDED = ("period", *_COUNTS, "status")
+_INVARIANTS = ("max_impact_speed", "asymmetry", "contact_fraction", "restitution_left", "restitution_right")
+_MEASURES = ("P", "max_impact_speed", "impacts_per_period", "contact_fraction", "lyapunov")
+_OUTPUTS = tuple(dict.fromkeys((*_ENDED, *_INVARIANTS, *_MEASURES, "admissible", "periods_run")))
+_TEXTS = {
+    "label": "impacts left:right/forcing periods",
+    "periodic": "whether a period was found",
+    "starts": "starts that end on the attractor",
+    "fraction": "part of all starts",
+}
+# What stands past the last attractor of a cell, by kind of value and for those that are counts.
+_BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "U": ""}
+_NONE = {"starts": 0, "fraction": 0.0}
+# Its growth from the identity is no stretching along the motion: the difference to a longer window is.
+_WARM_UP = 100
+_INSTANTS = 100  # points of a survival curve
+_SPREADS = ("its standard error", "the lowest of the ensemble", "the highest of the ensemble")
+_NEAR = 0.01  # spread of an ensemble around its start, in parts of the gap and of the unit of velocity
+
+
+def basins(
+    *,
+    u0: ArrayLike | None = None,
+    v0: ArrayLike | None = None,
+    merge_mirrors: bool = False,
+    periods: int = 400,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    dtype: str = "float64",
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Any,
+) -> "xr.Dataset":
+    """Which attractor each start of a (u0, v0) plane ends on, and a table of the attractors.
+
+        found = basins(d=0.2, kappa=3.0, r=0.5, v0=np.linspace(-0.6, 0.6, 400))
+        found.label.values, found.fraction.values  # the commonest first
+
+    Starts are matched by invariants of the polished orbit: period, impacts on either side, the greatest impact speed,
+    the part of the time in contact, restitution left and right, and the mean impact velocity, which tells mirror
+    images apart. Level ground and d > 2/pi^2: all motions that touch no wall again are one entry, "no impact".
+    Aperiodic motions of one parameter cell are one entry as well, and so are undecided ones: "aperiodic" says that no
+    period was found in `periods_run` periods, not that none will be.
+
+    Args:
+        u0: Displacements at the start; the whole of the widest gap unless given, in as many points as `v0` has.
+        v0: Velocities at the start; 256 between -0.6 and 0.6 unless given.
+        merge_mirrors: Count mirror images as one attractor; gamma must be 0 everywhere.
+        periods, wall, device, dtype, progress: As in `sweep`.
+        axes: Any other axes of `sweep`; every point of arrays among them has a table of its own.
+
+    Returns:
+        `basin` over all axes: the place of the start's attractor in its parameter cell's table, whose variables have
+        the dimension `attractor`: `label`, `period`, `impacts_left`, `impacts_right`, `P` [J per half period],
+        `max_impact_speed` [m/s], `impacts_per_period`, `contact_fraction`, `lyapunov`, `admissible`, `periodic`,
+        `starts` (how many end there), `fraction` (of all), `periods_run` (the most any start took), `status`. Entries
+        are in the order of `starts`; rows past a cell's last hold "" and NaN. `attractors` counts those of a cell.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+    """
+    planned = plan_basins(
+        axes | {"u0": u0, "v0": v0}, device, merge_mirrors=merge_mirrors, periods=periods, wall=wall, dtype=dtype
+    )
+    return matched(grid.run(planned, progress), merge_mirrors)
+
+
+def plan_basins(
+    axes: Mapping[str, Any], device: Harvester | None = None, *, merge_mirrors: bool = False, **settings: Any
+) -> Plan:
+    """Check what `basins` is asked for and lay out its cells; runs nothing.
+
+    Args:
+        axes: Value or values of each axis; None counts as not given.
+        device, merge_mirrors: As in `basins`.
+        settings: periods, wall, dtype: all of them, as in `basins`.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came.
+    """
+    others = {name: values for name, values in axes.items() if values is not None and name not in ("u0", "v0")}
+    u0, v0 = axes.get("u0"), axes.get("v0")
+    if v0 is None:
+        v0 = np.linspace(-SPEED, SPEED, _START_POINTS)
+    if u0 is None:
+        gap = cells(others, Harvester() if device is None else device, "soft").quantities["d"].values.max()
+        u0 = gap * _middles(max(np.size(v0), 2))
+    return _plan({"u0": u0, "v0": v0} | others, device, merge_mirrors, settings)
+
+
+def basin_fractions(
+    *,
+    starts: int = 64,
+    speed: float = SPEED,
+    seed: int | None = None,
+    merge_mirrors: bool = False,
+    periods: int = 400,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    dtype: str = "float64",
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Any,
+) -> "xr.Dataset":
+    """The share of starts that each coexisting attractor takes, for every parameter cell: multistability maps.
+
+    Starts are spread uniformly over the gap and over velocities between -`speed` and `speed`, alike in every cell.
+
+    Args:
+        starts: How many, in every cell.
+        speed: Largest velocity at the start, dimensionless.
+        seed: Of starts drawn at random; unless given they lie on a lattice, which is more even.
+        merge_mirrors, periods, wall, device, dtype, progress: As in `basins`.
+        axes: Any axes of `sweep` but u0 and v0.
+
+    Returns:
+        As `basins`, with the dimension `start` in place of u0 and v0, which are its coordinates; and of random starts
+        `fraction_stderr`, by the binomial distribution.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+    """
+    planned = plan_fractions(
+        axes,
+        device,
+        starts=starts,
+        speed=speed,
+        seed=seed,
+        merge_mirrors=merge_mirrors,
+        periods=periods,
+        wall=wall,
+        dtype=dtype,
+    )
+    found = matched(grid.run(planned, progress), merge_mirrors)
+    if seed is not None:
+        share = found["fraction"]
+        found["fraction_stderr"] = (share * (1 - share) / starts) ** 0.5
+        found["fraction_stderr"].attrs = {"units": "1", "long_name": "standard error of the fraction"}
+    return found
+
+
+def plan_fractions(
+    axes: Mapping[str, Any],
+    device: Harvester | None = None,
+    *,
+    starts: int,
+    speed: float,
+    seed: int | None,
+    merge_mirrors: bool = False,
+    **settings: Any,
+) -> Plan:
+    """Check what `basin_fractions` is asked for and lay out its cells; runs nothing.
+
+    Args:
+        axes, device, starts, speed, seed, merge_mirrors: As in `basin_fractions`.
+        settings: periods, wall, dtype: all of them, as in `basins`.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came.
+    """
+    for name in ("u0", "v0"):
+        if axes.get(name) is not None:
+            raise TypeError(f"{name} must be left out where starts are drawn; got {axes[name]!r}")
+    if not 0 < speed < np.inf:
+        raise ValueError(f"speed must be positive and finite; got {speed!r}")
+    place = _spread(whole("starts", starts, 1), seed)
+    planned = _plan(axes, device, merge_mirrors, settings)
+    return _started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
+
+
+def _plan(axes: Mapping[str, Any], device: Harvester | None, merge_mirrors: bool, settings: dict[str, Any]) -> Plan:
+    planned = grid.plan(axes, _OUTPUTS, device, until="attractor", transient=0, method="exact", **settings)
+    gamma = planned.cells.quantities["gamma"].values
+    if merge_mirrors and gamma.any():
+        got = gamma[gamma != 0].flat[0]
+        raise ValueError(f"merge_mirrors must be left out unless gamma is 0 everywhere; got gamma = {got:g}")
+    return planned
+
+
+def _middles(count: int) -> np.ndarray:
+    """Middles of `count` equal parts of [-1/2, 1/2]."""
+    return (np.arange(count) + 0.5) / count - 0.5
+
+
+def _spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
+    """Points spread uniformly over the unit square around 0, along the dimension `start`."""
+    import xarray as xr  # here, as importing vijax must not load it
+
+    if seed is None:
+        # The lattice of the root of x^3 = x + 1, as even in the plane as that of the golden ratio is on a line.
+        root = 1.324717957244746
+        points = (0.5 + np.arange(1, count + 1) * np.array([[1 / root], [1 / root**2]])) % 1
+    else:
+        points = np.random.default_rng(seed).random((2, count))
+    first, second = points - 0.5
+    return xr.Variable("start", first), xr.Variable("start", second)
+
+
+def _started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:
+    """A plan whose cells have one more dimension, `start`, on which their starts depend."""
+    of = planned.cells
+    laid = replace(
+        of,
+        sizes=of.sizes | {"start": u0.sizes["start"]},
+        dynamic=(*of.dynamic, "start"),
+        quantities=of.quantities | {"u0": u0, "v0": v0},
+    )
+    return replace(planned, cells=laid)
+
+
+# --- which starts end on the same attractor ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Starts sorted by the attractor on which they end; the groups of a cell lie together.
+
+    Attributes:
+        order: Starts, group by group.
+        first: Where each group begins in that order.
+        counts: Starts of each group.
+        cell: The parameter cell of each group.
+        rank: Its place among the groups of its cell, the largest first.
+    """
+
+    order: np.ndarray
+    first: np.ndarray
+    counts: np.ndarray
+    cell: np.ndarray
+    rank: np.ndarray
+
+
+def _groups(cell: np.ndarray, group: np.ndarray) -> _Groups:
+    order = np.argsort(group, kind="stable")
+    _, first, counts = np.unique(group[order], return_index=True, return_counts=True)
+    of = cell[order[first]]
+    places = np.lexsort((-counts, of))
+    rank = np.empty_like(places)
+    rank[places] = np.arange(of.size) - np.searchsorted(of, of)[places]
+    return _Groups(order, first, counts, of, rank)
+
+
+def _group(cell: np.ndarray, measured: dict[str, np.ndarray], merge_mirrors: bool, apart: float) -> np.ndarray:
+    """A number for every start, alike where it is the same attractor of the same cell; in the order of the cells."""
+    period = np.where(np.isin(measured["status"], FAILED), -2, measured["period"]).astype(np.int64)
+    left, right = ordered(measured["impacts_left"], measured["impacts_right"], merge_mirrors)
+    resting = measured["status"] == Status.PERMANENT_CONTACT
+    kind = ((period << 20 | left + 1) << 20 | right + 1) << 1 | resting
+    group = _parted(cell, kind, 0)
+    for values in _invariants(measured, merge_mirrors):
+        # Averages over chaos differ from start to start and tell nothing apart.
+        group = _parted(group, np.where(period > 0, values, 0.0), apart)
+    return group
+
+
+def _invariants(measured: dict[str, np.ndarray], merge_mirrors: bool) -> list[np.ndarray]:
+    """What is the same for all starts of a periodic attractor and, of mirror images to be merged, for both of them."""
+    speed, asymmetry, contact, *restitution = (np.nan_to_num(measured[name], nan=-1.0) for name in _INVARIANTS)
+    while speed.ndim > 1:  # the unit of speed may vary where the motion does not
+        speed = speed[0]
+    speed = np.log(np.maximum(speed, np.finfo(speed.dtype).tiny))
+    if merge_mirrors:
+        asymmetry, restitution = abs(asymmetry), [np.minimum(*restitution), np.maximum(*restitution)]
+    return [speed, asymmetry, contact, *restitution]
+
+
+def _parted(group: np.ndarray, values: np.ndarray, apart: float) -> np.ndarray:
+    """Groups parted further wherever, in ascending order, values of one group are further apart than a tolerance."""
+    order = np.lexsort((values, group))
+    parts = (np.diff(group[order]) != 0) | (np.diff(values[order]) > apart)
+    parted = np.empty_like(group)
+    parted[order] = np.concatenate([[0], np.cumsum(parts)])
+    return parted
+
+
+def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
+    """The attractor of every start, and a table of attractors for every cell of the other dimensions.
+
+    Args:
+        found: A sweep over starts (u0, v0, or `start`) with the outputs that `basins` asks for.
+        merge_mirrors: As in `basins`.
+
+    Returns:
+        As `basins`.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    over = tuple(dim for dim in ("u0", "v0", "start") if dim in found["period"].dims)
+    dims = tuple(str(dim) for dim in found["period"].dims if dim not in over)
+    shape = tuple(found.sizes[dim] for dim in dims)
+    starts = math.prod(found.sizes[dim] for dim in over)
+    measured = {name: _flat(found[name].variable, dims, over) for name in _OUTPUTS}
+    cell = np.repeat(np.arange(math.prod(shape)), starts)
+    group = _group(cell, measured, merge_mirrors, _SAME[found.attrs["dtype"]])
+    groups = _groups(cell, group)
+    basin = groups.rank[group].reshape(*shape, *(found.sizes[dim] for dim in over)).astype(np.int32)
+    variables = {"basin": xr.Variable((*dims, *over), basin, _described("place of the start's attractor in the table"))}
+    variables["basin"] = variables["basin"].transpose(*found["period"].dims)
+    for name, values in _entries(measured, groups, merge_mirrors, starts).items():
+        further = [dim for dim in found[name].dims if dim not in (*dims, *over)] if name in found else []
+        attributes = found[name].attrs if name in found else _described(_TEXTS[name])
+        table = _laid_out(values, groups, shape, _NONE.get(name, _BLANK[values.dtype.kind]))
+        variables[name] = xr.Variable((*further, *dims, "attractor"), table, attributes)
+    variables["attractors"] = (variables["period"] >= 0).sum("attractor")
+    variables["attractors"].attrs = _described("attractors found; aperiodic motions are one, undecided starts none")
+    attributes = found.attrs | {"title": "Basins of attraction", "merge_mirrors": int(merge_mirrors)}
+    return xr.Dataset(variables, coords=found.coords, attrs=attributes)
+
+
+def _flat(variable: "xr.Variable", dims: tuple[str, ...], over: tuple[str, ...]) -> np.ndarray:
+    """Values of every start, cell by cell, on the last axis; dimensions that the motion does not depend on before it."""
+    further = [dim for dim in variable.dims if dim not in (*dims, *over)]
+    values = variable.transpose(*further, *dims, *over).values
+    return values.reshape(*values.shape[: len(further)], -1)
+
+
+def _entries(
+    measured: dict[str, np.ndarray], groups: _Groups, merge_mirrors: bool, starts: int
+) -> dict[str, np.ndarray]:
+    """The table's columns, each [..., group]."""
+    first = {name: measured[name][..., groups.order[groups.first]] for name in (*_ENDED, "admissible")}
+    left, right = ordered(first["impacts_left"], first["impacts_right"], merge_mirrors)
+    means = {
+        name: np.add.reduceat(measured[name][..., groups.order], groups.first, axis=-1) / groups.counts
+        for name in _MEASURES
+    }
+    return {
+        "label": label(first["period"], left, right, first["status"]),
+        **first,
+        "impacts_left": left,
+        "impacts_right": right,
+        **means,
+        "periods_run": np.maximum.reduceat(measured["periods_run"][groups.order], groups.first),
+        "periodic": first["period"] > 0,
+        "starts": groups.counts,
+        "fraction": groups.counts / starts,
+    }
+
+
+def _laid_out(values: np.ndarray, groups: _Groups, shape: tuple[int, ...], blank: Any) -> np.ndarray:
+    """Values of every group [..., group] over the cells and, by rank, their groups; blank past a cell's last."""
+    table = np.full((*values.shape[:-1], math.prod(shape), groups.rank.max() + 1), blank, values.dtype)
+    table[..., groups.cell, groups.rank] = values
+    return table.reshape(*values.shape[:-1], *shape, -1)
+
+
+def _described(text: str) -> dict[str, Any]:
+    return {"units": "1", "long_name": text}
+
+
+# --- chaos, and what only looks like it ---------------------------------------------------------------------------------
+
+
+def lyapunov(
+    *,
+    starts: int = 64,
+    periods: int = 2000,
+    transient: int = 500,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Unpack[Axes],
+) -> "xr.Dataset":
+    """Largest Lyapunov exponent per forcing period of the motion from a start, with its standard error.
+
+    The exact tangent map is multiplied up along an ensemble of motions from starts around the given one, u0 up to 1 %
+    nearer to the middle and v0 up to 0.005 off. The map starts from the identity, which biases a finite window by some
+    0.5/periods; the growth in its first 100 periods, when it turns to the most unstable direction, is taken off.
+
+    Args:
+        starts: Size of the ensemble, at least 2.
+        periods: Forcing periods over which the growth is measured, for every start.
+        transient: Forcing periods to drop first: long enough to reach the attractor, and for the starts to part.
+        wall, device, progress, axes: As in `sweep`.
+
+    Returns:
+        Over the axes `lyapunov` [per forcing period], `lyapunov_stderr`, and `lyapunov_lowest` and `lyapunov_highest`
+        of the ensemble: where these lie many standard errors times sqrt(starts) apart, the starts have ended on
+        different attractors. NaN where the motion leaves the walls for ever.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    periods = whole("periods", periods, 1)
+    place = _spread(whole("starts", starts, 2), None)
+    settings = {"until": "window", "transient": transient, "wall": wall, "method": "exact", "dtype": "float64"}
+    growths = []
+    for done, window in enumerate((_WARM_UP, _WARM_UP + periods)):
+        planned = grid.plan(axes, ("lyapunov",), device, periods=window, **settings)
+        of = planned.cells.quantities
+        near = _started(planned, of["u0"] * (1 - _NEAR * (0.5 + place[0])), of["v0"] + _NEAR * place[1])
+        tell = _halves(progress, done)
+        run = grid.run(near, tell)
+        growths.append(run["lyapunov"] * window)
+    first, last = growths
+    # What sticks to a wall forgets its start altogether.
+    exponent = ((last - first) / periods).where(last > -np.inf, -np.inf).where(last.notnull())
+    error = exponent.std("start", ddof=1) / starts**0.5
+    found = {
+        "lyapunov": exponent.mean("start"),
+        "lyapunov_stderr": error,
+        "lyapunov_lowest": exponent.min("start", skipna=False),
+        "lyapunov_highest": exponent.max("start", skipna=False),
+    }
+    for values, text in zip(found.values(), ("largest Lyapunov exponent per forcing period", *_SPREADS), strict=True):
+        values.attrs = _described(text)
+    return xr.Dataset(found, attrs=run.attrs | {"title": "Largest Lyapunov exponents", "periods": periods})
+
+
+def _halves(progress: Callable[[int, int], None] | None, done: int) -> Callable[[int, int], None] | None:
+    """The progress of the first or the second of two runs alike, as that of both."""
+    return progress and (lambda now, total: progress(done * total + now, 2 * total))
+
+
+def survival(
+    *,
+    starts: int = 1000,
+    speed: float = SPEED,
+    seed: int | None = None,
+    periods: int = 10_000,
+    transient: int = 200,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Any,
+) -> "xr.Dataset":
+    """How long aperiodic motions last: chaos that ends is a transient, however much it looked like an attractor.
+
+    The mean lifetime is that of an exponential law, the time spent by all motions over the number that ended: right
+    for motions that have forgotten their start, as those that outlast `transient` have.
+
+    Args:
+        starts, speed, seed, axes: As in `basin_fractions`.
+        periods: Forcing periods to look.
+        transient: Lifetimes are counted from here on, of the motions that are still aperiodic then.
+        wall, device, progress: As in `sweep`.
+
+    Returns:
+        Over the axes: `survival` over `after` [forcing periods], the part of all starts still without a period or
+        rest; `lifetime` [forcing periods] and `lifetime_stderr`, infinite where no motion ended.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    if transient >= periods:
+        raise ValueError(f"transient must be less than periods; got {transient} and {periods}")
+    planned = plan_fractions(
+        axes, device, starts=starts, speed=speed, seed=seed, periods=periods, wall=wall, dtype="float64"
+    )
+    found = grid.run(replace(planned, outputs=("period", "periods_run", "status")), progress)
+    ended = found["period"] > 0
+    spent = found["periods_run"].where(ended, np.inf)
+    after = xr.Variable("after", np.linspace(0, periods, _INSTANTS + 1), {"units": "1", "long_name": "forcing periods"})
+    lasting = (spent > transient) & (found["status"] < Status.EVENT_BUDGET)
+    time = (spent.clip(max=periods) - transient).where(lasting, 0.0).sum("start")
+    number = (ended & lasting).sum("start")
+    lifetime = (time / number).where(number > 0, np.inf)
+    result = {
+        "survival": (spent > after).mean("start").transpose(..., "after"),
+        "lifetime": lifetime,
+        "lifetime_stderr": (lifetime / number**0.5).where(number > 0, np.inf),
+    }
+    texts = ("part of all starts that are still aperiodic", "mean lifetime, forcing periods", "its standard error")
+    for values, text in zip(result.values(), texts, strict=True):
+        values.attrs = _described(text)
+    return xr.Dataset(result, coords={"after": after}, attrs=found.attrs | {"title": "Survival of aperiodic motion"})
