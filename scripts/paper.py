@@ -70,11 +70,11 @@ def _draw(number: int, file: Path) -> None:
 def _check(file: Path) -> None:
     from vijax import claims
 
-    found = []
-    for claim in claims.CLAIMS:
-        found.append(claims.check(claim))
-        click.echo(claims.line(found[-1]))
-    file.write_text(claims.markdown(found), encoding="utf-8")
+    rows = []
+    for claim in claims.CLAIMS.values():
+        rows.append((claim, claim.check()))
+        click.echo(claims.line(*rows[-1]))
+    file.write_text(claims.markdown(rows), encoding="utf-8")
     click.echo(f"wrote {file}")
 
 

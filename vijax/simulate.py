@@ -256,6 +256,7 @@ def follow(
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=True,
         energies=True,
+        asymmetry=False,
         tangent=True,
         variants=1,
         chained=True,
