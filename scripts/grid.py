@@ -3,6 +3,7 @@
     python scripts/grid.py
     python scripts/grid.py --gamma 0.1 --out inclined.zarr --plot inclined.png
     python scripts/grid.py --omega pi:6pi:96 --omega0 20:400:96 --plot device.png
+    python scripts/grid.py --show label --plot labels.png
     python scripts/grid.py --kappa 3:4000:128:log --compare rigid --tolerance 0.05
 
 An axis is a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE; arrays become dimensions in the order given: x, y and
@@ -12,6 +13,7 @@ panels of the picture. Write a range that begins with a minus as --u0=-0.1:0.1:9
 import math
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,8 +30,12 @@ if TYPE_CHECKING:
 _DEFAULT_PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
 _METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", "chi", "exponent")
 _LONG = 9  # periods from here on are counted together
-_DEFAULT_FILES = ("power_map.zarr", "power_map.png")
-_COMPARISON_FILES = ("comparison.zarr", "comparison.png")
+_SHOWN = ("power", "label")
+_FILES = {
+    "power": ("power_map.zarr", "power_map.png"),
+    "label": ("label_map.zarr", "label_map.png"),
+    "difference": ("comparison.zarr", "comparison.png"),
+}
 
 
 def _options() -> list[click.Parameter]:
@@ -55,15 +61,20 @@ def _options() -> list[click.Parameter]:
         click.Option(["--chi"], type=float, help="of hunt-crossley: damping over stiffness"),
         click.Option(["--exponent"], type=float, help="of hunt-crossley: exponent of the penetration [1.5]"),
         click.Option(["--dtype"], default="float64", show_default=True, help="float64 or float32"),
-        click.Option(["--outputs"], metavar="NAME,NAME", help="variables wanted [all but asymmetry, lyapunov]"),
+        click.Option(
+            ["--outputs"],
+            metavar="NAME,NAME",
+            help="variables wanted [all but asymmetry, lyapunov; for labels lyapunov too]",
+        ),
+        click.Option(["--show"], default="power", show_default=True, help="what the picture shows: power or label"),
         *command.file_options(),
     ]
 
 
 @click.command(
     params=_options(),
-    epilog=f"{command.VALUES} With neither --out nor --plot, power_map.zarr and power_map.png are written, or "
-    "comparison.zarr and comparison.png.",
+    epilog=f"{command.VALUES} With neither --out nor --plot, power_map.zarr and power_map.png are written, "
+    "or the same of label_map or comparison.",
     context_settings={"max_content_width": 120},
 )
 def power_map(
@@ -71,37 +82,54 @@ def power_map(
     outputs: str | None,
     compare: str | None,
     tolerance: float | None,
+    show: str,
     overwrite: bool,
     **given: Any,
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
     with command.door():
-        defaults = _DEFAULT_FILES if compare is None else _COMPARISON_FILES
-        out, plot = command.targets(given.pop("out"), given.pop("plot"), defaults, overwrite)
+        _check_show(show, compare, given["until"])
+        picture = show if compare is None else "difference"
+        out, plot = command.targets(given.pop("out"), given.pop("plot"), _FILES[picture], overwrite)
         axes, device = command.take_axes(given, _DEFAULT_PLANE), command.device(constants)
         if compare is None and tolerance is not None:
             raise ValueError(f"tolerance must come with compare; got {tolerance:g} alone; add --compare rigid")
         planned: Plan | Comparison
         if compare is None:
-            planned = _plan(axes, device, outputs, given)
+            planned = _plan(axes, device, _wanted(outputs, show), given)
         else:
             planned = _comparison(axes, device, outputs, compare, tolerance, given)
         if plot is not None:
-            _check_picture(plot, planned)
+            _check_picture(plot, planned, show)
     keep_compiled()
     began = time.perf_counter()
     dataset = _run(planned)
     pace = command.pace(planned.count, time.perf_counter() - began)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
-    command.finish(dataset, f"{pace}\n{summary}", out, plot, _draw, overwrite)
+    command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite)
 
 
-def _plan(axes: dict[str, Any], device: Any, outputs: str | None, settings: dict[str, Any]) -> "Plan":
+def _check_show(show: str, compare: str | None, until: str) -> None:
+    if show not in _SHOWN:
+        raise ValueError(f"show must be power or label; got {show!r}")
+    if show == "label" and (compare is not None or until != "attractor"):
+        got = "a comparison" if compare is not None else f"until {until}"
+        raise ValueError(f"show must be power unless cells are run until their attractor; got label with {got}")
+
+
+def _wanted(outputs: str | None, show: str) -> list[str] | None:
+    if outputs is not None:
+        return [name.strip() for name in outputs.split(",")]
+    from vijax.dataset import ON_REQUEST, OUTPUTS
+
+    return [name for name in OUTPUTS if name not in ON_REQUEST or (show == "label" and name == "lyapunov")]
+
+
+def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, settings: dict[str, Any]) -> "Plan":
     from vijax.grid import plan
 
-    wanted = None if outputs is None else [name.strip() for name in outputs.split(",")]
     settings["membrane"] = _membrane(settings["membrane"], settings.pop("chi"), settings.pop("exponent"))
-    return plan(axes, wanted, device, **settings)
+    return plan(axes, outputs, device, **settings)
 
 
 def _comparison(
@@ -141,7 +169,7 @@ def _membrane(name: str | None, chi: float | None, exponent: float | None) -> An
     return None if name is None else Linear()
 
 
-def _check_picture(path: Path, planned: "Plan | Comparison") -> None:
+def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
     from vijax import plot as pictures
     from vijax.compare import Comparison
 
@@ -149,8 +177,13 @@ def _check_picture(path: Path, planned: "Plan | Comparison") -> None:
     if isinstance(planned, Comparison):
         pictures.layout(planned.soft.cells.sizes)
         return
-    pictures.layout(planned.cells.sizes)
-    missing = [name for name in pictures.NEEDS if name not in planned.outputs]
+    sizes = planned.cells.sizes
+    if show == "label":
+        pictures.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
+    else:
+        pictures.layout(sizes)
+    needs = pictures.LABEL_NEEDS if show == "label" else pictures.NEEDS
+    missing = [name for name in needs if name not in planned.outputs]
     if missing:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
 
@@ -163,10 +196,10 @@ def _run(planned: "Plan | Comparison") -> "xr.Dataset":
         return run(planned, show) if isinstance(planned, Comparison) else grid.run(planned, show)
 
 
-def _draw(dataset: "xr.Dataset", path: Path) -> None:
+def _draw(picture: str, dataset: "xr.Dataset", path: Path) -> None:
     from vijax import plot as pictures
 
-    (pictures.power_map if "P" in dataset else pictures.difference_map)(dataset, path)
+    getattr(pictures, f"{picture}_map")(dataset, path)
 
 
 def _summary(dataset: "xr.Dataset") -> str:

@@ -52,7 +52,7 @@ ROOMS: dict[str, set[str]] = {
     "portrait": {"store"},
     "figures": {"model", "curve", "paper", "portrait", "diagram"},
     "chart": {"store"},
-    "plot": {"model", "axes", "dataset", "label", "store", "grid", "attractor", "compare"},
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare"},
 }
 ROOMS["__init__"] = set(ROOMS)
 

@@ -9,6 +9,7 @@ from matplotlib.legend import Legend
 from vijax import plot
 from vijax.compare import Label, Model
 from vijax.dataset import best
+from vijax.model import Status
 
 SYMBOLS = {
     "d": ("d", "1"),
@@ -255,3 +256,117 @@ def test_missing_variables_and_endings_are_named(tmp_path):
         plot.power_map(drawn_map(d=D, kappa=KAPPA).drop_vars("admissible"))
     with pytest.raises(ValueError, match=r"plot must end in \.png"):
         plot.power_map(drawn_map(d=D, kappa=KAPPA), tmp_path / "map.doc")
+
+
+# --- maps of kinds ----------------------------------------------------------------------------------------------------
+
+
+def coords(**axes):
+    found = {name: (name, np.asarray(values), {"symbol": name, "units": "1"}) for name, values in axes.items()}
+    return found | {"gamma": ((), 0.0, {"symbol": r"\gamma", "units": "1"})}
+
+
+def labelled_map(gamma=0.0) -> xr.Dataset:
+    """Half the cells 1:1, then 2:1/2T with its mirror image, one label to a cell, and chaos in the last two columns."""
+    period = np.ones((20, 10), int)
+    left = np.ones_like(period)
+    period[10:12], left[10:12], period[12:14] = 2, 2, 2
+    right = np.where(np.arange(20)[:, None] // 2 == 6, 2, 1) + 0 * left
+    left[14:16] = 3 + np.arange(20).reshape(2, 10)
+    period[16:18], left[16:18], right[16:18] = -1, -1, -1
+    period[18:], left[18:], right[18:] = 0, -1, -1
+    dims = ("d", "kappa")
+    exponent = np.where(period == 0, np.linspace(0.1, 0.9, 10), -0.5)
+    status = np.where(period < 0, int(Status.SLOW), 0)
+    status[17] = Status.NO_IMPACT
+    period[17], left[17], right[17] = 1, 0, 0
+    values = {"period": period, "impacts_left": left, "impacts_right": right, "status": status, "lyapunov": exponent}
+    place = coords(d=np.linspace(0.1, 0.3, 20), kappa=np.geomspace(3, 30, 10))
+    found = xr.Dataset({name: (dims, value) for name, value in values.items()}, place, {"wall": "soft", "periods": 400})
+    found["gamma"] = found["gamma"] + gamma
+    return found
+
+
+def legend(figure) -> dict[str, tuple]:
+    """Text of every entry and its colour."""
+    (box,) = figure.legends or [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+    texts = (text.get_text() for text in box.get_texts())
+    return dict(zip(texts, (patch.get_facecolor() for patch in box.get_patches()), strict=True))
+
+
+def test_label_map_names_the_commonest_and_says_how_long_chaos_was_looked_at():
+    found = labelled_map()
+    figure = plot.label_map(found)
+    shown = legend(figure)
+    rare = {f"0.5 % 1:{n}" for n in range(3, 23)}
+    assert list(shown)[:2] == ["50 % 1:1", "20 % 1:2/2T"]  # mirror images as one
+    assert len(rare & set(shown)) == 10
+    assert {"5 % 10 other labels", "10 % aperiodic within 400 periods", "5 % undecided", "5 % no impact"} < set(shown)
+    assert len(set(shown.values())) == len(shown) == 16
+    mesh, shades = figure.axes[0].collections
+    colours = mesh.cmap(mesh.norm(mesh.get_array()))
+    for cell, text in (((0, 0), "50 % 1:1"), ((9, 13), "20 % 1:2/2T"), ((5, 16), "5 % undecided")):
+        assert tuple(colours[cell]) == shown[text], text
+    drawn = shades.get_array()
+    np.testing.assert_allclose(drawn[:, 18], found["lyapunov"][18])
+    assert drawn.mask[:, :18].all()
+    assert "Lyapunov exponent per forcing period" in [axes.get_xlabel() for axes in figure.axes]
+
+
+def test_label_map_keeps_mirror_images_apart_under_gravity_and_needs_no_exponent(tmp_path):
+    figure = plot.label_map(labelled_map(gamma=0.1).drop_vars("lyapunov"), tmp_path / "map.png")
+    assert {"10 % 2:1/2T", "10 % 1:2/2T"} < set(legend(figure))
+    assert len(figure.axes) == 1
+    assert (tmp_path / "map.png").stat().st_size
+
+
+def basin_table(**further) -> xr.Dataset:
+    table = {
+        "label": ["1:2/2T", "aperiodic", "1:1", ""],
+        "P": [4e-3, 2e-6, 1e-6, np.nan],
+        "starts": [40, 30, 10, 0],
+        "fraction": [0.5, 0.375, 0.125, 0.0],
+        "periods_run": [50.0, 300.0, 40.0, np.nan],
+    }
+    basin = np.repeat([0, 0, 0, 0, 1, 1, 1, 2], 10).reshape(8, 10)
+    found = {name: ("attractor", np.array(column)) for name, column in table.items()}
+    place = coords(u0=np.linspace(-0.1, 0.1, 8), v0=np.linspace(-0.6, 0.6, 10))
+    return xr.Dataset(found | {"basin": (("u0", "v0"), basin)} | further, place, {"wall": "soft"})
+
+
+def test_basin_map_lists_its_attractors():
+    found = basin_table()
+    figure = plot.basin_map(found)
+    shown = legend(figure)
+    chaos = "37.5 % aperiodic within 300 periods, $P$ = 2.00 µJ"
+    assert list(shown) == ["50 % 1:2/2T, $P$ = 4.00 mJ", chaos, "12.5 % 1:1, $P$ = 1.00 µJ"]
+    (mesh,) = figure.axes[0].collections
+    colours = mesh.cmap(mesh.norm(mesh.get_array()))
+    assert [tuple(colours[0, column]) for column in (0, 4, 7)] == list(shown.values())
+    assert figure.axes[0].get_xlabel() == "$u0$"
+
+
+def test_more_attractors_than_colours_are_others():
+    many, most = 40, plot._MOST_NAMED
+    found = basin_table().isel(attractor=np.zeros(many, int))
+    found["fraction"] = ("attractor", np.full(many, 1 / many))
+    found["basin"] = (("u0", "v0"), np.arange(80).reshape(8, 10) % many)
+    shown = legend(plot.basin_map(found))
+    assert list(shown)[-1] == f"70 % {many - most} others"
+
+
+def test_multistability_map_counts_attractors():
+    number = np.tile([0, 1, 1, 3], (5, 1))
+    place = coords(d=np.linspace(0.1, 0.3, 5), kappa=np.arange(3.0, 7.0))
+    found = xr.Dataset({"attractors": (("d", "kappa"), number)}, place, {"wall": "soft"})
+    shown = legend(plot.multistability_map(found))
+    assert list(shown) == ["25 % undecided", "50 % 1 attractor", "0 % 2 attractors", "25 % 3 attractors"]
+
+
+def test_a_map_of_kinds_wants_a_plane_and_its_variables():
+    with pytest.raises(ValueError, match="two axes of more than one value; got d alone"):
+        plot.label_map(labelled_map().isel(kappa=[0]))
+    with pytest.raises(ValueError, match="without status"):
+        plot.label_map(labelled_map().drop_vars("status"))
+    with pytest.raises(ValueError, match="without P"):
+        plot.basin_map(basin_table().drop_vars("P"))

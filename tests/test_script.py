@@ -9,9 +9,10 @@ import sys
 import grid as script
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import SCRIPTS
 
-from vijax import dataset, grid
+from vijax import dataset, grid, plot
 
 TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
 
@@ -89,6 +90,11 @@ BAD = [
     (["--compare", "rigid", "--u0", "0.2", "--d", "0.1,0.2"], "u0 must lie in the gap"),
     (["--compare", "rigid", "--d", "0.1", "--kappa", "30"], "single cell"),
     (["--compare", "rigid", "--plot", "map.doc"], "plot must end in"),
+    (["--show", "phase"], "show must be power or label; got 'phase'"),
+    (["--show", "label", "--until", "window"], "got label with until window"),
+    (["--show", "label", "--compare", "rigid"], "got label with a comparison"),
+    (["--show", "label", "--outputs", "period"], "outputs must hold impacts_left, impacts_right"),
+    (["--show", "label", "--kappa", "3"], "two axes of more than one value; got d alone"),
     (["--gravity", "1"], "No such option"),
     (["more"], "unexpected extra argument"),
 ]
@@ -180,6 +186,18 @@ def test_methods_and_membranes_arrive(planned):
     plan = planned("--method", "rk4", "--steps", "500", "--membrane", "linear")
     assert plan.method.steps == 500
     assert planned().method is None
+
+
+def test_labels_are_shown_with_exponents(folder, monkeypatch):
+    plans, drawn = [], []
+    ok = xr.Variable("d", [0, 0], {"flag_values": [0], "flag_meanings": "ok"})
+    monkeypatch.setattr(grid, "run", lambda plan, progress: plans.append(plan) or xr.Dataset({"status": ok}))
+    monkeypatch.setattr(plot, "label_map", lambda found, path: drawn.append(path.name))
+    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    assert script.main(["--show", "label", "--plot", "labels.png"]) == 0
+    assert {"lyapunov", "P", "period"} < set(plans[0].outputs)
+    assert "asymmetry" not in plans[0].outputs
+    assert drawn == ["labels.png"]
 
 
 def test_from_arguments_to_store_and_picture(folder, monkeypatch):

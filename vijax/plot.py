@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, QuadMesh
-from matplotlib.colors import LogNorm
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap, LogNorm, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -20,12 +20,14 @@ from matplotlib.ticker import EngFormatter
 
 from vijax.compare import Label, Model
 from vijax.dataset import best
+from vijax.label import label
 from vijax.store import replacing
 
 if TYPE_CHECKING:
     import xarray as xr
 
 NEEDS = ("P", "period", "admissible")
+LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
 MOST_PANELS = 36
 
 _STYLE: Any = {
@@ -57,6 +59,18 @@ _OUTLINE: dict[str, Any] = _LINE | {"color": "red", "linewidth": 1.2}
 _SINGLE = {"markersize": 4.0}  # of a mark that is not one of thousands
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "red", "mec": "white", "linestyle": "none"}
 _BARE: dict[str, Any] = {"color": "0.75"}
+# Of kinds: so many by name, in these colours; strong ones first, their pale sisters after them, without the greys.
+_MOST_NAMED = 12
+_COLOURS = [mpl.colormaps["tab20"](n) for n in (*range(0, 20, 2), *range(1, 20, 2)) if n not in (14, 15)]
+_OTHERS = "#fff3c4"
+_NO_ORBIT = {
+    "no impact": "0.93",
+    "permanent contact": "white",
+    "aperiodic": "0.35",
+    "undecided": "magenta",
+    "failed": "red",
+}
+_GREYS = LinearSegmentedColormap.from_list("greys", ["0.8", "black"])
 _VEIL: dict[str, Any] = {"facecolor": (1, 1, 1, 0.55), "edgecolor": "0.3", "hatch": "/////", "linewidth": 0}
 
 
@@ -81,6 +95,14 @@ def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
         raise ValueError(f"plot must have at most {MOST_PANELS} panels; got {got}; give the two longest axes first")
     columns = min(count, 3) if len(panels) < 2 else next(iter(panels.values()))
     return math.ceil(count / columns), columns
+
+
+def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
+    """`layout` for a map of labels or basins, which a curve cannot show."""
+    drawn = [dim for dim, size in sizes.items() if size > 1]
+    if len(drawn) == 1:
+        raise ValueError(f"plot must have two axes of more than one value; got {drawn[0]} alone")
+    return layout(sizes)
 
 
 def check_format(path: str | Path) -> None:
@@ -124,6 +146,72 @@ def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
         ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
     return _picture(dataset, _POWER, path)
+
+
+def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """The plane coloured by attractor, n:m/pT; aperiodic cells are shaded by their Lyapunov exponent.
+
+    The commonest labels have a colour and a name each, the others are one group. Without gravity mirror images count as
+    one, by the smaller count first. Aperiodic means: without a period within the periods that were run.
+
+    Args:
+        dataset: A map with `period`, `impacts_left`, `impacts_right` and `status`, and with `lyapunov` for shades;
+            dimensions as in `power_map`, two at least.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    _need(dataset, LABEL_NEEDS)
+    period = dataset["period"]
+    level = (dataset["gamma"] == 0).broadcast_like(period).transpose(*period.dims)
+    words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
+    codes, categories = _named(words, int(dataset.attrs["periods"]))
+    drawn = dataset[["lyapunov"] if "lyapunov" in dataset else []].assign(
+        code=(period.dims, codes), aperiodic=period == 0
+    )
+    return _coded(drawn.assign_attrs(dataset.attrs), categories, path)
+
+
+def basin_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """The (u0, v0) plane coloured by the attractor on which each start ends, with a table of them beside it.
+
+    Args:
+        dataset: What `basins` returned for arrays u0 and v0; further axes make panels, each with a table of its own.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    _need(dataset, ("basin", "label", "fraction", "P"))
+    further = [dim for dim in dataset["P"].dims if dim not in (*dataset["basin"].dims, "attractor")]
+    dataset = dataset.isel(dict.fromkeys(further, 0))
+    drawn = dataset.assign(code=dataset["basin"].clip(max=_MOST_NAMED)).drop_vars("basin")
+    return _coded(drawn, None, path)
+
+
+def multistability_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+    """The plane of parameters coloured by the number of coexisting attractors.
+
+    Args:
+        dataset: What `basin_fractions` returned; dimensions as in `power_map`, two at least.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    _need(dataset, ("attractors",))
+    number = dataset["attractors"]
+    most = int(number.max())
+    shades = mpl.colormaps["viridis_r"](np.linspace(0, 1, most + 1))
+    shades[0] = to_rgba(_NO_ORBIT["undecided"])
+    texts = ["undecided", "1 attractor", *(f"{n} attractors" for n in range(2, most + 1))]
+    categories = [
+        _Category(tuple(shade), f"{_share((number == n).mean())} {text}")
+        for n, (shade, text) in enumerate(zip(shades, texts[: most + 1], strict=True))
+    ]
+    drawn = dataset[[]].assign(code=number).assign_attrs(dataset.attrs)
+    return _coded(drawn, categories, path)
 
 
 def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
@@ -172,56 +260,71 @@ def stability_map(found: Any, path: str | Path | None = None) -> Figure:
     return figure
 
 
-def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
-    missing = [name for name in kind.needs if name not in dataset]
+def _need(dataset: "xr.Dataset", names: tuple[str, ...]) -> None:
+    missing = [name for name in names if name not in dataset]
     if missing:
-        raise ValueError(f"plot must have {', '.join(kind.needs)}; got a map without {', '.join(missing)}")
+        raise ValueError(f"plot must have {', '.join(names)}; got a map without {', '.join(missing)}")
+
+
+def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
+    _need(dataset, kind.needs)
     if path is not None:
         check_format(path)
     whole = dataset[kind.coloured]
-    rows, columns = layout({str(dim): size for dim, size in whole.sizes.items()})
+    layout({str(dim): size for dim, size in whole.sizes.items()})
     names = [*kind.needs, *(name for name in kind.optional if name in dataset)]
     # A variable lacks the dimensions that it does not depend on; the picture wants them all.
     full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
     dataset = dataset.assign(full)[names].squeeze()
     dims = [str(dim) for dim in dataset[kind.coloured].dims]
     with mpl.rc_context(_STYLE):
-        figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims, rows, columns)
+        figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
         if path is not None:
             with replacing(Path(path)) as part:
                 figure.savefig(part)
     return figure
 
 
-def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str], rows: int, columns: int) -> Figure:
+def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str]) -> Figure:
+    figure, panels = _panels(dataset, dims)
+    norm, peak = kind.colours(dataset), _peak(dataset)
+    for axes, panel in panels:
+        mesh = _panel(axes, panel, kind, dims[0], dims[1], norm)
+        if peak is not None and all(peak[dim] == panel[dim] for dim in dims[2:]):
+            axes.plot(peak[dims[0]], peak[dims[1]], **_STAR, clip_on=False, zorder=5)
+    figure.colorbar(mesh, ax=figure.axes, extend="both", label=kind.label)
+    _explain(figure, dataset, kind, peak)
+    return figure
+
+
+def _panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple[Axes, xr.Dataset]]]":
+    """A figure of empty panels with titles and labels, and what belongs into each, ascending and [y, x]."""
+    rows, columns = layout({dim: dataset.sizes[dim] for dim in dims})
     size = (5.2, 4.6) if rows * columns == 1 else (1.6 + 2.1 * columns, 1.6 + 1.9 * rows)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    norm, peak = kind.colours(dataset), _peak(dataset)
     # Panels by rows, cells by y: the dimensions backwards.
-    dataset = dataset.sortby(dims[:2]).transpose(*dims[::-1])
+    dataset = dataset.sortby(dims[:2]).transpose(*dims[::-1], ...)
     outer = dims[:1:-1]
+    panels = []
     for axes, index in itertools.zip_longest(grid.flat, np.ndindex(*(dataset.sizes[dim] for dim in outer))):
         if index is None:
             axes.set_visible(False)
             continue
         panel = dataset.isel(dict(zip(outer, index, strict=True)))
-        mesh = _panel(axes, panel, kind, dims[0], dims[1], norm)
+        (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in dims[:2])
+        axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_BARE["color"])
         axes.set_title(_values(panel, dims[2:]), fontsize="medium")
-        if peak is not None and all(peak[dim] == panel[dim] for dim in outer):
-            axes.plot(peak[dims[0]], peak[dims[1]], **_STAR, clip_on=False, zorder=5)
+        panels.append((axes, panel))
     for axes in grid[-1]:
         axes.set_xlabel(_label(dataset[dims[0]]))
     for axes in grid[:, 0]:
         axes.set_ylabel(_label(dataset[dims[1]]))
-    figure.colorbar(mesh, ax=grid, extend="both", label=kind.label)
-    _explain(figure, dataset, kind, peak)
-    return figure
+    return figure, panels
 
 
 def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: LogNorm) -> QuadMesh:
-    (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in (x, y))
-    axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_BARE["color"])
+    across, up = (_edges(panel[dim].values)[0] for dim in (x, y))
     # matplotlib takes infinities for missing.
     values = np.minimum(panel[kind.coloured].values, np.finfo(float).max)
     mesh = axes.pcolormesh(across, up, np.ma.masked_where(~(values > 0), values), norm=norm, rasterized=True)
@@ -327,11 +430,112 @@ _DIFFERENCE = _Kind(
 )
 
 
-def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataArray | None") -> None:
-    """What the map holds constant above it, what its marks mean below; only the marks that it has."""
+class _Category(NamedTuple):
+    """One colour of a map of kinds, and what it means."""
+
+    colour: Any
+    text: str
+
+
+def _coded(dataset: "xr.Dataset", categories: list[_Category] | None, path: str | Path | None) -> Figure:
+    """A map of kinds, by their places `code` among the categories; those of every panel's own table if there are none.
+
+    Where it is `aperiodic`, the Lyapunov exponent shades it.
+    """
+    if path is not None:
+        check_format(path)
+    layout_of_kinds({str(dim): size for dim, size in dataset["code"].sizes.items()})
+    dataset = dataset.squeeze([dim for dim, size in dataset["code"].sizes.items() if size == 1])
+    dims = [str(dim) for dim in dataset["code"].dims]
+    with mpl.rc_context(_STYLE):
+        figure, panels = _panels(dataset, dims)
+        figure.set_figwidth(figure.get_figwidth() + 1.5)
+        for axes, panel in panels:
+            kinds = _table_categories(panel) if categories is None else categories
+            across, up = (_edges(panel[dim].values)[0] for dim in dims[:2])
+            colours = ListedColormap([kind.colour for kind in kinds])
+            scale = BoundaryNorm(np.arange(len(kinds) + 1) - 0.5, len(kinds))
+            axes.pcolormesh(across, up, panel["code"].values, cmap=colours, norm=scale, rasterized=True)
+            if categories is None:
+                _list_categories(axes, kinds, loc="upper left", bbox_to_anchor=(1.0, 1.02))
+        if {"lyapunov", "aperiodic"} <= set(dataset) and dataset["aperiodic"].any():
+            _shade(figure, dataset, panels, dims)
+        if categories is not None:
+            _list_categories(figure, categories, loc="outside right upper")
+        figure.suptitle(_constants(dataset), fontsize="medium")
+        if path is not None:
+            with replacing(Path(path)) as part:
+                figure.savefig(part)
+    return figure
+
+
+def _shade(figure: Figure, dataset: "xr.Dataset", panels: "list[tuple[Axes, xr.Dataset]]", dims: list[str]) -> None:
+    """Aperiodic cells in greys, the darker the faster they forget their start."""
+    exponents = dataset["lyapunov"].where(dataset["aperiodic"])
+    scale = Normalize(0.0, float(exponents.max()))
+    for axes, panel in panels:
+        across, up = (_edges(panel[dim].values)[0] for dim in dims[:2])
+        shown = np.ma.masked_invalid(panel["lyapunov"].where(panel["aperiodic"]).values)
+        mesh = axes.pcolormesh(across, up, shown, cmap=_GREYS, norm=scale, rasterized=True)
+    figure.colorbar(mesh, ax=figure.axes, location="bottom", aspect=40, label="Lyapunov exponent per forcing period")
+
+
+def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]]:
+    """Every word's place among the categories, and these: the commonest labels, the others, and what is no orbit."""
+    kinds, which, counts = np.unique(words, return_inverse=True, return_counts=True)
+    orbits = [place for place in np.argsort(-counts, kind="stable") if kinds[place] not in _NO_ORBIT]
+    ranked = [[place] for place in orbits[:_MOST_NAMED]] + [orbits[_MOST_NAMED:]]
+    colours = [*_COLOURS[: len(ranked) - 1], _OTHERS]
+    texts = [str(kinds[place[0]]) for place in ranked[:-1]] + [f"{len(ranked[-1])} other labels"]
+    for word, colour in _NO_ORBIT.items():
+        ranked.append(list(np.flatnonzero(kinds == word)))
+        colours.append(colour)
+        texts.append(f"aperiodic within {periods} periods" if word == "aperiodic" else word)
+    shown = [n for n, places in enumerate(ranked) if places]
+    codes = np.empty(kinds.size, int)
+    for code, n in enumerate(shown):
+        codes[ranked[n]] = code
+    categories = [_Category(colours[n], f"{_share(counts[ranked[n]].sum() / words.size)} {texts[n]}") for n in shown]
+    return codes[which].reshape(words.shape), categories
+
+
+def _table_categories(panel: "xr.Dataset") -> list[_Category]:
+    """The attractors of one table, the commonest by name."""
+    found = panel.isel(attractor=panel["starts"].values > 0)
+    colours = iter(_COLOURS)
+    categories = []
+    for n in range(min(found.sizes["attractor"], _MOST_NAMED)):
+        entry = found.isel(attractor=n)
+        word = str(entry["label"].values)
+        colour = _NO_ORBIT[word] if word in _NO_ORBIT else next(colours)
+        if word == "aperiodic":
+            word += f" within {float(entry['periods_run']):g} periods"
+        power = f", $P$ = {EngFormatter('J', places=2)(float(entry['P']))}" if entry["P"] > 0 else ""
+        categories.append(_Category(colour, f"{_share(entry['fraction'])} {word}{power}"))
+    rest = found["fraction"].values[_MOST_NAMED:]
+    return [*categories, _Category(_OTHERS, f"{_share(rest.sum())} {rest.size} others")] if rest.size else categories
+
+
+def _list_categories(where: Figure | Axes, categories: list[_Category], **place: Any) -> None:
+    handles = [Patch(facecolor=kind.colour, edgecolor="0.3", linewidth=0.4) for kind in categories]
+    texts = [kind.text for kind in categories]
+    where.legend(handles, texts, frameon=False, handlelength=1.2, fontsize="small", **place)
+
+
+def _share(part: Any) -> str:
+    return f"{100 * float(part):.3g} %"
+
+
+def _constants(dataset: "xr.Dataset") -> str:
+    """The kind of wall and what the map holds constant."""
     constants = [name for name in _CONSTANTS if name in dataset.coords and not dataset[name].ndim]
     title = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
-    figure.suptitle(", ".join([*title, _values(dataset, constants)]), fontsize="medium")
+    return ", ".join([*title, _values(dataset, constants)])
+
+
+def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataArray | None") -> None:
+    """What the map holds constant above it, what its marks mean below; only the marks that it has."""
+    figure.suptitle(_constants(dataset), fontsize="medium")
     shown = [(_handle(mark), mark.text) for mark in kind.marks(dataset) if mark.mask.any()]
     if peak is not None:
         amount = EngFormatter("J", places=2)(float(peak))
