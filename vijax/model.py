@@ -25,6 +25,8 @@ class Status(enum.IntEnum):
     SLOW = 4  # neither periodic nor certainly aperiodic when the periods were spent
     EVENT_BUDGET = 5  # more impacts than the budget allows
     NONFINITE = 6  # the state left the finite numbers
+    NO_ORBIT = 7  # no periodic orbit was found from the guess
+    VIRTUAL = 8  # the equations of an orbit hold, but the ball would meet a wall in between
 
 
 class State(eqx.Module):

@@ -38,7 +38,7 @@ def trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     return fold(plan, settings, cell, event)
 
 
-class _Request(eqx.Module):
+class Request(eqx.Module):
     """What a lane that the quick step declined hands over to be served."""
 
     pair: ImpactPair
@@ -47,7 +47,7 @@ class _Request(eqx.Module):
     end: Lane  # last period
 
 
-class _Answer(eqx.Module):
+class Answer(eqx.Module):
     """What became of a request; a lane whose answer is not sure asks again, for the careful step."""
 
     event: Event
@@ -55,21 +55,21 @@ class _Answer(eqx.Module):
     sure: Mask
 
 
-def request(plan: Plan, settings: Settings, cell: Cell) -> _Request:
+def request(plan: Plan, settings: Settings, cell: Cell) -> Request:
     """What serving each lane would need."""
-    return _Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell.since))
+    return Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell.since))
 
 
-def sampled_answer(plan: Plan, request: _Request) -> _Answer:
+def sampled_answer(plan: Plan, request: Request) -> Answer:
     """Of level cells: where walls are soft it is the contact that the quick step declines nearly always."""
     arrival = None if plan.rigid else quick.arrive(0.5 * request.pair.d, request.ball)
     hit, sure = sampled.sampled_step(request.pair, request.ball, arrival, deep=plan.deep, tangent=plan.tangent)
     no = jnp.zeros_like(sure)
     sure = sure & (request.held == 0)
-    return _Answer(Event(hit, sure, no, no, no), no, sure)
+    return Answer(Event(hit, sure, no, no, no), no, sure)
 
 
-def careful_answer(plan: Plan, request: _Request) -> _Answer:
+def careful_answer(plan: Plan, request: Request) -> Answer:
     """`exact.step` on every lane."""
     pair, ball, held = request.pair, request.ball, request.held
     horizon = 2 * (jnp.maximum(request.end - ball.n, 0.0) + _QUIET)
@@ -96,7 +96,7 @@ def careful_answer(plan: Plan, request: _Request) -> _Answer:
         tangent=matrix,
     )
     event = Event(hit, (out.impact.side != 0) | late, out.quiet & ~late, out.permanent, out.stuck)
-    return _Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
+    return Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
 
 
 def _neutral(pair: ImpactPair, ball: Lanes) -> Mask:
@@ -105,7 +105,7 @@ def _neutral(pair: ImpactPair, ball: Lanes) -> Mask:
     return jnp.abs(drift) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
 
 
-def settle(plan: Plan, settings: Settings, cell: Cell, answer: _Answer, served: Mask) -> Cell:
+def settle(plan: Plan, settings: Settings, cell: Cell, answer: Answer, served: Mask) -> Cell:
     """The cells with the answers of those that were served."""
     event, left = answer.event, answer.left & served
     ours = served & answer.sure

@@ -1,0 +1,335 @@
+"""Periodic orbits, stable and unstable: from states or impact sequences, by Newton, each verified by the impact map."""
+
+import itertools
+import os
+import re
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from vijax import flow, shooting
+from vijax.energy import harvested_energy
+from vijax.impact_map import next_impacts
+from vijax.model import Harvester, Impact, ImpactPair, Status
+from vijax.shooting import Sequence
+from vijax.trajectory import trajectory
+
+_SAME = 1e-6  # how closely the impact map must meet the next impact of a real orbit
+_FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
+_TILES = (32, 256, 4096)  # orbits of one compiled call
+
+
+class Orbit(eqx.Module):
+    """Periodic orbits, one along the leading axis; impacts along the last, padded with side 0 and NaN.
+
+    Attributes:
+        pair: Parameters.
+        sequence: Walls met, and how the orbit closes; see `shooting.Sequence`.
+        knots: Onset time, speed into the wall and contact time of each impact.
+        depth, work: Largest penetration and energy given to the membrane (per unit mass) of each impact; NaN unless OK.
+        multipliers: Floquet multipliers of the full orbit, larger modulus first.
+        residual: Largest violation of the equations; inf where no orbit was found.
+        status: OK; VIRTUAL: the equations hold but the ball would meet a wall in between; NO_ORBIT.
+    """
+
+    pair: ImpactPair
+    sequence: Sequence
+    knots: Float[Array, "orbit impact 3"]
+    depth: Float[Array, "orbit impact"]
+    work: Float[Array, "orbit impact"]
+    multipliers: Complex[Array, "orbit 2"]
+    residual: Float[Array, "orbit"]
+    status: Int[Array, "orbit"]
+
+    @property
+    def count(self) -> Int[Array, "orbit"]:
+        """Impacts until it closes (half of all where it closes onto its mirror image)."""
+        return self.sequence.real.sum(axis=-1)
+
+    def __getitem__(self, index: Any) -> "Orbit":
+        """Some of the orbits, by an index array, a mask or a slice."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __len__(self) -> int:
+        return self.knots.shape[0]
+
+
+def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
+    """The periodic orbits near some guesses, thousands in one call, on every core.
+
+    Args:
+        pair: One cell an orbit.
+        sequence, knots: Guesses; padded impacts hold anything.
+
+    Returns:
+        Orbits in the order of the guesses, each with its `status`.
+    """
+    level = _level(pair)
+    return _by_tiles(lambda part: _solve(*part, level), (pair, sequence, knots))
+
+
+def _level(pair: ImpactPair) -> bool:
+    return bool((np.asarray(pair.gamma) == 0).all())
+
+
+def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
+    """The work on every row, in padded tiles of few sizes so that few programs are compiled, a thread a core."""
+    count = jax.tree.leaves(rows)[0].shape[0]
+    tile = next((size for size in _TILES if size >= count), _TILES[-1])
+
+    def part(start: int) -> Orbit:
+        index = np.minimum(np.arange(start, start + tile), count - 1)
+        return work(jax.tree.map(lambda leaf: leaf[index], rows))[: count - start]
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        found = list(pool.map(part, range(0, count, tile)))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+
+
+def _solve(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"], level: bool) -> Orbit:
+    """One tile: Newton, then the proof."""
+    return _verify(pair, sequence, *_shoot(pair, sequence, guess), level)
+
+
+@jax.jit
+def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]):
+    knots, residual = shooting.newton(pair, sequence, guess)
+    return knots, residual, _once_around(pair, sequence, knots)
+
+
+def _once_around(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
+    """Multipliers, and the passages to verify."""
+    around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
+    return floquet(around, sequence.mirrored), jax.vmap(shooting.passages)(pair, sequence, knots)
+
+
+def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
+    """Orbits from knots that solve the equations already, as the points of a branch do, even where Newton is singular."""
+    level = _level(pair)
+    return _by_tiles(lambda part: _verify(*part, *_measured(*part), level), (pair, sequence, knots))
+
+
+@jax.jit
+def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
+    """Residuals, and what `_once_around` says."""
+    residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
+    return residual, _once_around(pair, sequence, knots)
+
+
+def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level: bool) -> Orbit:
+    """Fly from the end of every contact: the impact map must meet the next impact, and end its contact in time."""
+    multipliers, passage = around
+    found = jnp.isfinite(residual)
+    real = sequence.real
+    wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], real.shape).reshape(-1), pair)
+    phase, periods = flow.wrap_phase(passage.t)
+    flown = next_impacts(wide, passage.side.reshape(-1), passage.speed.reshape(-1), phase.reshape(-1), level=level)
+    flown = jax.tree.map(lambda leaf: leaf.reshape(real.shape), flown)
+    miss = jnp.abs(flown.t + 2 * periods - passage.next_t) + jnp.abs(flown.side * flown.v_in - passage.next_speed)
+    miss = miss + jnp.abs(flown.duration - passage.next_stay)
+    met = flown.real & (flown.side == passage.next_side) & (miss < _SAME)
+    whole = found & (met | ~real).all(axis=1)
+    status = jnp.where(whole, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
+    good = whole[:, None] & real
+    # What was flown to is the impact after each.
+    place = jnp.arange(real.shape[1])
+    before = jnp.where(place == 0, real.sum(axis=1)[:, None] - 1, place - 1)
+    depth, work = (jnp.take_along_axis(leaf, before, axis=1) for leaf in (flown.depth, flown.work))
+    # The first impact is put into the first period.
+    knots = knots.at[..., 0].add(-2 * jnp.floor(0.5 * knots[:, :1, 0]))
+    return Orbit(
+        pair=pair,
+        sequence=sequence,
+        knots=jnp.where(real[..., None], knots, jnp.nan),
+        depth=jnp.where(good, depth, jnp.nan),
+        work=jnp.where(good, work, jnp.nan),
+        multipliers=jnp.where(found[:, None], multipliers, jnp.nan),
+        residual=residual,
+        status=status,
+    )
+
+
+def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
+    """Eigenvalues of 2 x 2 monodromy matrices, the larger modulus first; squared where the orbit is closed half way.
+
+    The smaller of two real ones is the determinant over the larger: their difference would cancel.
+    """
+    half = 0.5 * (around[:, 0, 0] + around[:, 1, 1])
+    product = around[:, 0, 0] * around[:, 1, 1] - around[:, 0, 1] * around[:, 1, 0]
+    spread = half * half - product
+    root = jnp.sqrt(jnp.abs(spread))
+    large = half + jnp.where(half < 0, -root, root)
+    small = product / jnp.where(large == 0, 1.0, large)
+    pair = jnp.stack([large, small], axis=1).astype(complex)
+    twins = jnp.stack([half + 1j * root, half - 1j * root], axis=1)
+    values = jnp.where((spread >= 0)[:, None], pair, twins)
+    return jnp.where(mirrored[:, None], values * values, values)
+
+
+def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1) -> Orbit:
+    """Periodic orbits near some states: each is flown once around to learn its impacts, then corrected by Newton.
+
+    Args:
+        pair: One cell, or one a state.
+        u, v, t: Displacements, velocities and phases in [0, 2).
+        period: Forcing periods of the orbits.
+
+    Returns:
+        One orbit a state, stable or not; NO_ORBIT where Newton found none, or the state meets no wall.
+
+    Raises:
+        ValueError: period below 1, or an inadmissible pair or state.
+    """
+    if period < 1:
+        raise ValueError(f"period must be at least 1; got {period}")
+    u, v, t = (jnp.atleast_1d(jnp.asarray(x, float)) for x in (u, v, t))
+    shape = jnp.broadcast_shapes(u.shape, v.shape, t.shape, *(jnp.shape(x) for x in jax.tree.leaves(pair)))
+    pair = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), pair)
+    u, v, t = (jnp.broadcast_to(x, shape) for x in (u, v, t))
+    # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
+    found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
+    onset = 2.0 * found.n + found.t
+    inside = np.asarray(onset < onset[:, :1] + 2 * period - _SAME)
+    width = 1 << max(int(inside.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
+    mask = jnp.asarray(inside[:, :width])
+    side = jnp.where(mask, found.side[:, :width], 0)
+    knots = jnp.stack([onset[:, :width], jnp.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
+    span = jnp.full(shape, 2.0 * period)
+    return solve(pair, Sequence(side, span, jnp.zeros(shape, bool)), knots)
+
+
+def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
+    """Every orbit found with a given impact sequence, stable or unstable, from random guesses.
+
+    Args:
+        pair: One cell.
+        impacts: Walls in order, such as "RLL" (R right, L left), or a label n:m or n:m/pT: n impacts on the left, m on
+            the right, in any order.
+        period: Forcing periods; 1, or the label's.
+        guesses: Random guesses a sequence.
+        seed: Of the guesses.
+
+    Returns:
+        The distinct orbits, each once.
+
+    Raises:
+        ValueError: Neither a sequence nor a label, or a period that does not agree with it.
+
+    Source: Eqs. (28)-(29) ask for one sequence from one guess.
+    """
+    sequences, period = _sequences(impacts, period)
+    draw = np.random.default_rng(seed)
+    found = [_search(pair, walls, period, guesses, draw) for walls in sequences]
+    return distinct(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found))
+
+
+def _sequences(impacts: str, period: int | None) -> tuple[list[tuple[int, ...]], int]:
+    """Cyclically distinct sequences of walls, and the period."""
+    walls = {"L": -1, "R": 1}
+    if impacts and set(impacts.upper()) <= set(walls):
+        return [tuple(walls[letter] for letter in impacts.upper())], 1 if period is None else period
+    match = re.fullmatch(r"(\d+):(\d+)(?:/(\d*)T)?", impacts)
+    if match is None or int(match[1]) + int(match[2]) == 0:
+        raise ValueError(f"impacts must be walls such as RLL or a label such as 1:2/2T; got {impacts!r}")
+    named = int(match[3] or 1)
+    if period not in (None, named):
+        raise ValueError(f"period must agree with the label {impacts}; got {period}")
+    left, right = int(match[1]), int(match[2])
+    places = itertools.combinations(range(left + right), left)
+    every = (tuple(-1 if i in lefts else 1 for i in range(left + right)) for lefts in places)
+    return sorted({min(walls[i:] + walls[:i] for i in range(len(walls))) for walls in every}), named
+
+
+def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int, draw: np.random.Generator) -> Orbit:
+    """Orbits of one sequence from random guesses: times in any proportion, speeds up to what the forcing can give."""
+    count = len(walls)
+    gaps = draw.dirichlet(np.ones(count), guesses) * 2 * period
+    t = draw.uniform(0, 2, (guesses, 1)) + np.cumsum(gaps, axis=1) - gaps[:, :1]
+    speed = draw.uniform(0, _FASTEST, (guesses, count))
+    free = np.zeros(()) if pair.kappa is None else np.pi / np.asarray(pair.omega1)
+    knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
+    wide = jax.tree.map(lambda x: jnp.broadcast_to(x, guesses), pair)
+    side = jnp.broadcast_to(jnp.asarray(walls, jnp.int32), (guesses, count))
+    span = jnp.full(guesses, 2.0 * period)
+    return solve(wide, Sequence(side, span, jnp.zeros(guesses, bool)), jnp.asarray(knots))
+
+
+def distinct(orbit: Orbit) -> Orbit:
+    """The orbits that are there, each once whichever impact it was begun with."""
+    good = np.flatnonzero(np.asarray(orbit.status) == Status.OK)
+    marks = np.round(np.asarray(_marks(orbit))[good] / _SAME)
+    _, first = np.unique(marks, axis=0, return_index=True)
+    return orbit[np.sort(good[first])]
+
+
+def _marks(orbit: Orbit) -> Float[Array, "orbit 4"]:
+    """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
+    t, speed, stay = jnp.moveaxis(orbit.knots, -1, 0)
+    signed = orbit.sequence.side * speed
+    parts = [signed * jnp.cos(jnp.pi * t), signed * jnp.sin(jnp.pi * t), signed + speed, stay * speed]
+    return jnp.stack([jnp.nansum(part, axis=-1) for part in parts], axis=-1)
+
+
+def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[Array, "orbit"]:
+    """Whether each orbit is its own mirror image, half a span later."""
+    count = orbit.count
+    index = jnp.arange(orbit.knots.shape[1])
+    half = jnp.where(index < (count // 2)[:, None], index + (count // 2)[:, None], index)
+    wait = jnp.array([0.5, 0.0, 0.0]) * orbit.sequence.span[:, None, None]
+    moved = jnp.take_along_axis(orbit.knots, half[..., None], axis=1) - orbit.knots - wait
+    opposite = jnp.take_along_axis(orbit.sequence.side, half, axis=1) == -orbit.sequence.side
+    first = index < (count // 2)[:, None]
+    same = (jnp.abs(moved).max(axis=2) < tolerance) & opposite
+    return orbit.sequence.mirrored | ((count % 2 == 0) & (orbit.pair.gamma == 0) & (same | ~first).all(axis=1))
+
+
+def halved(orbit: Orbit) -> Orbit:
+    """Symmetric orbits closed half way, onto their mirror image: half the impacts, and a pitchfork becomes a flip.
+
+    Raises:
+        ValueError: An orbit that is not symmetric.
+    """
+    if not bool(symmetric(orbit).all()):
+        raise ValueError(f"orbit must be symmetric to be closed half way; got {np.asarray(symmetric(orbit))}")
+    if bool(orbit.sequence.mirrored.all()):
+        return orbit
+    index = jnp.arange(orbit.knots.shape[1])
+    kept = index < (orbit.count // 2)[:, None]
+    width = orbit.knots.shape[1] // 2
+    side = jnp.where(kept, orbit.sequence.side, 0)[:, :width]
+    sequence = Sequence(side, 0.5 * orbit.sequence.span, jnp.ones_like(orbit.sequence.mirrored))
+    return solve(orbit.pair, sequence, jnp.where(kept[..., None], orbit.knots, 0.0)[:, :width])
+
+
+def doubled(orbit: Orbit) -> Orbit:
+    """Orbits run through twice, or in full where they were closed half way."""
+    return _unfolded(orbit, jnp.ones_like(orbit.sequence.mirrored))
+
+
+def unfolded(orbit: Orbit) -> Orbit:
+    """Orbits in full, those closed half way too."""
+    return _unfolded(orbit, orbit.sequence.mirrored) if bool(orbit.sequence.mirrored.any()) else orbit
+
+
+def _unfolded(orbit: Orbit, twice: Bool[Array, "orbit"]) -> Orbit:
+    """The second turn appended to the first where asked."""
+    count, width = orbit.count[:, None], orbit.knots.shape[1]
+    index = jnp.arange(2 * width)
+    again = index >= count
+    from_first = jnp.where(again, index - count, index)
+    there = (index < count) | (twice[:, None] & again & (index < 2 * count))
+    from_first = jnp.clip(from_first, 0, width - 1)
+    side = jnp.take_along_axis(orbit.sequence.side, from_first, axis=1)
+    side = jnp.where(again & orbit.sequence.mirrored[:, None], -side, side)
+    knots = jnp.take_along_axis(orbit.knots, from_first[..., None], axis=1)
+    knots = knots.at[..., 0].add(jnp.where(again, orbit.sequence.span[:, None], 0.0))
+    span = jnp.where(twice, 2 * orbit.sequence.span, orbit.sequence.span)
+    sequence = Sequence(jnp.where(there, side, 0), span, orbit.sequence.mirrored & ~twice)
+    return proven(orbit.pair, sequence, jnp.where(there[..., None], knots, 0.0))
