@@ -14,6 +14,8 @@ from pathlib import Path
 import click
 import command
 
+_STARTED = time.perf_counter()
+
 
 def _options() -> list[click.Parameter]:
     return [
@@ -38,7 +40,7 @@ def paper(figure: str | None, claims: bool, into: str, overwrite: bool) -> None:
         _draw(number, file)
     if table is not None:
         _check(table)
-    click.echo(command.elapsed())
+    click.echo(f"{time.perf_counter() - _STARTED:.1f} s from start to end")
 
 
 def _numbers(text: str) -> list[int]:
@@ -60,11 +62,13 @@ def _target(folder: str, name: str, overwrite: bool) -> Path:
 
 def _draw(number: int, file: Path) -> None:
     from vijax import figures
+    from vijax.paper import FIGURES
 
     began = time.perf_counter()
     figures.draw(number, file)
-    click.echo(f"Fig. {number}: {figures.describe(number)}")
-    click.echo(f"  wrote {file}, {time.perf_counter() - began:.1f} s")
+    click.echo(f"Fig. {number} in {time.perf_counter() - began:.1f} s, wrote {file}")
+    if chosen := FIGURES[number].chosen:
+        click.echo(f"  {chosen}")
 
 
 def _check(file: Path) -> None:

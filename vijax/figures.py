@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from vijax.cached import branches, diagram, orbits
 from vijax.curve import Curve, curve, states
-from vijax.diagram import orbit_diagram
 from vijax.model import ImpactPair, impact_pair
-from vijax.paper import FIGURES, PaperFigure, Run, Source, View
+from vijax.paper import BRANCHES_FROM, BRANCHES_WITHIN, FIGURES, PaperFigure, Run, Source, View
 from vijax.portrait import Layer, Panel, phase_plane, small_multiples, time_series
+from vijax.trajectory import trajectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -51,21 +52,6 @@ QUANTITIES = {
 }
 _NAMES = {"d": "$d$", "kappa": r"$\kappa$", "omega": r"$\omega$ [rad/s]", "r": "$r$"}
 _LOGARITHMIC = {"energy", "power"}
-
-
-@lru_cache(maxsize=16)
-def diagram(run: Run) -> "xr.Dataset":
-    """The orbit diagram of a run; computed once."""
-    axes = {name: np.asarray(values) if isinstance(values, tuple) else values for name, values in run.axes}
-    return orbit_diagram(
-        along=run.along,
-        values=np.array(run.values),
-        direction=run.direction,
-        wall=run.wall,
-        periods=run.periods,
-        keep=run.keep,
-        **axes,
-    )
 
 
 def selected(source: Source) -> "xr.Dataset":
@@ -141,11 +127,13 @@ def _sweep(figure: PaperFigure, view: View) -> Panel:
     else:
         shown = [(source, view.shows) for source in view.sources]
     layers = [_points(source, name) for source, name in shown]
+    layers += _unstable_branches(view)
     run, quantity = view.sources[0].run, QUANTITIES[shown[0][1]]
     label, level = quantity.label, [(np.pi, "tab:blue")] if view.shows == "phase" else []
     for source in view.levels:
-        rigid, stiffest = selected(source), selected(view.sources[-1]).isel({run.along: 0})
-        speeds = _image(rigid, stiffest) * rigid["v_in"].values
+        front = view.sources[-1]
+        stiffest = front._replace(where=front.where | {run.along: max(run.values)})
+        speeds = _image(motion(source), motion(stiffest)) * selected(source)["v_in"].values
         level += [(speed, "red") for speed in np.unique(speeds[np.isfinite(speeds)].round(6))]
     if view.shows == "energies":
         layers[1] = layers[1]._replace(colour="green", text="$P$, mean over the orbit")
@@ -176,19 +164,49 @@ def _points(source: Source, shows: str) -> Layer:
 
 
 def _phase_plane(figure: PaperFigure, view: View) -> Panel:
-    layers, gaps = [], set()
+    layers, front = [], motion(view.sources[-1])
     for source in view.sources:
-        point, line = selected(source), motion(source)
+        line = motion(source)
         # Of attractors that are mirror images of each other, soft and rigid walls may settle on either.
-        image = _image(point, selected(view.sources[-1])) if source.run.wall == "rigid" else 1
+        image = _image(line, front) if source.run.wall == "rigid" else 1
         layers.append(Layer(image * line.u, image * line.v, source.colour, "line", source.text))
-        gaps.add(float(point["d"]))
+    for line in _unstable_orbits(view):
+        image = _image(line, front)
+        layers.append(Layer(image * line.u, image * line.v, "red", "line", "unstable"))
+    gaps = {float(selected(source)["d"]) for source in view.sources}
     return phase_plane(view.title, layers, gaps.pop() if len(gaps) == 1 else None)
 
 
-def _image(point: "xr.Dataset", other: "xr.Dataset") -> int:
-    """-1 where two attractors lean to opposite sides, so that the mirror image of one is like the other."""
-    lean, reference = (float(each["v_in"].mean()) for each in (point, other))
+def _unstable_branches(view: View) -> list[Layer]:
+    """Impact velocities of unstable orbits between rigid walls over d, and of their mirror images."""
+    layers = []
+    for walls in view.unstable:
+        for each in branches(walls, "d", BRANCHES_WITHIN, BRANCHES_FROM, None):
+            shown = ~each.stable & (each.values < max(view.sources[-1].run.values))
+            speeds = np.asarray(each.orbit.sequence.side * each.orbit.knots[..., 1])[shown]
+            x = np.broadcast_to(each.values[shown, None], speeds.shape)
+            layers += [Layer(x, sign * speeds, "red", "dots", "unstable") for sign in (1, -1)]
+    return layers
+
+
+def _unstable_orbits(view: View) -> Iterator[Curve]:
+    """Unstable orbits at the parameters of the last source."""
+    source = view.sources[-1]
+    pair = pair_of(selected(source), source.run.wall)
+    for walls in view.unstable:
+        found = orbits(walls, float(pair.d), None if pair.kappa is None else float(pair.kappa), float(pair.r))
+        for one in np.flatnonzero(np.abs(np.asarray(found.multipliers)).max(axis=1) > 1):
+            t, speed, _ = np.asarray(found.knots[one]).T
+            side = int(found.sequence.side[one, 0])
+            # On the wall at an onset: flown on from there, it has no time to leave the orbit.
+            impacts = trajectory(pair, 0.5 * side * pair.d, side * speed[0], 3, t[0]).impacts
+            clock = np.asarray(impacts.t) + 2.0 * np.asarray(impacts.n)
+            yield curve(pair, clock, impacts.side, impacts.v_in, impacts.v_out, impacts.duration)
+
+
+def _image(line: Curve, other: Curve) -> int:
+    """-1 where two motions lean to opposite sides, so that the mirror image of one is like the other."""
+    lean, reference = (np.trapezoid(each.u, each.t) for each in (line, other))
     return -1 if lean * reference < 0 else 1
 
 

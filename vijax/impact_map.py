@@ -126,7 +126,7 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
     """
     kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
     rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, side.astype(pair.d.dtype), speed, t], axis=1)
-    plan = Plan("window", None, pair.kappa is None, level, True, False, False, 1)
+    plan = Plan("window", None, pair.kappa is None, level, True, False, False, False, 1)
     tile = _TILES[0] if rows.shape[0] <= _TILES[0] else _TILES[1]
     parts = []
     for start in range(0, rows.shape[0], tile):

@@ -15,8 +15,13 @@ SPRINGS = (560.0, 56.0, 5.6, 0.56, 0.056)  # k [N/m] of Figs. 12-16: omega0 = 40
 COLOURS = ("black", "tab:blue", "tab:green", "tab:orange", "tab:purple")  # of either, the stiffest first
 RESTITUTIONS = (0.5, 0.1, 0.95)
 
+GAP_IN_METRES = 0.2  # of Figs. 12-16
+
 GAPS = tuple(np.round(np.arange(0.3, 0.0499, -0.002), 3).tolist())
 PHASE_PLANES = (0.16, 0.18, 0.2)  # d of Figs. 3 and 5
+UNSTABLE_AT = 0.18  # d of the 1:2 orbit in red
+# Rigid branches over d: where 1:1 and 1:2 coexist, and how far they are followed (to the end of 1:1 in Fig. 12).
+BRANCHES_FROM, BRANCHES_WITHIN = 0.19, (0.05, 1.1)
 STIFFNESS_SWEEP = tuple((400 / np.arange(1, 134)).tolist())  # kappa = 400/n
 # The frequencies whose phase planes are drawn are points of the sweep too.
 SHOWN_FREQUENCIES = (np.pi / 3, np.pi, 7.79, 10.0, 10.5, 10.99)
@@ -63,13 +68,23 @@ class Source(NamedTuple):
 
 
 class View(NamedTuple):
-    """A panel: its letter in the layout, what it shows, of what, its title, and speeds drawn as dashed red levels."""
+    """A panel.
+
+    Attributes:
+        letter: In the layout.
+        shows: A quantity over the swept axis, or what is drawn at one value of it.
+        sources: Of what, the first below the others.
+        title: Above it.
+        levels: Whose impact velocities are dashed red lines.
+        unstable: Impact sequences whose unstable orbits, of the last source's parameters, are red.
+    """
 
     letter: str
     shows: str
     sources: tuple[Source, ...]
     title: str = ""
     levels: tuple[Source, ...] = ()
+    unstable: tuple[str, ...] = ()
 
 
 class PaperFigure(NamedTuple):
@@ -80,7 +95,6 @@ class PaperFigure(NamedTuple):
         layout: Rows of letters; a capital continues the panel of the small letter.
         views: Its panels.
         chosen: What the paper leaves open or prints wrongly, and what is drawn here.
-        unstable: Impact sequences whose unstable orbits are red over diagrams and phase planes.
         marks: Values of the swept axis marked by dashed red lines.
     """
 
@@ -88,7 +102,6 @@ class PaperFigure(NamedTuple):
     layout: tuple[str, ...]
     views: tuple[View, ...]
     chosen: str = ""
-    unstable: tuple[str, ...] = ()
     marks: tuple[float, ...] = ()
 
 
@@ -111,13 +124,13 @@ STIFF = run("d", *GAPS, r=0.5, kappa=400.0)
 BY_GAP = {r: run("d", *GAPS, r=r, kappa=STIFFNESSES) for r in RESTITUTIONS}
 SOFTENED = run("kappa", *STIFFNESS_SWEEP, r=0.5, d=(0.2, 0.18, 0.16, 0.12))
 STIFFENED = run("kappa", *STIFFNESS_SWEEP, r=0.5, d=(0.2, 0.18, 0.16, 0.12), direction="up")
-BY_FREQUENCY = {r: run("omega", *FREQUENCIES, s=0.2, r=r, k=SPRINGS, direction="up") for r in RESTITUTIONS}
-RIGID_BY_FREQUENCY = run("omega", *FREQUENCIES, s=0.2, r=0.5, direction="up", wall="rigid")
+BY_FREQUENCY = {r: run("omega", *FREQUENCIES, s=GAP_IN_METRES, r=r, k=SPRINGS, direction="up") for r in RESTITUTIONS}
+RIGID_BY_FREQUENCY = run("omega", *FREQUENCIES, s=GAP_IN_METRES, r=0.5, direction="up", wall="rigid")
 
 RIGID_SECTION = _chaos("d", 0.12, r=0.5, wall="rigid")
 STIFF_SECTION = _chaos("d", 0.12, r=0.5, kappa=400.0)
 SOFT_SECTION = _chaos("d", 0.25, r=0.5, kappa=4.0)
-FREQUENCY_SECTION = _chaos("omega", 7.79, s=0.2, r=0.5, k=560.0)
+FREQUENCY_SECTION = _chaos("omega", 7.79, s=GAP_IN_METRES, r=0.5, k=560.0)
 
 # --- the captions ---------------------------------------------------------------------------------
 
@@ -133,7 +146,13 @@ def _each(letters: str, shows: tuple[str, ...], sources: tuple[Source, ...]) -> 
 def _planes(letters: str, *sources: Source) -> list[View]:
     """Phase planes of the same sources at the three gaps of Figs. 3 and 5."""
     return [
-        View(letter, "phase plane", tuple(source._replace(where={"d": d}) for source in sources), f"$d = {d}$")
+        View(
+            letter,
+            "phase plane",
+            tuple(source._replace(where={"d": d}) for source in sources),
+            f"$d = {d}$",
+            unstable=("RLL",) if d == UNSTABLE_AT else (),
+        )
         for letter, d in zip(letters, PHASE_PLANES, strict=True)
     ]
 
@@ -174,7 +193,7 @@ def _at_frequencies(r: float) -> PaperFigure:
     )
 
 
-_FIRST, _IMAGE = Source(RIGID, {}, "black"), Source(RIGID, {}, "purple", "mirror image", mirror=True)
+_FIRST, _IMAGE = Source(RIGID, {}, "black", "the sweep"), Source(RIGID, {}, "purple", "its mirror image", mirror=True)
 _HARD, _SOFT = Source(RIGID, {}, "magenta", "rigid"), Source(STIFF, {}, "black", r"soft, $\kappa = 400$")
 _HARD_W = Source(RIGID_BY_FREQUENCY, {}, "magenta", "rigid")
 _SOFT_W = Source(BY_FREQUENCY[0.5], {"k": 560.0}, "black", "soft, $k = 560$ N/m")
@@ -219,15 +238,16 @@ FIGURES: dict[int, PaperFigure] = {
         "Rigid walls over $d$, $r = 0.5$",
         ("aabb", "aabb", "cdef", "cDEF", "gghh", "gghh"),
         (
-            *_each("ab", ("speed", "strobe"), (_IMAGE, _FIRST)),
+            View("a", "speed", (_IMAGE, _FIRST), unstable=("RL", "RLL")),
+            View("b", "strobe", (_IMAGE, _FIRST)),
             View("c", "section", (Source(RIGID_SECTION, {"d": 0.12}, "black"),), "$d = 0.12$"),
             *_planes("def", _FIRST),
             *_planes("DEF", _IMAGE),
             View("g", "energies", (_FIRST,)),
             View("h", "phase", (_IMAGE, _FIRST)),
         ),
-        "From both starts of the paper the sweep settles on the same image: purple is its mirror image. " + _ENERGY,
-        unstable=("RL", "RLL", "RRL"),
+        "From both starts of the paper the sweep settles on the same image: purple is its mirror image. Red: "
+        "unstable 1:1 and 1:2 orbits. " + _ENERGY,
         marks=(0.12, *PHASE_PLANES),
     ),
     4: PaperFigure(
@@ -250,8 +270,8 @@ FIGURES: dict[int, PaperFigure] = {
             *_planes("def", _HARD, _SOFT),
             *_each("ghij", ("restitution", "duration", "energies", "phase"), (_SOFT,)),
         ),
-        "The rigid walls start as in Fig. 3 and may settle on mirror images; (d) to (f) show like ones. " + _ENERGY,
-        unstable=("RL", "RLL", "RRL"),
+        "The rigid walls start as in Fig. 3 and may settle on mirror images; (d) to (f) show like ones. Red: an "
+        "unstable 1:2 orbit. " + _ENERGY,
         marks=(0.12, *PHASE_PLANES),
     ),
     6: PaperFigure(
