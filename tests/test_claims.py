@@ -1,12 +1,13 @@
 """Claims recomputed: the cheap ones against the values of reference, the table, mirror images of a diagram."""
 
+import itertools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vijax import claims, figures
+from vijax import claims, evidence, figures
 from vijax.cached import diagram
 from vijax.paper import RIGID, Source
 
@@ -35,13 +36,13 @@ def test_cheap_claims(name):
     [("1:1", 0.25, (0.3, 0.188)), ("2:4/2T", 0.182, (0.186, 0.178)), ("2:2", 0.08, (0.09, 0.068))],
 )
 def test_stretches_of_the_rigid_sweep_are_those_of_reference(name, at, stretch):
-    assert claims._run_of(claims._labels(RIGID), name, at) == pytest.approx(stretch)
+    assert evidence.stretch(evidence.labels(RIGID), name, at) == pytest.approx(stretch)
 
 
 def test_bands_tell_all_points_in_order():
-    bands = list(claims._bands(claims._labels(RIGID)))
+    bands = list(evidence.bands(evidence.labels(RIGID)))
     assert (bands[0][1], bands[-1][2]) == (0.3, 0.05)
-    assert all(before[0] != after[0] for before, after in zip(bands, bands[1:], strict=False))
+    assert all(before[0] != after[0] for before, after in itertools.pairwise(bands))
 
 
 def test_the_table_escapes_what_would_part_its_cells():
@@ -59,10 +60,8 @@ def test_mirror_image_of_a_symmetric_orbit_is_itself_and_of_others_not():
     lean = {"d": 60}  # at d = 0.18
     assert float(np.abs(found["v_strobe"] - image["v_strobe"]).isel(lean).min()) > 1e-3
     np.testing.assert_array_equal(image["v_in"], -found["v_in"])
-    assert np.all(
-        image["phase"].values[image["phase"].notnull().values] % 2
-        == image["phase"].values[image["phase"].notnull().values]
-    )
+    phase = image["phase"].values[image["phase"].notnull().values]
+    assert 0 <= phase.min() <= phase.max() < 2
 
 
 def test_time_series_ring_repeated_impacts_alone():

@@ -47,11 +47,11 @@ def test_contacts_begin_and_end_on_the_wall(case):
 
 def test_states_at_given_times_are_those_of_the_engine(case):
     pair, path, impacts, line = case
-    u, v = states(pair, *impacts, 2.0 * np.arange(PERIODS))
+    u, v = states(pair, *impacts, when=2.0 * np.arange(PERIODS))
     np.testing.assert_allclose(u[1:], path.states.u[: PERIODS - 1], atol=1e-13)
     np.testing.assert_allclose(v[1:], path.states.v[: PERIODS - 1], atol=1e-12)
     assert np.isnan([u[0], v[0]]).all()  # before the first impact
-    u, v = states(pair, *impacts, line.t[:400])  # in contact
+    u, v = states(pair, *impacts, when=line.t[:400])  # in contact
     np.testing.assert_allclose([u, v], [line.u[:400], line.v[:400]], atol=1e-13)
 
 

@@ -56,7 +56,8 @@ ROOMS: dict[str, set[str]] = {
     "portrait": {"store"},
     "cached": {"model", "orbit", "branch", "diagram", "paper"},
     "figures": {"model", "curve", "trajectory", "paper", "portrait", "cached"},
-    "claims": {"model", "orbit", "branch", "attractor", "cached", "diagram", "grid", "label", "paper"},
+    "evidence": {"model", "orbit", "branch", "attractor", "label", "cached", "paper"},
+    "claims": {"model", "branch", "attractor", "diagram", "grid", "cached", "paper", "evidence"},
     "chart": {"store"},
     "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare"},
 }

@@ -1,7 +1,7 @@
 """Diagrams, orbits and branches of the paper's figures and claims, each computed once."""
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ _LANES, _IMPACTS = 4, 3
 @lru_cache(maxsize=16)
 def diagram(run: Run) -> "xr.Dataset":
     """The orbit diagram of a run."""
-    axes = {name: np.asarray(values) if isinstance(values, tuple) else values for name, values in run.axes}
+    axes: Any = {name: np.asarray(values) if isinstance(values, tuple) else values for name, values in run.axes}
     return orbit_diagram(
         along=run.along,
         values=np.array(run.values),

@@ -45,18 +45,18 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
     return Curve(*(np.asarray(piece)[:count].ravel() for piece in pieces))
 
 
-def states(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[np.ndarray, np.ndarray]:
+def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
     """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
     (t, side, v_in, v_out, duration), count = _padded(t, side, v_in, v_out, duration)
     index = np.searchsorted(t[:count], when, side="right") - 1
     last = np.maximum(index, 0)
     u, v = _at(pair, *(row[last] for row in (t, side, v_in, v_out, duration)), np.asarray(when, float))
-    return tuple(np.where(index < 0, np.nan, x) for x in (u, v))
+    return np.where(index < 0, np.nan, u), np.where(index < 0, np.nan, v)
 
 
-def _padded(*rows) -> tuple[list[np.ndarray], int]:
+def _padded(*given) -> tuple[list[np.ndarray], int]:
     """Rows without what is not there, repeated to a power of two, as every new length would compile anew."""
-    rows = [np.asarray(row, float) for row in rows]
+    rows = [np.asarray(row, float) for row in given]
     there = np.isfinite(rows[0])
     count = int(there.sum())
     width = 1 << max(count - 1, 0).bit_length()
@@ -67,10 +67,9 @@ def _padded(*rows) -> tuple[list[np.ndarray], int]:
 def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, Array]:
     """The ball a time after each impact."""
     inside = when - t <= duration
-    held = jax.vmap(partial(_contact, pair))(t, side, v_in, jnp.where(inside, when - t, 0.0))
-    rise, v = flow.flight(pair.gamma, t + duration, v_out, jnp.where(inside, 0.0, when - t - duration))
-    free = 0.5 * side * pair.d + rise, v
-    return tuple(jnp.where(inside, *both) for both in zip(held, free, strict=True))
+    u, v = jax.vmap(partial(_contact, pair))(t, side, v_in, jnp.where(inside, when - t, 0.0))
+    rise, speed = flow.flight(pair.gamma, t + duration, v_out, jnp.where(inside, 0.0, when - t - duration))
+    return jnp.where(inside, u, 0.5 * side * pair.d + rise), jnp.where(inside, v, speed)
 
 
 @partial(jax.jit, static_argnames="samples")
