@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from vijax.trajectory import trajectory
 
 if TYPE_CHECKING:
     import xarray as xr
-    from matplotlib.figure import Figure
 
 MICRO = 1e6
 SERIES_PERIODS = 4  # of a time series
@@ -105,12 +104,15 @@ def panels(number: int) -> dict[str, Panel]:
     return {view.letter: _SHOWS.get(view.shows, _sweep)(figure, view) for view in figure.views}
 
 
-def draw(number: int, path: str | Path | None = None) -> "Figure":
+def draw(number: int, path: str | Path | None = None) -> Any:
     """Draw a figure of the paper.
 
     Args:
         number: 3 to 16.
         path: Where to write it, if anywhere.
+
+    Returns:
+        The `matplotlib.figure.Figure`.
     """
     figure = FIGURES[number]
     caption = f"Fig. {number}. {figure.title}. {figure.chosen}"
