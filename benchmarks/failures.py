@@ -39,7 +39,7 @@ import numpy as np
 from peers import rk4
 
 import vijax
-from vijax import exact, flow, plot
+from vijax import chart, exact, flow
 from vijax.membrane import Linear
 from vijax.method import Ode
 from vijax.model import ImpactPair, State, damping_ratio
@@ -574,7 +574,7 @@ def main() -> None:
     given = parser.parse_args()
 
     if given.plot:
-        plot.stability_map(stability_map(STABILITY_SIDES[given.quick]), given.plot)
+        chart.stability_map(stability_map(STABILITY_SIDES[given.quick]), given.plot)
         return
     given.rows.mkdir(parents=True, exist_ok=True)
     part = "_quick" if given.quick or given.only else ""

@@ -32,7 +32,7 @@ import mpmath as mp
 import numpy as np
 
 import vijax
-from vijax.plot import work_precision
+from vijax.chart import work_precision
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]

@@ -172,8 +172,9 @@ def _membrane(name: str | None, chi: float | None, exponent: float | None) -> An
 def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
     from vijax import plot as pictures
     from vijax.compare import Comparison
+    from vijax.style import check_format
 
-    pictures.check_format(path)
+    check_format(path)
     if isinstance(planned, Comparison):
         pictures.layout(planned.soft.cells.sizes)
         return

@@ -98,15 +98,16 @@ def test_a_cloud_of_starts_wider_than_the_tolerance_is_not_one_orbit():
 def test_chaos_is_one_entry_whatever_its_averages_and_says_how_long_was_looked():
     chaos = {"period": 0, "impacts_left": -1, "impacts_right": -1, "periods_run": 400.0, "lyapunov": 0.7}
     slow = {"period": -1, "impacts_left": -1, "impacts_right": -1, "status": Status.SLOW}
-    which = np.repeat([0, 0, 0, 1, 2], 20).reshape(1, 10, 10)
-    data = planted([chaos, slow, {}], which, noise=0.1)
+    failed = slow | {"status": Status.NONFINITE}
+    which = np.concatenate([np.repeat([0, 0, 0, 1, 2], 18), np.full(10, 3)]).reshape(1, 10, 10)
+    data = planted([chaos, slow, {}, failed], which, noise=0.1)
     data["P"][:] = np.random.default_rng(4).uniform(0.9e-6, 1.1e-6, which.shape)
-    quiet = data.where(which < 2, planted([{}], 0 * which))
+    quiet = data.where(which != 2, planted([{}], 0 * which))
     found = matched(quiet.astype({name: data[name].dtype for name in data}))
-    assert found.label.values.tolist() == [["aperiodic", "undecided", "1:1"]]
-    assert found.periodic.values.tolist() == [[False, False, True]]
+    assert found.label.values.tolist() == [["aperiodic", "undecided", "1:1", "failed"]]
+    assert found.periodic.values.tolist() == [[False, False, True, False]]
     assert found.periods_run.values[0, 0] == 400
-    assert found.attractors == 2  # undecided starts are none
+    assert found.attractors == 2  # undecided and failed starts are none
     assert float(found.P[0, 0]) == pytest.approx(float(data.P.values[which == 0].mean()))
 
 
@@ -191,6 +192,19 @@ def test_three_attractors_coexist_in_known_shares():
     assert shares["2:2/3T"] == pytest.approx(0.422, abs=0.05)
     energies = dict(zip(found.label.values, found.P.values, strict=True))
     assert energies["1:2/2T"] == pytest.approx(energies["2:1/2T"], rel=1e-12)
+
+
+def test_the_sign_of_the_mean_impact_velocity_tells_mirror_images_apart():
+    settings = {"starts": 500, "speed": 0.6, "seed": None, "periods": 200, "wall": "soft", "dtype": "float64"}
+    swept = grid.run(plan_fractions({"d": [0.2, 0.3], "kappa": 3.0, "r": 0.5}, **settings)).isel(d=0)
+    few, many, both = (
+        swept["asymmetry"].values[(swept["impacts_left"] == left) & (swept["impacts_right"] == right)]
+        for left, right in ((1, 2), (2, 1), (2, 2))
+    )
+    assert 0.01 < abs(few[0]) < 1
+    np.testing.assert_allclose(few, few[0], rtol=1e-9)
+    np.testing.assert_allclose(many, -few[0], rtol=1e-9)
+    np.testing.assert_allclose(both, 0.0, atol=1e-9)
 
 
 def test_merged_mirror_images_are_the_sum_of_both():

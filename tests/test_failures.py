@@ -14,7 +14,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import failures  # noqa: E402
 
-from vijax import plot  # noqa: E402
+from vijax import chart  # noqa: E402
 
 
 @cache
@@ -41,10 +41,10 @@ def test_stability():
 
 def test_the_stability_map_is_drawn(tmp_path):
     found = failures.stability_map(12)
-    plot.stability_map(found, tmp_path / "map.png")
+    chart.stability_map(found, tmp_path / "map.png")
     assert np.ptp(matplotlib.image.imread(tmp_path / "map.png")) > 0.5
     with pytest.raises(ValueError, match="plot must end in"):
-        plot.stability_map(found, tmp_path / "map.csv")
+        chart.stability_map(found, tmp_path / "map.csv")
 
 
 def test_order():

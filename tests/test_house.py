@@ -39,11 +39,11 @@ ROOMS: dict[str, set[str]] = {
     "simulate": {"model", "exact", "quick", "lanes", "method", "cell", "relay", "recurrence", "summary", "trips"},
     "curve": {"model", "flow"},
     "trajectory": {"model", "flow", "exact", "ode", "rk4", "membrane", "method"},
+    "shooting": {"model", "flow"},
+    "impact_map": {"model", "quick", "sampled", "lanes", "cell", "trips"},
+    "orbit": {"model", "flow", "energy", "shooting", "impact_map", "trajectory"},
+    "branch": {"model", "flow", "shooting", "orbit"},
     "record": {"model", "exact", "lanes", "trajectory"},
-    "impact_map": {"model", "cell", "lanes", "quick", "sampled", "trips"},
-    "shooting": {"model", "flow", "exact"},
-    "orbit": {"model", "flow", "energy", "exact", "impact_map", "shooting", "trajectory"},
-    "branch": {"model", "flow", "exact", "orbit", "shooting"},
     "axes": {"model"},
     "dataset": {"model", "method", "axes", "simulate"},
     "label": {"model"},
@@ -52,20 +52,21 @@ ROOMS: dict[str, set[str]] = {
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
     "compare": {"model", "dataset", "label", "grid"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
+    "style": set(),
+    "chart": {"store", "style"},
     "paper": set(),
     "portrait": {"store"},
     "cached": {"model", "orbit", "branch", "diagram", "paper"},
     "figures": {"model", "curve", "trajectory", "paper", "portrait", "cached"},
     "evidence": {"model", "orbit", "branch", "attractor", "label", "cached", "paper"},
     "claims": {"model", "branch", "attractor", "diagram", "grid", "cached", "paper", "evidence"},
-    "chart": {"store"},
-    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare"},
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style"},
 }
 ROOMS["__init__"] = set(ROOMS)
 
 ONLY_IN = {
     "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
-    "matplotlib": {"vijax/plot.py", "vijax/portrait.py"},
+    "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py"},
 }
 NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]
 IMPORT_SECONDS = 1.5

@@ -180,3 +180,44 @@ def test_a_new_number_of_real_cells_compiles_nothing():
     before = run._cache_size()
     results(cells, width=128, count=5)
     assert run._cache_size() == before
+
+
+# --- chains ---------------------------------------------------------------------------------------
+
+
+def succeed(toy, rows):
+    """The next countdown hashes on from the last one's digest."""
+    return rows.at[:, 0].set(toy.hash)
+
+
+@jax.jit
+def chained(links, count, length):
+    return lanes.chain(PROGRAM, succeed, links, count, length, OUTPUTS)
+
+
+def draw_chains(chains, links):
+    return draw(chains * links, [EASY, DECLINES, HARD]).reshape(chains, links, 4)
+
+
+def plain_chain(rows):
+    """What becomes of one chain, link after link."""
+    found = []
+    for row in rows:
+        found.append(plain([found[-1][1] if found else row[0], *row[1:]]))
+    return found
+
+
+@pytest.mark.parametrize("chains", [1, 5, 40])
+def test_every_link_starts_where_the_last_one_ended(chains):
+    links = draw_chains(chains, 12)
+    found = chained(jnp.asarray(links), jnp.asarray(chains, jnp.int32), jnp.asarray(12, jnp.int32))
+    assert np.array_equal(found, [plain_chain(rows) for rows in links])
+
+
+def test_chains_and_links_that_are_padding_stay_zero_and_are_never_looked_at():
+    links = draw_chains(8, 6)
+    links[5:], links[:, 4:] = np.nan, np.nan
+    found = np.asarray(chained(jnp.asarray(links), jnp.asarray(5, jnp.int32), jnp.asarray(4, jnp.int32)))
+    assert np.array_equal(found[:5, :4], [plain_chain(rows) for rows in links[:5, :4]])
+    assert not found[5:].any()
+    assert not found[:, 4:].any()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.colors import LogNorm
+from matplotlib.colors import LogNorm, to_rgba
 from matplotlib.legend import Legend
 
 from vijax import plot
@@ -343,6 +343,7 @@ def test_basin_map_lists_its_attractors():
     (mesh,) = figure.axes[0].collections
     colours = mesh.cmap(mesh.norm(mesh.get_array()))
     assert [tuple(colours[0, column]) for column in (0, 4, 7)] == list(shown.values())
+    assert shown[chaos] == to_rgba(plot._NO_ORBIT["aperiodic"])
     assert figure.axes[0].get_xlabel() == "$u0$"
 
 

@@ -7,7 +7,9 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from vijax.attractor import basin_fractions, basins, lyapunov, survival
 from vijax.compare import compare
+from vijax.diagram import orbit_diagram
 from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
 from vijax.membrane import HuntCrossley
@@ -22,12 +24,17 @@ __all__ = [
     "ImpactPair",
     "State",
     "Status",
+    "basin_fractions",
+    "basins",
     "compare",
     "harvested_energy",
     "impact_pair",
     "load",
+    "lyapunov",
+    "orbit_diagram",
     "save",
     "summarise",
+    "survival",
     "sweep",
     "trajectory",
 ]

@@ -4,8 +4,6 @@ The orbit's equations go on through grazing into orbits that are none (`shooting
 marks a bifurcation, are smooth functions along the branch. A sign change is located on the arc, and says which it was.
 """
 
-from collections.abc import Iterator, Sequence as Many
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -13,26 +11,46 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from vijax import flow, orbit as orbits, shooting
+from vijax import flow, shooting
+from vijax import orbit as orbits
 from vijax.model import Harvester, ImpactPair, Status
 from vijax.orbit import Orbit
 from vijax.shooting import Sequence
 
 ALONG = ("d", "kappa", "r", "gamma", "omega")
-_CHUNK = 32  # steps of one compiled call
+_BATCHES = (8, 64, 512)  # lanes of one compiled call
 _LONGEST, _SHORTEST = 0.01, 1e-9  # arclength of a step; the parameter's range counts as one
 _FIRST = 1e-3
 _CROWDED = 1e-7  # arclength within which several things may happen unresolved
 _ROUNDS = 6  # Newton corrections of a step, at most
 _CLOSE = 1e-11  # size of the last correction
 _BEND = 0.98  # least cosine between the tangents at the ends of a step
+_EASY = 0.2  # share of that bend after which the next step is longer
 _SAMPLES = 48  # of a flight or contact, to find its extrema
 _NOTHING = 1.0  # clearance where there is nothing to clear
 _ZERO = 1e-3  # part of a test function's ends that is zero
 _LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
 _NARROWINGS = 40  # of an interval that holds an event: false position with every third step a bisection
+
+
+class Tests(NamedTuple):
+    """Functions whose sign changes mark what happens on a branch; those from `speed` on are positive on real orbits."""
+
+    fold: Float[Array, ""]  # the parameter's share of the tangent
+    plus: Float[Array, ""]  # det(M - 1): a multiplier passes +1
+    minus: Float[Array, ""]  # det(M + 1): a multiplier passes -1
+    speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
+    flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
+    contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
+    exit: Float[Array, ""]  # least speed away from a wall: the ball stays
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+
+
+_FOLD, _PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
+_FIRST_END = Tests._fields.index("speed")
 
 
 class Arc(eqx.Module):
@@ -59,28 +77,6 @@ class Arc(eqx.Module):
         return ImpactPair(d, kappa, self.pair.r, self.pair.gamma)
 
 
-class _Place(NamedTuple):
-    """A point of a branch in the space of knots and parameter, the tangent there, and the test functions."""
-
-    y: Float[Array, "unknown"]  # knots, then the parameter over its range
-    tangent: Float[Array, "unknown"]
-    tests: "Tests"
-
-
-class Tests(NamedTuple):
-    """Functions whose sign changes mark what happens on a branch; those from `speed` on are positive on real orbits."""
-
-    fold: Float[Array, ""]  # the parameter's share of the tangent
-    plus: Float[Array, ""]  # det(M - 1): a multiplier passes +1
-    minus: Float[Array, ""]  # det(M + 1): a multiplier passes -1
-    speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
-    flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
-    contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
-    exit: Float[Array, ""]  # least speed away from a wall: the ball stays
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-
-
 def _unpack(arc: Arc, y):
     width = arc.sequence.side.shape[0]
     return y[:-1].reshape(width, 3), y[-1] * (arc.high - arc.low)
@@ -103,7 +99,7 @@ class _Arrival(NamedTuple):
 
 
 def _correct(arc: Arc, guess, former) -> _Arrival:
-    """Newton in the plane across the former tangent; the new tangent is that of the last correction but its own size."""
+    """Newton in the plane across the former tangent, and the tangent there."""
     ahead = jnp.zeros_like(guess).at[-1].set(1.0)
 
     def once(at: _Arrival) -> _Arrival:
@@ -192,90 +188,102 @@ def _tests(arc: Arc, y, tangent) -> Tests:
     )
 
 
-def _happenings(before: Tests, after: Tests):
+class _Place(NamedTuple):
+    """Points of branches, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
+
+    And how Newton came there: the size of its last correction, and how many it took.
+    """
+
+    y: np.ndarray
+    tangent: np.ndarray
+    tests: np.ndarray
+    size: np.ndarray
+    trips: np.ndarray
+
+
+@jax.jit
+def _compiled(arcs: Arc, y, tangent, length):
+    def one(arc, y, tangent, length):
+        at = _correct(arc, y + length * tangent, tangent)
+        return _Place(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.trips)
+
+    return jax.vmap(one)(arcs, y, tangent, length)
+
+
+def _advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> _Place:
+    """From points of branches on by an arclength each: the compiled program behind every step and every search."""
+    count = y.shape[0]
+    size = next((size for size in _BATCHES if size >= count), count)
+    index = np.minimum(np.arange(size), count - 1)
+    rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], (arcs, y, tangent, length))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], _compiled(*rows))
+
+
+def _changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Which test functions change sign."""
+    return np.sign(before) * np.sign(after) < 0
+
+
+def _happenings(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """How many things happen between two points; a multiplier that passes +1 at a fold is one of them."""
-    changed = Tests(*(jnp.sign(a) != jnp.sign(b) for a, b in zip(before, after, strict=True)))
-    real = jnp.stack(changed[Tests._fields.index("speed") :]).any()
-    return sum(x.astype(jnp.int32) for x in (changed.fold | changed.plus, changed.minus, real))
+    changed = Tests(*_changed(before, after).T)
+    ends = np.any(changed[_FIRST_END:], axis=0)
+    return (changed.fold | changed.plus).astype(int) + changed.minus + ends
 
 
-def _is_real(tests: Tests):
-    return jnp.stack(tests[Tests._fields.index("speed") :]).min(axis=0) > 0
+def _follow(arcs: Arc, first: _Place, along: str, points: int) -> list["Branch"]:
+    """One way from every start: all lanes together until none goes on; a step that does not do is halved."""
+    lanes = first.y.shape[0]
+    passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]
+    y, tangent, tests = first.y, first.tangent, first.tests
+    length, going = np.full(lanes, _FIRST), np.full(lanes, True)
+    while going.any():
+        there = _advance(arcs, y, tangent, length)
+        straight = (there.tangent * tangent).sum(axis=1)
+        near = np.linalg.norm(there.y - y, axis=1) < 2 * length
+        single = (_happenings(tests, there.tests) <= 1) | (length < _CROWDED)
+        good = going & (there.size <= _CLOSE) & (straight > _BEND) & near & single
+        for lane in np.flatnonzero(good):
+            passed[lane].append((there.y[lane], there.tangent[lane], there.tests[lane], length[lane]))
+        easy = (there.trips <= 3) & (straight > 1 - _EASY * (1 - _BEND))
+        longer = np.where(easy, np.minimum(1.5 * length, _LONGEST), length)
+        new = (there.y, there.tangent, there.tests)
+        y, tangent, tests = (np.where(good[:, None], *pair) for pair in zip(new, (y, tangent, tests), strict=True))
+        length = np.where(good, longer, 0.5 * length)
+        real = (tests[:, _FIRST_END:] > 0).all(axis=1) | ~good
+        short = np.array([len(lane) < points for lane in passed])
+        going = going & (length > _SHORTEST) & real & short
+    return [_branch(jax.tree.map(lambda x, i=i: x[i], arcs), rows, along, points) for i, rows in enumerate(passed)]
 
 
-class _Walk(NamedTuple):
-    """A lane's way along its branch: where it is, how long the next step is, whether it goes on."""
+def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, test: np.ndarray, low_f: np.ndarray):
+    """Arclengths from points of a branch at which test functions vanish, the points, and which are zeros, no poles."""
+    rows = np.arange(test.size)
+    arcs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
 
-    place: _Place
-    length: Float[Array, ""]
-    going: Bool[Array, ""]
+    def look(s):
+        at = _advance(arcs, y, tangent, s)
+        return at.tests[rows, test], at.y
 
-
-def _step(arc: Arc, walk: _Walk) -> tuple[_Walk, tuple[_Place, Array, Array]]:
-    """Try one step; returns the walk after it, and what was reached, with how long a step, and whether it counts."""
-    here = walk.place
-    y, tangent, size, trips = _correct(arc, here.y + walk.length * here.tangent, here.tangent)
-    there = _Place(y, tangent, _tests(arc, y, tangent))
-    straight = tangent @ here.tangent
-    near = jnp.linalg.norm(y - here.y) < 2 * walk.length
-    single = (_happenings(here.tests, there.tests) <= 1) | (walk.length < _CROWDED)
-    good = walk.going & (size <= _CLOSE) & (straight > _BEND) & near & single
-    easy = good & (trips <= 3) & (straight > 1 - 0.2 * (1 - _BEND))
-    length = jnp.where(good, jnp.where(easy, jnp.minimum(1.5 * walk.length, _LONGEST), walk.length), 0.5 * walk.length)
-    going = walk.going & (length > _SHORTEST) & ~(good & ~_is_real(there.tests))
-    place = jax.tree.map(lambda new, old: jnp.where(good, new, old), there, here)
-    return _Walk(place, length, going), (there, walk.length, good)
-
-
-@jax.jit
-def _begin(arcs: Arc, y, heading) -> _Walk:
-    def one(arc, y, heading):
-        y, tangent, *_ = _correct(arc, y, heading)
-        return _Walk(_Place(y, tangent, _tests(arc, y, tangent)), jnp.asarray(_FIRST, y.dtype), jnp.asarray(True))
-
-    return jax.vmap(one)(arcs, y, heading)
-
-
-@jax.jit
-def _walk(arcs: Arc, walk: _Walk):
-    def steps(arc, walk):
-        return lax.scan(lambda w, _: _step(arc, w), walk, None, length=_CHUNK)
-
-    return jax.vmap(steps)(arcs, walk)
-
-
-@jax.jit
-def _locate(arcs: Arc, here: _Place, length, test):
-    """The arclength from `here`, up to `length`, of a test function's zero, the point, and whether it is no pole."""
-
-    def one(arc, here, length, test):
-        def look(s):
-            y, tangent, *_ = _correct(arc, here.y + s * here.tangent, here.tangent)
-            return y, jnp.stack(_tests(arc, y, tangent))[test]
-
-        def narrow(trip, carry):
-            low, high, f_low, f_high, best, f_best = carry
-            chord = low - f_low * (high - low) / jnp.where(f_high == f_low, 1.0, f_high - f_low)
-            inside = (chord > low) & (chord < high) & (trip % 3 != 2)
-            s = jnp.where(inside, chord, 0.5 * (low + high))
-            f = look(s)[1]
-            left = jnp.sign(f) == jnp.sign(f_low)
-            closer = jnp.abs(f) < jnp.abs(f_best)
-            return (
-                jnp.where(left, s, low),
-                jnp.where(left, high, s),
-                jnp.where(left, f, 0.5 * f_low),  # Illinois: the end that stays counts half
-                jnp.where(left, 0.5 * f_high, f),
-                jnp.where(closer, s, best),
-                jnp.where(closer, f, f_best),
-            )
-
-        f_high = look(length)[1]
-        start = (jnp.zeros_like(length), length, jnp.stack(here.tests)[test], f_high, length, f_high)
-        *_, s, f = lax.fori_loop(0, _NARROWINGS, narrow, start)
-        return s, look(s)[0], jnp.abs(f) <= _ZERO * (jnp.abs(start[2]) + jnp.abs(f_high))
-
-    return jax.vmap(one)(arcs, here, length, test)
+    low, high = np.zeros_like(length), length
+    high_f, best_y = look(high)
+    scale, best, best_f = np.abs(low_f) + np.abs(high_f), high, high_f
+    for trip in range(_NARROWINGS):
+        chord = low - low_f * (high - low) / np.where(high_f == low_f, 1.0, high_f - low_f)
+        inside = (chord > low) & (chord < high) & (trip % 3 != 2)
+        s = np.where(inside, chord, 0.5 * (low + high))
+        f, there = look(s)
+        closer = np.abs(f) < np.abs(best_f)
+        best, best_f, best_y = (
+            np.where(closer, s, best),
+            np.where(closer, f, best_f),
+            np.where(closer[:, None], there, best_y),
+        )
+        left = np.sign(f) == np.sign(low_f)
+        # Illinois: the value at the end that stays counts half.
+        low, high = np.where(left, s, low), np.where(left, high, s)
+        low_f, high_f = np.where(left, f, 0.5 * low_f), np.where(left, 0.5 * high_f, f)
+    return best, best_y, np.abs(best_f) <= _ZERO * scale
 
 
 class Point(NamedTuple):
@@ -317,7 +325,7 @@ class Branch(NamedTuple):
         return np.abs(np.asarray(self.orbit.multipliers)).max(axis=1) < 1
 
 
-_NAMES = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
+_GRAZING = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
 
 def follow(
@@ -350,9 +358,18 @@ def follow(
     ways = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
     if direction not in ways:
         raise ValueError(f'direction must be "up", "down" or "both"; got {direction!r}')
-    ahead = jnp.zeros_like(y).at[:, -1].set(1.0)
-    found = [_follow(arcs, y, sign * ahead, along, points) for sign in ways[direction]]
+    ahead = np.zeros_like(y)
+    ahead[:, -1] = 1.0
+    first = _advance(arcs, y, ahead, np.zeros(len(orbit)))
+    found = [_follow(arcs, _heading(first, sign), along, points) for sign in ways[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]
+
+
+def _heading(place: _Place, sign: float) -> _Place:
+    """The place, facing the other way where the sign is negative; the fold's test function turns with it."""
+    tests = place.tests.copy()
+    tests[:, _FOLD] *= sign
+    return place._replace(tangent=sign * place.tangent, tests=tests)
 
 
 def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None):
@@ -376,85 +393,59 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
         raise ValueError("orbit must not be closed half way to follow it along gamma; unfold it first")
     arcs = Arc(orbit.pair, orbit.sequence, ratio, jnp.full(size, low), jnp.full(size, high), along)
     knots = jnp.where(orbit.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
-    return arcs, jnp.concatenate([knots, (x / (high - low))[:, None]], axis=1)
+    return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 
-def _follow(arcs: Arc, y, tangent, along: str, points: int) -> list[Branch]:
-    """One way from every start: all lanes together, chunk by chunk, until none goes on."""
-    walk = _begin(arcs, y, tangent)
-    reached = [jax.tree.map(lambda leaf: np.asarray(leaf)[:, None], (walk.place, walk.length, walk.going))]
-    for _ in range(0, points, _CHUNK):
-        walk, chunk = _walk(arcs, walk)
-        reached.append(jax.tree.map(np.asarray, chunk))
-        if not walk.going.any():
-            break
-    places, lengths, good = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *reached)
-    return [
-        _branch(
-            jax.tree.map(lambda leaf, i=lane: leaf[i], arcs),
-            *jax.tree.map(lambda leaf, i=lane: leaf[i][good[i]], (places, lengths)),
-            along,
-            bool(walk.going[lane]),
-        )
-        for lane in range(y.shape[0])
-    ]
-
-
-def _branch(arc: Arc, places: _Place, lengths: np.ndarray, along: str, unfinished: bool) -> Branch:
+def _branch(arc: Arc, rows: list[tuple], along: str, points: int) -> Branch:
     """A lane's record as a branch: what was met between its points, and where it ends."""
-    real = np.asarray(_is_real(Tests(*map(jnp.asarray, places.tests))))
-    events = sorted(_events(arc, places, lengths), key=lambda event: event[:2])
-    last = len(real)
-    end = "points" if unfinished else "lost"
-    points = []
-    for index, _, name, y in events:
-        kind = _kind(arc, name, y, places.y[index : index + 2])
-        if kind in ("low", "high"):
-            end = kind
-        else:
-            points.append(Point(kind, float(y[-1] * (arc.high - arc.low)), _orbits(arc, y[None])))
-            end = kind if name in _NAMES else end
-        if not real[index + 1]:
-            last = index + 1
-    ys = places.y[:last]
-    return Branch(along, ys[:, -1] * float(arc.high - arc.low), _orbits(arc, ys), points, ("start", end))
+    y, tangent, tests, lengths = (np.array(column) for column in zip(*rows, strict=True))
+    end = "points" if len(rows) >= points else "lost"
+    last, met = len(rows), []
+    for event in sorted(_events(arc, y, tangent, tests, lengths), key=lambda event: (event.place, event.s)):
+        kind = _kind(arc, event, y[event.place : event.place + 2])
+        if event.test in Tests._fields[_FIRST_END:]:
+            end, last = kind, event.place + 1
+        if kind not in ("low", "high"):
+            met.append(Point(kind, float(event.y[-1] * (arc.high - arc.low)), _orbits(arc, event.y[None])))
+    return Branch(along, y[:last, -1] * float(arc.high - arc.low), _orbits(arc, y[:last]), met, ("start", end))
 
 
-def _events(arc: Arc, places: _Place, lengths: np.ndarray) -> Iterator[tuple[int, float, str, np.ndarray]]:
-    """Sign changes between neighbours: index of the first, arclength from there, which test, the point."""
-    tests = np.stack(places.tests, axis=1)
-    index, test = np.nonzero(np.sign(tests[:-1]) * np.sign(tests[1:]) < 0)
+class _Event(NamedTuple):
+    """A sign change: the point before it, the arclength from there, of which test function, the point itself."""
+
+    place: int
+    s: float
+    test: str
+    y: np.ndarray
+
+
+def _events(arc: Arc, y, tangent, tests, lengths) -> list[_Event]:
+    """What happens between neighbours, up to the first thing that ends the branch."""
+    index, test = np.nonzero(_changed(tests[:-1], tests[1:]))
     if not index.size:
-        return
-    # A power of two of them, so that few programs are compiled.
-    size = 1 << (index.size - 1).bit_length()
-    rows, which = np.resize(index, size), np.resize(test, size)
-    here = jax.tree.map(lambda leaf: jnp.asarray(leaf[rows]), places)
-    wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size, *leaf.shape)), arc)
-    s, y, zero = jax.tree.map(np.asarray, _locate(wide, here, jnp.asarray(lengths[rows + 1]), jnp.asarray(which)))
-    names = [Tests._fields[t] for t in test]
-    ends: dict[int, float] = {}  # the first that ends the branch, by interval
-    for i, test_name in enumerate(names):
-        if test_name in (*_NAMES, "low", "high"):
-            ends[index[i]] = min(ends.get(index[i], np.inf), s[i])
-    for i, test_name in enumerate(names):
-        beyond = s[i] > ends.get(index[i], np.inf)
-        # At a fold a multiplier passes +1 too.
-        twin = test_name == "plus" and ((index == index[i]) & (test == Tests._fields.index("fold"))).any()
-        if zero[i] and not beyond and not twin:
-            yield int(index[i]), float(s[i]), test_name, y[i]
+        return []
+    s, there, zero = _locate(arc, y[index], tangent[index], lengths[index + 1], test, tests[index, test])
+    found = [
+        _Event(int(i), float(at), Tests._fields[t], y)
+        for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
+        # A multiplier that passes +1 at a fold is no second event.
+        if sure and not (t == _PLUS and ((index == i) & (test == _FOLD)).any())
+    ]
+    ends = [event.s for event in found if event.place == len(y) - 2 and event.test in Tests._fields[_FIRST_END:]]
+    return [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
 
 
-def _kind(arc: Arc, test: str, y: np.ndarray, neighbours: np.ndarray) -> str:
+def _kind(arc: Arc, event: _Event, neighbours: np.ndarray) -> str:
     """What a sign change means for this orbit."""
-    if test in _NAMES:
-        return f"grazing {_NAMES[test]}"
+    test = event.test
+    if test in _GRAZING:
+        return f"grazing {_GRAZING[test]}"
     if test == "minus":
         return "pitchfork" if bool(arc.sequence.mirrored) else "flip"
     if test in ("low", "high"):
         return test
     # A branch of mirror pairs turns where the two of a pair meet; a symmetric one passes +1 there without turning.
-    meets = np.asarray(orbits.symmetric(_orbits(arc, np.concatenate([y[None], neighbours])), _LEVEL))
+    meets = np.asarray(orbits.symmetric(_orbits(arc, np.concatenate([event.y[None], neighbours])), _LEVEL))
     turns = test == "fold"
     return "pitchfork" if meets[0] and turns != meets[1:].all() else "fold"
 
@@ -500,6 +491,9 @@ def switch(
     doubled = orbits.doubled(point.orbit)
     arcs, y = _set_out(doubled, along, within, device)
     knots = y[0, :-1].reshape(-1, 3)
-    slope = np.asarray(shooting.linearise(*jax.tree.map(lambda x: x[0], (doubled.pair, doubled.sequence)), knots).slope)
-    away = jnp.append(jnp.asarray(np.linalg.svd(slope)[2][-1]), 0.0)[None]
-    return [_follow(arcs, y, sign * away, along, points)[0] for sign in (1.0, -1.0)]
+    pair, sequence = jax.tree.map(lambda x: x[0], (doubled.pair, doubled.sequence))
+    slope = np.asarray(shooting.linearise(pair, sequence, knots).slope)
+    away = np.append(np.linalg.svd(slope)[2][-1], 0.0)[None]
+    # Test functions that vanish here would be met again at once.
+    first = _Place(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
+    return [_follow(arcs, _heading(first, sign), along, points)[0] for sign in (1.0, -1.0)]

@@ -311,7 +311,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
 def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -> Record:
     """The kept periods of every point, flown again from where they begin."""
     soft = planned.settings["wall"] == "soft"
-    d, kappa, r, gamma = (table[name].ravel() for name in ("d", "kappa", "r", "gamma"))
+    d, kappa, r, gamma = (jnp.asarray(table[name].ravel()) for name in ("d", "kappa", "r", "gamma"))
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
     whole_numbers = (x.astype(np.int32) for x in (n, held))
     lost = np.isin(summary.status, (Status.EVENT_BUDGET, Status.NONFINITE)).ravel()
@@ -335,6 +335,8 @@ def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
     of = planned.cells
     # A start is that of the first points alone.
     known = {name: x for name, x in coordinates(of).items() if name in of.given or name not in ("u0", "v0")}
-    ways = {"direction": ("direction", list(diagram.ways))} if "direction" in sizes else {}
+    # Text of fixed width has no place in the third format of zarr.
+    names = np.array(diagram.ways, dtype=np.dtypes.StringDType())
+    ways = {"direction": ("direction", names)} if "direction" in sizes else {}
     title = {"title": "Orbit diagram of a vibro-impact pair"}
     return xr.Dataset(variables, coords=ways | known, attrs=provenance(planned) | title)

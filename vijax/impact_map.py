@@ -126,7 +126,16 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
     """
     kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
     rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, side.astype(pair.d.dtype), speed, t], axis=1)
-    plan = Plan("window", None, pair.kappa is None, level, True, False, False, False, 1)
+    plan = Plan(
+        until="window",
+        stepping=None,
+        rigid=pair.kappa is None,
+        level=level,
+        deep=True,
+        energies=False,
+        tangent=False,
+        variants=1,
+    )
     tile = _TILES[0] if rows.shape[0] <= _TILES[0] else _TILES[1]
     parts = []
     for start in range(0, rows.shape[0], tile):
@@ -135,4 +144,5 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
         part = jnp.concatenate([part, jnp.broadcast_to(part[:1], (tile - count, part.shape[1]))])
         parts.append(_compiled(plan, _LANES)(part, jnp.asarray(count, jnp.int32))[:count])
     table = jnp.concatenate(parts)
-    return Next(*table[:, :-1].T, table[:, -1] != 0)
+    t, side, v_in, v_out, duration, depth, work, real = table.T
+    return Next(t, side, v_in, v_out, duration, depth, work, real != 0)

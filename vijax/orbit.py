@@ -3,10 +3,10 @@
 import itertools
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -72,7 +72,13 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impac
         Orbits in the order of the guesses, each with its `status`.
     """
     level = _level(pair)
-    return _by_tiles(lambda part: _solve(*part, level), (pair, sequence, knots))
+
+    def work(part):
+        pair, sequence, guess = part
+        knots, residual, around = _shoot(pair, sequence, guess)
+        return _verify(pair, sequence, knots, residual, around, level)
+
+    return _by_tiles(work, (pair, sequence, knots))
 
 
 def _level(pair: ImpactPair) -> bool:
@@ -93,11 +99,6 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
 
 
-def _solve(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"], level: bool) -> Orbit:
-    """One tile: Newton, then the proof."""
-    return _verify(pair, sequence, *_shoot(pair, sequence, guess), level)
-
-
 @jax.jit
 def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]):
     knots, residual = shooting.newton(pair, sequence, guess)
@@ -111,9 +112,15 @@ def _once_around(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbi
 
 
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
-    """Orbits from knots that solve the equations already, as the points of a branch do, even where Newton is singular."""
+    """Orbits from knots that solve the equations already, even where Newton is singular: points of a branch."""
     level = _level(pair)
-    return _by_tiles(lambda part: _verify(*part, *_measured(*part), level), (pair, sequence, knots))
+
+    def work(part):
+        pair, sequence, knots = part
+        residual, around = _measured(pair, sequence, knots)
+        return _verify(pair, sequence, knots, residual, around, level)
+
+    return _by_tiles(work, (pair, sequence, knots))
 
 
 @jax.jit
@@ -173,26 +180,31 @@ def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -
     return jnp.where(mirrored[:, None], values * values, values)
 
 
-def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1) -> Orbit:
+def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1, settle: int = 0) -> Orbit:
     """Periodic orbits near some states: each is flown once around to learn its impacts, then corrected by Newton.
 
     Args:
         pair: One cell, or one a state.
         u, v, t: Displacements, velocities and phases in [0, 2).
         period: Forcing periods of the orbits.
+        settle: Forcing periods that the states are flown first: the guesses are then near attractors.
 
     Returns:
         One orbit a state, stable or not; NO_ORBIT where Newton found none, or the state meets no wall.
 
     Raises:
-        ValueError: period below 1, or an inadmissible pair or state.
+        ValueError: period below 1, settle below 0, or an inadmissible pair or state.
     """
-    if period < 1:
-        raise ValueError(f"period must be at least 1; got {period}")
+    for name, value, least in (("period", period, 1), ("settle", settle, 0)):
+        if value < least:
+            raise ValueError(f"{name} must be at least {least}; got {value}")
     u, v, t = (jnp.atleast_1d(jnp.asarray(x, float)) for x in (u, v, t))
     shape = jnp.broadcast_shapes(u.shape, v.shape, t.shape, *(jnp.shape(x) for x in jax.tree.leaves(pair)))
     pair = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), pair)
     u, v, t = (jnp.broadcast_to(x, shape) for x in (u, v, t))
+    if settle:
+        last = jax.tree.map(lambda x: x[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
+        u, v, t = last.u, last.v, jnp.zeros_like(t)
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
     found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
     onset = 2.0 * found.n + found.t
@@ -333,3 +345,98 @@ def _unfolded(orbit: Orbit, twice: Bool[Array, "orbit"]) -> Orbit:
     span = jnp.where(twice, 2 * orbit.sequence.span, orbit.sequence.span)
     sequence = Sequence(jnp.where(there, side, 0), span, orbit.sequence.mirrored & ~twice)
     return proven(orbit.pair, sequence, jnp.where(there[..., None], knots, 0.0))
+
+
+class Counts(NamedTuple):
+    """Label of orbits: impacts on the left, on the right, per forcing periods; n:m/pT."""
+
+    left: Int[Array, "orbit"]
+    right: Int[Array, "orbit"]
+    period: Int[Array, "orbit"]
+
+
+def counts(orbit: Orbit) -> Counts:
+    """What is in the label of each orbit, over the smallest whole number of periods after which it recurs."""
+    full = unfolded(orbit)
+    side, number = full.sequence.side, full.count
+    period = jnp.round(0.5 * full.sequence.span).astype(jnp.int32)
+    index = jnp.arange(side.shape[1])
+    turns = jnp.ones_like(period)
+    for parts in range(2, int(period.max(initial=1)) + 1):
+        shift = jnp.where(number % parts == 0, number // parts, 0)[:, None]
+        there = jnp.minimum(index + shift, side.shape[1] - 1)
+        wait = jnp.array([1.0, 0.0, 0.0]) * (full.sequence.span / parts)[:, None, None]
+        moved = jnp.take_along_axis(full.knots, there[..., None], axis=1) - full.knots - wait
+        same = (jnp.abs(moved).max(axis=2) < _SAME) & (jnp.take_along_axis(side, there, axis=1) == side)
+        recurs = (period % parts == 0) & (shift[:, 0] > 0) & (same | (index >= number[:, None] - shift)).all(axis=1)
+        turns = jnp.where(recurs, parts, turns)
+    left, right = ((side == wall).sum(axis=1, dtype=jnp.int32) for wall in (-1, 1))
+    return Counts(left // turns, right // turns, period // turns)
+
+
+def impacts(orbit: Orbit) -> Impact:
+    """The impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
+    full = unfolded(orbit)
+    passage = jax.jit(jax.vmap(shooting.passages))(full.pair, full.sequence, full.knots)
+    side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
+    phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
+    blank = jnp.where(side == 0, jnp.nan, 0.0)
+    return Impact(
+        n=n.astype(jnp.int32),
+        t=phase + blank,
+        side=side,
+        v_in=side * speed + blank,
+        v_out=-side * passage.speed + blank,
+        depth=full.depth,
+        duration=stay,
+        work=full.work,
+    )
+
+
+def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
+    """Energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
+
+    Args:
+        device: Gives A and omega (the unit of length), omega0 where walls are rigid, and the electrical constants.
+
+    Source: Eq. (36), corrected.
+    """
+    length = device.length_unit
+    if orbit.pair.kappa is None:
+        length = length * device.omega / (flow.PI * device.omega0)
+    energy = jnp.where(orbit.sequence.real, harvested_energy(device, orbit.depth * length), 0.0)
+    return energy.sum(axis=1) / orbit.sequence.span
+
+
+def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The motion of full orbits to draw: `samples` instants of every contact and of every flight.
+
+    Returns:
+        Time, displacement and velocity, each [orbit, instant], in order; NaN where padded. Velocity jumps at a rigid
+        wall.
+    """
+    full = unfolded(orbit)
+    rows = jax.jit(jax.vmap(partial(_path, samples)))(full.pair, full.sequence, full.knots)
+    t, u, v = (np.asarray(x).reshape(len(full), -1) for x in rows)
+    return t, u, v
+
+
+def _path(samples: int, pair: ImpactPair, sequence: Sequence, knots):
+    passage = shooting.passages(pair, sequence, knots)
+    share = jnp.linspace(0.0, 1.0, samples)
+
+    def one(real, side, knot, out, leaves, arrives):
+        t, speed, stay = knot
+        inside = share * stay
+        w, z = jnp.zeros_like(share), jnp.full_like(share, speed)
+        if pair.kappa is not None:
+            force, wall = flow.contact_force(pair.gamma, side, t), flow.membrane(pair, rolled=True)
+            start = jnp.zeros_like(t)
+            w, z = jax.vmap(lambda s: flow.oscillate(wall, force, start, speed, s))(inside)
+        aloft = share * (arrives - leaves)
+        rise, v = jax.vmap(lambda s: flow.flight(pair.gamma, leaves, -side * out, s))(aloft)
+        u = jnp.concatenate([side * (0.5 * pair.d + w), 0.5 * side * pair.d + rise])
+        rows = jnp.concatenate([t + inside, leaves + aloft]), u, jnp.concatenate([side * z, v])
+        return jax.tree.map(lambda x: jnp.where(real, x, jnp.nan), rows)
+
+    return jax.vmap(one)(sequence.real, passage.side, knots, passage.speed, passage.t, passage.next_t)

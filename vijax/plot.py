@@ -1,9 +1,8 @@
-"""Pictures of maps, for print; the only room that loads matplotlib."""
+"""Pictures of maps, for print."""
 
 import itertools
 import math
-import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -22,6 +21,7 @@ from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.label import label
 from vijax.store import replacing
+from vijax.style import STYLE, axis_label, check_format, equations, title
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,17 +30,6 @@ NEEDS = ("P", "period", "admissible")
 LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
 MOST_PANELS = 36
 
-_STYLE: Any = {
-    "font.family": "STIXGeneral",
-    "mathtext.fontset": "stix",
-    "font.size": 9,
-    "axes.linewidth": 0.6,
-    "hatch.linewidth": 0.4,
-    "savefig.dpi": 250,
-}
-_ENDINGS = (".png", ".pdf", ".svg", ".eps")
-# Worth a place in the title: neither the start, nor a quantity under a second name.
-_CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
 # A wider scale would say more about its faintest cells than about those worth building.
 _DECADES = 4
 # Values count as evenly spaced if their steps differ by less than this part of their range.
@@ -103,12 +92,6 @@ def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
     if len(drawn) == 1:
         raise ValueError(f"plot must have two axes of more than one value; got {drawn[0]} alone")
     return layout(sizes)
-
-
-def check_format(path: str | Path) -> None:
-    """Raise ValueError unless the path ends as a picture does."""
-    if Path(path).suffix not in _ENDINGS:
-        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {str(path)!r}")
 
 
 class _Mark(NamedTuple):
@@ -230,36 +213,6 @@ def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Fig
     return _picture(dataset, _DIFFERENCE, path)
 
 
-def stability_map(found: Any, path: str | Path | None = None) -> Figure:
-    """Where an explicit method stays bounded over stiffness and steps per period, under the boundary of theory.
-
-    Args:
-        found: A record with `kappa` [K] and `steps` [S], both ascending, `stable` [S, K], and `least_steps` [K], the
-            boundary.
-        path: Where to write it, if anywhere; the ending chooses the format.
-
-    Raises:
-        ValueError: If the path does not end as a picture does.
-    """
-    if path is not None:
-        check_format(path)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(5.2, 3.8), layout="constrained")
-        axes = figure.subplots()
-        axes.set(xscale="log", yscale="log", xlabel=r"$\kappa$", ylabel="RK4 steps per period")
-        axes.pcolormesh(found.kappa, found.steps, found.stable, cmap="Blues_r", vmin=-1, vmax=1.5, rasterized=True)
-        axes.plot(found.kappa, found.least_steps, **_OUTLINE)
-        axes.set(xlim=found.kappa[[0, -1]], ylim=found.steps[[0, -1]])
-        shades = (Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4))
-        handles = [*shades, Line2D([], [], **_OUTLINE)]
-        texts = ["bounded", "blown up within 50 periods", "theory"]
-        figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
-        if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
-    return figure
-
-
 def _need(dataset: "xr.Dataset", names: tuple[str, ...]) -> None:
     missing = [name for name in names if name not in dataset]
     if missing:
@@ -277,7 +230,7 @@ def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Fig
     full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
     dataset = dataset.assign(full)[names].squeeze()
     dims = [str(dim) for dim in dataset[kind.coloured].dims]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
         if path is not None:
             with replacing(Path(path)) as part:
@@ -314,12 +267,12 @@ def _panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple
         panel = dataset.isel(dict(zip(outer, index, strict=True)))
         (across, xscale), (up, yscale) = (_edges(panel[dim].values) for dim in dims[:2])
         axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=_BARE["color"])
-        axes.set_title(_values(panel, dims[2:]), fontsize="medium")
+        axes.set_title(equations(panel, dims[2:]), fontsize="medium")
         panels.append((axes, panel))
     for axes in grid[-1]:
-        axes.set_xlabel(_label(dataset[dims[0]]))
+        axes.set_xlabel(axis_label(dataset[dims[0]]))
     for axes in grid[:, 0]:
-        axes.set_ylabel(_label(dataset[dims[1]]))
+        axes.set_ylabel(axis_label(dataset[dims[1]]))
     return figure, panels
 
 
@@ -340,7 +293,7 @@ def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
     figure = Figure(figsize=(5.2, 3.8), layout="constrained")
     axes, peak = figure.subplots(), _peak(dataset)
     across, xscale = _edges(places)
-    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=_label(dataset[x]), ylabel=kind.label)
+    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=axis_label(dataset[x]), ylabel=kind.label)
     drawn = (values > 0) & np.isfinite(values)
     axes.plot(places, np.where(drawn, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
     axes.margins(y=0.05)
@@ -447,7 +400,7 @@ def _coded(dataset: "xr.Dataset", categories: list[_Category] | None, path: str 
     layout_of_kinds({str(dim): size for dim, size in dataset["code"].sizes.items()})
     dataset = dataset.squeeze([dim for dim, size in dataset["code"].sizes.items() if size == 1])
     dims = [str(dim) for dim in dataset["code"].dims]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, panels = _panels(dataset, dims)
         figure.set_figwidth(figure.get_figwidth() + 1.5)
         for axes, panel in panels:
@@ -462,7 +415,7 @@ def _coded(dataset: "xr.Dataset", categories: list[_Category] | None, path: str 
             _shade(figure, dataset, panels, dims)
         if categories is not None:
             _list_categories(figure, categories, loc="outside right upper")
-        figure.suptitle(_constants(dataset), fontsize="medium")
+        figure.suptitle(title(dataset), fontsize="medium")
         if path is not None:
             with replacing(Path(path)) as part:
                 figure.savefig(part)
@@ -526,16 +479,9 @@ def _share(part: Any) -> str:
     return f"{100 * float(part):.3g} %"
 
 
-def _constants(dataset: "xr.Dataset") -> str:
-    """The kind of wall and what the map holds constant."""
-    constants = [name for name in _CONSTANTS if name in dataset.coords and not dataset[name].ndim]
-    title = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
-    return ", ".join([*title, _values(dataset, constants)])
-
-
 def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataArray | None") -> None:
     """What the map holds constant above it, what its marks mean below; only the marks that it has."""
-    figure.suptitle(_constants(dataset), fontsize="medium")
+    figure.suptitle(title(dataset), fontsize="medium")
     shown = [(_handle(mark), mark.text) for mark in kind.marks(dataset) if mark.mask.any()]
     if peak is not None:
         amount = EngFormatter("J", places=2)(float(peak))
@@ -592,166 +538,3 @@ def _marks(mask: np.ndarray, x: np.ndarray, y: np.ndarray, *, most: bool) -> tup
     rows, columns = np.nonzero(2 * share > step**2 if most else share)
     centre = [np.minimum(start + step // 2, size - 1) for start, size in zip(starts, mask.shape, strict=True)]
     return x[centre[1][columns]], y[centre[0][rows]]
-
-
-def _label(coordinate: "xr.DataArray") -> str:
-    units = _units(coordinate)
-    return _symbol(coordinate) + (f" [{units}]" if units else "")
-
-
-def _symbol(coordinate: "xr.DataArray") -> str:
-    return f"${coordinate.attrs.get('symbol', coordinate.name)}$"
-
-
-def _values(dataset: "xr.Dataset", names: list[str]) -> str:
-    """The values of scalar coordinates: r = 0.5, omega = 3.14 rad/s."""
-    scalars = [dataset[name] for name in names]
-    return ", ".join(f"{_symbol(scalar)} = {float(scalar):.4g} {_units(scalar)}".strip() for scalar in scalars)
-
-
-def _units(coordinate: "xr.DataArray") -> str:
-    units = coordinate.attrs.get("units", "1")
-    return "" if units == "1" else re.sub(r"(-?\d+)", r"$^{\1}$", units)
-
-
-# --- work against precision -----------------------------------------------------------------------
-
-# The same colour for a method everywhere: vijax in strong colours and whole lines, its peers dashed.
-_METHODS: dict[str, tuple[str, str]] = {
-    "exact": ("#d62728", "-"),
-    "exact float32": ("#ff7f0e", "-"),
-    "ode Tsit5": ("#1f77b4", "-"),
-    "ode Dopri8": ("#17a2b8", "-"),
-    "ode Kvaerno5": ("#7b5fc7", "-"),
-    "rk4": ("#8c564b", "-"),
-    "numba RK4": ("#c49a6c", "--"),
-    "numba DP5 + events": ("#2ca02c", "--"),
-    "diffrax restarts": ("#6baed6", "--"),
-    "SciPy DOP853": ("0.35", "--"),
-    "SciPy Radau": ("0.6", "--"),
-}
-_MEASURES = {
-    "state": "error of the state",
-    "power": "bias of mean $P$ / standard error",
-    "gradient": "relative error of the gradient",
-}
-_HOW_TO_READ = (
-    "down and to the left is better; the grey stairs are the best there is at each cost\n"
-    "whole lines: vijax; dashed: its peers; crosses: no result"
-)
-_COLUMNS = 3
-_ROUNDING = 1e-16  # an error below is drawn there
-_NOISE = 2.0  # standard errors that mean nothing
-_LEAST = 1.0  # fewer are drawn as so many: there is no better and worse among them
-_LABEL_GAP = 0.052  # between labels, of the height of a panel
-
-
-def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
-    """Error against cost, a panel a scene: down and to the left is better, and the grey stairs are what can be had.
-
-    Args:
-        rows: Records with scene, measure ("state", "power", "gradient"), method, us (microseconds per cell-period),
-            error and noise (its standard error, of averages), in the order of panels and of settings. An infinite
-            error is drawn as a cross on the upper edge.
-        path: Picture to write.
-
-    Raises:
-        ValueError: A format that is none.
-    """
-    if path is not None:
-        check_format(path)
-    scenes: dict[str, list[Any]] = {}
-    for row in rows:
-        scenes.setdefault(row.scene, []).append(row)
-    columns = min(_COLUMNS, len(scenes))
-    lines = math.ceil(len(scenes) / columns)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.4 * columns, 3.0 * lines + 0.3), layout="constrained")
-        grid = figure.subplots(lines, columns, squeeze=False)
-        span = _decades([row.us for panel in scenes.values() for row in panel])
-        for axes, panel in itertools.zip_longest(grid.flat, scenes.items()):
-            if panel is None:
-                axes.set_visible(False)
-            else:
-                axes.set_xlim(span)
-                _work_panel(axes, *panel)
-        figure.suptitle(_HOW_TO_READ, fontsize="medium")
-        figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
-        if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
-    return figure
-
-
-def _decades(values: list[float]) -> tuple[float, float]:
-    """Limits of a logarithmic axis, with room for labels to the right."""
-    return min(values) / 2, max(values) * 20
-
-
-def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
-    measure = rows[0].measure
-    errors = [row.error / row.noise if row.noise else row.error for row in rows]
-    finite = [error for error in errors if math.isfinite(error)] or [1.0]
-    low, high = (_LEAST if measure == "power" else _ROUNDING), max(10.0, 10 * max(finite))
-    errors = [max(error, low) for error in errors]
-    axes.set(title=title, xscale="log", yscale="log", ylim=(low / 3, high), ylabel=_MEASURES[measure])
-    if measure == "power":
-        axes.axhspan(low / 3, _NOISE, color="0.94", zorder=0)
-        axes.text(0.98, 0.02, "noise", transform=axes.transAxes, ha="right", color="0.5", fontsize=7, in_layout=False)
-    axes.grid(color="0.9", linewidth=0.4)
-    axes.set_axisbelow(True)
-    points = [(row.us, error) for row, error in zip(rows, errors, strict=True) if math.isfinite(error)]
-    across, up = _stairs(points, axes.get_xlim()[1], high)
-    axes.plot(across, up, color="0.8", linewidth=4, solid_joinstyle="miter", zorder=1)
-    ends = []
-    for method in dict.fromkeys(row.method for row in rows):
-        colour, style = _METHODS[method]
-        chosen = [(row.us, error) for row, error in zip(rows, errors, strict=True) if row.method == method]
-        good = [(x, y) for x, y in chosen if math.isfinite(y)]
-        bad = [x for x, y in chosen if not math.isfinite(y)]
-        if good:
-            line: dict[str, Any] = {
-                "color": colour,
-                "linestyle": style,
-                "linewidth": 1.1,
-                "marker": "o",
-                "markersize": 2.5,
-            }
-            axes.plot(*zip(*good, strict=True), **line)
-            ends.append((*min(good, key=lambda point: point[1]), method, colour))
-        if bad:  # a line without points and clipping would count as one at the picture's corner
-            axes.plot(bad, [high] * len(bad), color=colour, marker="x", linestyle="none", clip_on=False)
-    _label_ends(axes, ends)
-
-
-def _stairs(points: list[tuple[float, float]], right: float, top: float) -> tuple[list[float], list[float]]:
-    """The least error that each cost buys."""
-    across, up, best_yet = [], [], top
-    for x, y in sorted(points):
-        if y < best_yet:
-            across += [x, x]
-            up += [best_yet, y]
-            best_yet = y
-    return [*across, right], [*up, best_yet]
-
-
-def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
-    """Name each line at its most accurate point; names that would collide give way downwards or upwards."""
-    (left, right), (low, high) = np.log(axes.get_xlim()), np.log(axes.get_ylim())
-    taken: list[tuple[float, float, float]] = []
-    for x, y, method, colour in sorted(ends, key=lambda end: end[1]):
-        place, height = (np.log(x) - left) / (right - left), (np.log(y) - low) / (high - low)
-        width = 0.02 * len(method)
-        begin = place + 0.015 if place + width < 1 else place - width - 0.015
-        height -= 0.03
-        while any(
-            abs(height - other) < _LABEL_GAP and begin < end and start < begin + width for start, end, other in taken
-        ):
-            height += 0.01
-        taken.append((begin, begin + width, height))
-        style: Any = {
-            "fontsize": 7,
-            "in_layout": False,
-            "path_effects": [Stroke(linewidth=2, foreground="white"), Normal()],
-        }
-        axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, **style)

@@ -58,7 +58,8 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     pair, starts = jax.tree.map(np.asarray, (pair, starts))
     count = starts.u.size
     live, states = np.flatnonzero(wanted), jax.tree.map(lambda x: x[wanted], starts)
-    balls, parts = [np.zeros(0, int)], []
+    balls: list[np.ndarray] = [np.zeros(0, int)]
+    parts: list[_Step] = []
     while live.size:
         taken = jax.tree.map(lambda x, live=live: x[live], pair)
         after, over, steps, real = _advance(taken, states, periods)
@@ -68,8 +69,8 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     ball = np.concatenate(balls)
     order = np.argsort(ball, kind="stable")
     ball = ball[order]
-    steps = jax.tree.map(lambda *x: np.concatenate(x)[order], *parts) if parts else None
-    return Record(*_impacts(ball, steps, count, periods), *_strobes(pair, ball, steps, count, periods))
+    flown = jax.tree.map(lambda *x: np.concatenate(x)[order], *parts) if parts else None
+    return Record(*_impacts(ball, flown, count, periods), *_strobes(pair, ball, flown, count, periods))
 
 
 @lru_cache(maxsize=1)

@@ -149,7 +149,7 @@ class Passage(NamedTuple):
 def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
     """How each contact ends, and where the flight after it is to lead."""
     side, wall, joined = _joined(sequence, knots)
-    t, speed, stay, next_t, next_speed = joined.T
+    t, _, stay, next_t, next_speed = joined.T
     rate = jax.vmap(lambda side, knot: _contact(pair, side, knot)[1])(side, joined)
     next_stay = knots[_following(sequence)[0], 2]
     return Passage(side, -rate, t + stay, wall, next_t, next_speed, next_stay)

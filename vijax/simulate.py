@@ -38,7 +38,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
     d, kappa, r, gamma, length, speed, u, v, *phase = rows.T
     pair = ImpactPair(d, None if plan.rigid else kappa, r, gamma)
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
-    ball = Lanes(u, v, *phase, zero) if phase else Lanes(u, v, zero, zero)
+    ball = Lanes(u, v, phase[0] if phase else zero, zero)
     held = exact.start_mode(pair, u, v, ball.t)
     start = settings.transient + zero
     eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None

@@ -177,5 +177,5 @@ def _unpack_handover(take: Callable[[None], Lane]) -> Handover:
 
 def columns(plan: Plan) -> int:
     """Length of a row of `pack`."""
-    scales, chained = 3 * plan.variants * plan.energies, _HANDOVER * plan.chained
-    return 12 + scales + plan.deep + plan.asymmetry + plan.tangent + chained
+    wide = 3 * plan.variants * plan.energies
+    return 12 + wide + plan.deep + plan.asymmetry + plan.tangent + _HANDOVER * plan.chained

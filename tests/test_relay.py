@@ -1,0 +1,31 @@
+"""What a chained cell hands on where nothing more happens: balls at rest on a wall."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vijax
+from vijax import flow, relay
+from vijax.diagram import orbit_diagram
+from vijax.model import Status
+
+
+@pytest.mark.parametrize("gamma", [-1.5, 2.0])
+def test_a_ball_at_rest_in_a_soft_wall_repeats_itself(gamma):
+    pair = vijax.impact_pair(jnp.full(2, 0.2), jnp.array([4.0, 40.0]), jnp.full(2, 0.5), jnp.full(2, gamma))
+    ball = relay._resting(pair, jnp.full(2, 400.0))
+    side = -np.sign(gamma)
+    for i in range(2):
+        wall = flow.membrane(vijax.impact_pair(0.2, pair.kappa[i], 0.5))
+        w, z = side * ball.u[i] - 0.1, side * ball.v[i]
+        assert w > 0
+        force = flow.contact_force(jnp.asarray(gamma), jnp.asarray(side), jnp.asarray(0.0))
+        np.testing.assert_allclose(flow.oscillate(wall, force, w, z, jnp.asarray(2.0)), (w, z), atol=1e-13)
+
+
+def test_a_ball_at_rest_is_handed_on():
+    """Gravity beyond the forcing holds the ball on the left wall; as it falls the ball takes off from there."""
+    ds = orbit_diagram(along="gamma", values=[1.2, 1.1, 0.3], d=0.2, wall="rigid", periods=60, keep=5)
+    assert ds.status.sel(gamma=[1.2, 1.1]).values.tolist() == [Status.PERMANENT_CONTACT] * 2
+    np.testing.assert_array_equal(ds.u_strobe.sel(gamma=[1.2, 1.1]), -0.1)
+    assert ds.filled.sel(gamma=1.2) == 0 < ds.filled.sel(gamma=0.3)
