@@ -10,9 +10,9 @@ import numpy as np
 from vijax.cached import branches, diagram, orbits
 from vijax.curve import Curve, curve, states
 from vijax.model import ImpactPair, impact_pair
+from vijax.orbit import path
 from vijax.paper import BRANCHES_FROM, BRANCHES_WITHIN, FIGURES, PaperFigure, Run, Source, View
 from vijax.portrait import Layer, Panel, phase_plane, small_multiples, time_series
-from vijax.trajectory import trajectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -104,19 +104,19 @@ def panels(number: int) -> dict[str, Panel]:
     return {view.letter: _SHOWS.get(view.shows, _sweep)(figure, view) for view in figure.views}
 
 
-def draw(number: int, path: str | Path | None = None) -> Any:
+def draw(number: int, file: str | Path | None = None) -> Any:
     """Draw a figure of the paper.
 
     Args:
         number: 3 to 16.
-        path: Where to write it, if anywhere.
+        file: Where to write it, if anywhere.
 
     Returns:
         The `matplotlib.figure.Figure`.
     """
     figure = FIGURES[number]
     caption = f"Fig. {number}. {figure.title}. {figure.chosen}"
-    return small_multiples(panels(number), figure.layout, caption, path)
+    return small_multiples(panels(number), figure.layout, caption, file)
 
 
 # --- panels ---------------------------------------------------------------------------------------
@@ -197,13 +197,10 @@ def _unstable_orbits(view: View) -> Iterator[Curve]:
     pair = pair_of(selected(source), source.run.wall)
     for walls in view.unstable:
         found = orbits(walls, float(pair.d), None if pair.kappa is None else float(pair.kappa), float(pair.r))
-        for one in np.flatnonzero(np.abs(np.asarray(found.multipliers)).max(axis=1) > 1):
-            t, speed, _ = np.asarray(found.knots[one]).T
-            side = int(found.sequence.side[one, 0])
-            # On the wall at an onset: flown on from there, it has no time to leave the orbit.
-            impacts = trajectory(pair, 0.5 * side * pair.d, side * speed[0], 3, t[0]).impacts
-            clock = np.asarray(impacts.t) + 2.0 * np.asarray(impacts.n)
-            yield curve(pair, clock, impacts.side, impacts.v_in, impacts.v_out, impacts.duration)
+        wild = np.flatnonzero(np.abs(np.asarray(found.multipliers)).max(axis=1) > 1)
+        for instants in zip(*path(found[wild]), strict=True):
+            there = np.isfinite(instants[0])
+            yield Curve(*(x[there] for x in instants))
 
 
 def _image(line: Curve, other: Curve) -> int:

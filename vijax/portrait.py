@@ -12,12 +12,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from vijax.store import replacing
+from vijax.style import STYLE
 
-_STYLE: Any = {
-    "font.family": "STIXGeneral",
-    "mathtext.fontset": "stix",
-    "font.size": 9,
-    "axes.linewidth": 0.6,
+_STYLE: Any = STYLE | {
     "axes.titlesize": "medium",
     "axes.titlepad": 3.0,
     "axes.formatter.limits": (-4, 5),
