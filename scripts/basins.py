@@ -44,7 +44,6 @@ def _options() -> list[click.Parameter]:
         click.Option(["--seed"], type=int, help="with --starts: draw them at random [an even lattice]"),
         click.Option(["--periods"], default=400, show_default=True, help="forcing periods to look for an attractor"),
         click.Option(["--wall"], default="soft", show_default=True, help="soft or rigid"),
-        click.Option(["--dtype"], default="float64", show_default=True, help="float64 or float32"),
         *command.file_options(),
     ]
 

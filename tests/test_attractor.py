@@ -26,7 +26,7 @@ def planted(kinds, which, dims=("d", "u0", "v0"), noise=NOISE, **further):
         if name in attractor._INVARIANTS:
             values = values * (1 + noise * random.uniform(-1, 1, which.shape))
         found[name] = (dims, values)
-    return xr.Dataset(found | further, attrs={"dtype": "float64"})
+    return xr.Dataset(found | further)
 
 
 def same_partition(basin, which) -> bool:
@@ -66,6 +66,7 @@ def test_every_cell_has_its_own_table_the_commonest_first():
     assert found.starts.values.tolist() == [[12, 8, 0], [15, 4, 1], [20, 0, 0]]
     assert found.attractors.values.tolist() == [2, 3, 1]
     np.testing.assert_allclose(found.fraction.sum("attractor"), 1.0)
+    assert float(found.fraction_stderr[0, 0]) == pytest.approx((0.6 * 0.4 / 20) ** 0.5)
     np.testing.assert_allclose(found.P.values[1], [3e-6, 1e-6, 2e-6])
     assert np.isnan(found.P.values[2, 1])
     for cell in range(3):
@@ -125,7 +126,7 @@ def test_energies_keep_dimensions_that_the_motion_does_not_depend_on():
 
 
 def drawn(**given):
-    settings = {"starts": 2000, "speed": 0.6, "seed": None, "periods": 400, "dtype": "float64", "wall": "rigid"}
+    settings = {"starts": 2000, "speed": 0.6, "seed": None, "periods": 400, "wall": "rigid"}
     of = plan_fractions({"d": [0.1, 0.3], "kappa": 10.0}, **settings | given).cells
     return (of.quantities[name].transpose(..., "start").values for name in ("u0", "v0"))
 
@@ -148,7 +149,7 @@ def test_a_seed_tells_the_starts():
 
 
 def test_a_plane_covers_the_widest_gap_unless_told():
-    settings = {"periods": 400, "wall": "soft", "dtype": "float64"}
+    settings = {"periods": 400, "wall": "soft"}
     of = plan_basins({"d": [0.1, 0.2], "kappa": 3.0, "v0": np.linspace(-1, 1, 9)}, **settings).cells
     assert of.sizes == {"u0": 9, "v0": 9, "d": 2}
     np.testing.assert_allclose(of.given["u0"].values[[0, -1]], [-0.1 + 0.1 / 9, 0.1 - 0.1 / 9])
@@ -195,7 +196,7 @@ def test_three_attractors_coexist_in_known_shares():
 
 
 def test_the_sign_of_the_mean_impact_velocity_tells_mirror_images_apart():
-    settings = {"starts": 500, "speed": 0.6, "seed": None, "periods": 200, "wall": "soft", "dtype": "float64"}
+    settings = {"starts": 500, "speed": 0.6, "seed": None, "periods": 200, "wall": "soft"}
     swept = grid.run(plan_fractions({"d": [0.2, 0.3], "kappa": 3.0, "r": 0.5}, **settings)).isel(d=0)
     few, many, both = (
         swept["asymmetry"].values[(swept["impacts_left"] == left) & (swept["impacts_right"] == right)]

@@ -28,8 +28,8 @@ __all__ = ["basin_fractions", "basins", "label", "lyapunov", "survival"]
 SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
 _START_POINTS = 256
 # Invariants of polished orbits agree to 3e-11 from start to start on a dozen planes of 4096 starts, and differ between
-# attractors by 2e-2 and more; single precision loses nine digits.
-_SAME = {"float64": 1e-6, "float32": 1e-3}
+# attractors by 2e-2 and more. In single precision an orbit passes for one of twice its period: there is no `dtype`.
+_SAME = 1e-6
 _COUNTS = ("impacts_left", "impacts_right")
 _ENDED = ("period", *_COUNTS, "status")
 _INVARIANTS = ("max_impact_speed", "asymmetry", "contact_fraction", "restitution_left", "restitution_right")
@@ -40,10 +40,11 @@ _TEXTS = {
     "periodic": "whether a period was found",
     "starts": "starts that end on the attractor",
     "fraction": "part of all starts",
+    "fraction_stderr": "standard error of the fraction if the starts are drawn at random",
 }
 # What stands past the last attractor of a cell, by kind of value and for those that are counts.
 _BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "O": ""}
-_NONE = {"starts": 0, "fraction": 0.0}
+_NONE = {"starts": 0, "fraction": 0.0, "fraction_stderr": 0.0}
 # Its growth from the identity is no stretching along the motion: the difference to a longer window is.
 _WARM_UP = 100
 # How survival looks: so often, so long; growth of the tangent map in powers of e; impacts per period.
@@ -61,7 +62,6 @@ def basins(
     periods: int = 400,
     wall: str = "soft",
     device: Harvester | None = None,
-    dtype: str = "float64",
     progress: Callable[[int, int], None] | None = None,
     **axes: Any,
 ) -> "xr.Dataset":
@@ -80,22 +80,21 @@ def basins(
         u0: Displacements at the start; the whole of the widest gap unless given, in as many points as `v0` has.
         v0: Velocities at the start; 256 between -0.6 and 0.6 unless given.
         merge_mirrors: Count mirror images as one attractor; gamma must be 0 everywhere.
-        periods, wall, device, dtype, progress: As in `sweep`.
+        periods, wall, device, progress: As in `sweep`.
         axes: Any other axes of `sweep`; every point of arrays among them has a table of its own.
 
     Returns:
         `basin` over all axes: the place of the start's attractor in its parameter cell's table, whose variables have
         the dimension `attractor`: `label`, `period`, `impacts_left`, `impacts_right`, `P` [J per half period],
         `max_impact_speed` [m/s], `impacts_per_period`, `contact_fraction`, `lyapunov`, `admissible`, `periodic`,
-        `starts` (how many end there), `fraction` (of all), `periods_run` (the most any start took), `status`. Entries
-        are in the order of `starts`; rows past a cell's last hold "" and NaN. `attractors` counts those of a cell.
+        `starts` (how many end there), `fraction` (of all) and, for starts drawn at random, `fraction_stderr`,
+        `periods_run` (the most any start took), `status`. Entries are in the order of `starts`; rows past a cell's last
+        hold "" and NaN. `attractors` counts those of a cell.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
     """
-    planned = plan_basins(
-        axes | {"u0": u0, "v0": v0}, device, merge_mirrors=merge_mirrors, periods=periods, wall=wall, dtype=dtype
-    )
+    planned = plan_basins(axes | {"u0": u0, "v0": v0}, device, merge_mirrors=merge_mirrors, periods=periods, wall=wall)
     return matched(grid.run(planned, progress), merge_mirrors)
 
 
@@ -107,7 +106,7 @@ def plan_basins(
     Args:
         axes: Value or values of each axis; None counts as not given.
         device, merge_mirrors: As in `basins`.
-        settings: periods, wall, dtype: all of them, as in `basins`.
+        settings: periods, wall: both of them, as in `basins`.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
@@ -131,7 +130,6 @@ def basin_fractions(
     periods: int = 400,
     wall: str = "soft",
     device: Harvester | None = None,
-    dtype: str = "float64",
     progress: Callable[[int, int], None] | None = None,
     **axes: Any,
 ) -> "xr.Dataset":
@@ -143,12 +141,11 @@ def basin_fractions(
         starts: How many, in every cell.
         speed: Largest velocity at the start, dimensionless.
         seed: Of starts drawn at random; unless given they lie on a lattice, which is more even.
-        merge_mirrors, periods, wall, device, dtype, progress: As in `basins`.
+        merge_mirrors, periods, wall, device, progress: As in `basins`.
         axes: Any axes of `sweep` but u0 and v0.
 
     Returns:
-        As `basins`, with the dimension `start` in place of u0 and v0, which are its coordinates; and of random starts
-        `fraction_stderr`, by the binomial distribution.
+        As `basins`, with the dimension `start` in place of u0 and v0, which are its coordinates.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
@@ -162,14 +159,8 @@ def basin_fractions(
         merge_mirrors=merge_mirrors,
         periods=periods,
         wall=wall,
-        dtype=dtype,
     )
-    found = matched(grid.run(planned, progress), merge_mirrors)
-    if seed is not None:
-        share = found["fraction"]
-        found["fraction_stderr"] = (share * (1 - share) / starts) ** 0.5
-        found["fraction_stderr"].attrs = {"units": "1", "long_name": "standard error of the fraction"}
-    return found
+    return matched(grid.run(planned, progress), merge_mirrors)
 
 
 def plan_fractions(
@@ -186,7 +177,7 @@ def plan_fractions(
 
     Args:
         axes, device, starts, speed, seed, merge_mirrors: As in `basin_fractions`.
-        settings: periods, wall, dtype: all of them, as in `basins`.
+        settings: periods, wall: both of them, as in `basins`.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
@@ -202,7 +193,9 @@ def plan_fractions(
 
 
 def _plan(axes: Mapping[str, Any], device: Harvester | None, merge_mirrors: bool, settings: dict[str, Any]) -> Plan:
-    planned = grid.plan(axes, _OUTPUTS, device, until="attractor", transient=0, method="exact", **settings)
+    planned = grid.plan(
+        axes, _OUTPUTS, device, until="attractor", transient=0, method="exact", dtype="float64", **settings
+    )
     gamma = planned.cells.quantities["gamma"].values
     if merge_mirrors and gamma.any():
         got = gamma[gamma != 0].flat[0]
@@ -324,7 +317,7 @@ def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
     starts = math.prod(found.sizes[dim] for dim in over)
     measured = {name: _flat(found[name].variable, dims, over) for name in _OUTPUTS}
     cell = np.repeat(np.arange(math.prod(shape)), starts)
-    group = _group(cell, measured, merge_mirrors, _SAME[found.attrs["dtype"]])
+    group = _group(cell, measured, merge_mirrors, _SAME)
     groups = _groups(cell, group)
     basin = groups.rank[group].reshape(*shape, *(found.sizes[dim] for dim in over)).astype(np.int32)
     variables = {"basin": xr.Variable((*dims, *over), basin, _described("place of the start's attractor in the table"))}
@@ -352,6 +345,7 @@ def _entries(
 ) -> dict[str, np.ndarray]:
     """The table's columns, each [..., group]."""
     first = {name: measured[name][..., groups.order[groups.first]] for name in (*_ENDED, "admissible")}
+    share = groups.counts / starts
     left, right = ordered(first["impacts_left"], first["impacts_right"], merge_mirrors)
     means = {
         name: np.add.reduceat(measured[name][..., groups.order], groups.first, axis=-1) / groups.counts
@@ -367,7 +361,8 @@ def _entries(
         "periods_run": np.maximum.reduceat(measured["periods_run"][groups.order], groups.first),
         "periodic": first["period"] > 0,
         "starts": groups.counts,
-        "fraction": groups.counts / starts,
+        "fraction": share,
+        "fraction_stderr": np.sqrt(share * (1 - share) / starts),
     }
 
 
@@ -485,9 +480,7 @@ def survival(
 
     step = whole("periods", periods, _INSTANTS) // _INSTANTS
     after = step * np.arange(1, _INSTANTS + 1)
-    planned = plan_fractions(
-        axes, device, starts=starts, speed=speed, seed=seed, periods=_WATCHED, wall=wall, dtype="float64"
-    )
+    planned = plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, periods=_WATCHED, wall=wall)
     alive = []
     for done, instant in enumerate(after):
         settings = planned.settings | {"until": "window", "transient": int(instant)}
