@@ -133,6 +133,7 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
         level=level,
         deep=True,
         energies=False,
+        asymmetry=False,
         tangent=False,
         variants=1,
     )
