@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 MICRO = 1e6
+FAST = 2.0  # largest speed of starts in the wide gaps of high frequencies
 SLOW_IMPACT = 0.25  # |u'| below which an impact counts as slow: rigid 1:n orbits have none near it
 
 
@@ -526,7 +527,7 @@ def _end_of_one_to_one() -> Finding:
 @_claim("F12c", "Fig. 12", "chaos up to omega = 9.97, then 3T", "9.97")
 def _emergence_of_three() -> Finding:
     soft, rigid = _both_walls("1:1/3T", 11.0, 0)
-    found = _fork("RL", "flip", 10.3, 11.0, (9.5, 12.5), 3)
+    found = _fork("RL", "flip", 10.3, 10.4, (9.5, 12.5), 3)
     return Finding(
         f"1:1/3T from {soft:.4g} soft, {rigid:.4g} rigid",
         f"stable from: {_told_fork('flip', found)}",
@@ -552,7 +553,9 @@ def _four_frequencies() -> Finding:
     soft, rigid = evidence.labels(BY_FREQUENCY[0.5], k=560.0), evidence.labels(RIGID_BY_FREQUENCY)
     shown = (np.pi / 3, np.pi, 10.99, 7.79)
     names = [[labels.sel(omega=omega, method="nearest").item() for omega in shown] for labels in (soft, rigid)]
-    shares = {omega: evidence.shares(s=GAP_IN_METRES, omega=omega, k=560.0, r=0.5) for omega in (np.pi, 10.99)}
+    shares = {
+        omega: evidence.shares(speed=FAST, s=GAP_IN_METRES, omega=omega, k=560.0, r=0.5) for omega in (np.pi, 10.99)
+    }
     exponent = evidence.exponent(s=GAP_IN_METRES, omega=7.79, k=560.0, r=0.5)
     reproduced = names[0][1:] == ["1:1", "1:1/3T", "aperiodic"]
     return Finding(
@@ -646,7 +649,7 @@ def _three_periods() -> Finding:
     for k, omega in cases:
         three = orbits("RL", *evidence.at_frequency(omega, k), 0.5, 3)
         growth = f"{evidence.growth(three).min():.3f}" if len(three) else "none"
-        shares = evidence.shares(s=GAP_IN_METRES, omega=omega, k=k, r=0.5)
+        shares = evidence.shares(speed=FAST, s=GAP_IN_METRES, omega=omega, k=k, r=0.5)
         found.append(f"k = {k:g}: least largest multiplier {growth}; {evidence.told_shares(shares)}")
     good = [k for (k, _), name in zip(cases, swept, strict=True) if name == "1:1/3T"]
     return Finding(
