@@ -1,222 +1,34 @@
 """Branches of periodic orbits along a parameter, by pseudo-arclength continuation through folds, many at once.
 
-The orbit's equations go on through grazing into orbits that are none (`shooting`); what makes an orbit real, and what
-marks a bifurcation, are smooth functions along the branch. A sign change is located on the arc, and says which it was.
+A sign change of a test function is located on the arc, and says what it was: a bifurcation, or why the branch ends.
 """
 
-from typing import NamedTuple
+import dataclasses
+from typing import TYPE_CHECKING, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from vijax import flow, shooting
 from vijax import orbit as orbits
-from vijax.model import Harvester, ImpactPair, Status
+from vijax.arc import ALONG, CLOSE, FIRST_END, FOLD, PLUS, Arc, Place, Tests, advance, unpack
+from vijax.axes import AXES
+from vijax.model import Harvester, ImpactPair, Status, check
 from vijax.orbit import Orbit
-from vijax.shooting import Sequence
 
-ALONG = ("d", "kappa", "r", "gamma", "omega")
-_BATCHES = (8, 64, 512)  # lanes of one compiled call
+if TYPE_CHECKING:
+    import xarray as xr
+
 _LONGEST, _SHORTEST = 0.01, 1e-9  # arclength of a step; the parameter's range counts as one
 _FIRST = 1e-3
 _CROWDED = 1e-7  # arclength within which several things may happen unresolved
-_ROUNDS = 6  # Newton corrections of a step, at most
-_CLOSE = 1e-11  # size of the last correction
 _BEND = 0.98  # least cosine between the tangents at the ends of a step
 _EASY = 0.2  # share of that bend after which the next step is longer
-_SAMPLES = 48  # of a flight or contact, to find its extrema
-_NOTHING = 1.0  # clearance where there is nothing to clear
 _ZERO = 1e-3  # part of a test function's ends that is zero
 _LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
 _NARROWINGS = 40  # of an interval that holds an event: false position with every third step a bisection
-
-
-class Tests(NamedTuple):
-    """Functions whose sign changes mark what happens on a branch; those from `speed` on are positive on real orbits."""
-
-    fold: Float[Array, ""]  # the parameter's share of the tangent
-    plus: Float[Array, ""]  # det(M - 1): a multiplier passes +1
-    minus: Float[Array, ""]  # det(M + 1): a multiplier passes -1
-    speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
-    flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
-    contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
-    exit: Float[Array, ""]  # least speed away from a wall: the ball stays
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-
-
-_FOLD, _PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
-_FIRST_END = Tests._fields.index("speed")
-
-
-class Arc(eqx.Module):
-    """What a lane follows: the orbit's parameters where it began, its walls, and which parameter moves.
-
-    Attributes:
-        ratio: s/A of the device, that fixes d at a frequency (along="omega" only).
-        scale: Range of the parameter, the unit of its share of the arclength.
-    """
-
-    pair: ImpactPair
-    sequence: Sequence
-    ratio: Float[Array, ""]
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-    along: str = eqx.field(static=True)
-
-    def at(self, x: Float[Array, ""]) -> ImpactPair:
-        """The pair at a value of the parameter."""
-        if self.along != "omega":
-            return eqx.tree_at(lambda pair: getattr(pair, self.along), self.pair, x)
-        d = self.ratio * (x / flow.PI) ** 2
-        kappa = None if self.pair.kappa is None else self.pair.kappa * jnp.sqrt(self.pair.d / d)
-        return ImpactPair(d, kappa, self.pair.r, self.pair.gamma)
-
-
-def _unpack(arc: Arc, y):
-    width = arc.sequence.side.shape[0]
-    return y[:-1].reshape(width, 3), y[-1] * (arc.high - arc.low)
-
-
-def _equations(arc: Arc, y) -> shooting.Linear:
-    """Gap and its derivatives in knots and parameter."""
-    knots, x = _unpack(arc, y)
-    pair, moved = jax.jvp(arc.at, (x,), (arc.high - arc.low,))
-    return shooting.linearise(pair, arc.sequence, knots, moved)
-
-
-class _Arrival(NamedTuple):
-    """Newton's way back to the branch: the point, the tangent there, the size of the last correction, how many."""
-
-    y: Float[Array, "unknown"]
-    tangent: Float[Array, "unknown"]
-    size: Float[Array, ""]
-    trips: Int[Array, ""]
-
-
-def _correct(arc: Arc, guess, former) -> _Arrival:
-    """Newton in the plane across the former tangent, and the tangent there."""
-    ahead = jnp.zeros_like(guess).at[-1].set(1.0)
-
-    def once(at: _Arrival) -> _Arrival:
-        gap, slope = _equations(arc, at.y)
-        slope = jnp.concatenate([slope, former[None]])
-        miss = jnp.append(gap, former @ (at.y - guess))
-        step, tangent = jnp.linalg.solve(slope, jnp.stack([miss, ahead], axis=1)).T
-        return _Arrival(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.trips + 1)
-
-    def going(at: _Arrival):
-        return (at.size > _CLOSE) & (at.size < 1.0) & (at.trips < _ROUNDS)
-
-    return lax.while_loop(going, once, _Arrival(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
-
-
-def _turning_points(position, velocity, acceleration, length):
-    """Positions at the zeros of the velocity inside a stretch, and its sign before each; NaN where there is none."""
-    s = jnp.linspace(0.0, 1.0, _SAMPLES + 1) * length
-    v = velocity(s)
-    low, high, before, after = s[:-1], s[1:], v[:-1], v[1:]
-    turns = before * after < 0
-    at = low + (high - low) * before / jnp.where(turns, before - after, 1.0)
-    for _ in range(2):
-        at = jnp.clip(at - velocity(at) / acceleration(at), low, high)
-    return jnp.where(turns, position(at), jnp.nan), before
-
-
-def _flight_room(pair: ImpactPair, passage: shooting.Passage):
-    """Least distance from a wall at a turning point of the flight that follows each contact."""
-
-    def one(side, speed, t, next_t):
-        place = lambda s: 0.5 * side * pair.d + flow.flight(pair.gamma, t, -side * speed, s)[0]  # noqa: E731
-        velocity = lambda s: flow.flight(pair.gamma, t, -side * speed, s)[1]  # noqa: E731
-        u, before = _turning_points(place, velocity, lambda s: flow.acceleration(pair.gamma, t + s), next_t - t)
-        room = jnp.where(before > 0, 0.5 * pair.d - u, 0.5 * pair.d + u)
-        return jnp.nanmin(jnp.append(room, _NOTHING))
-
-    return jax.vmap(one)(passage.side, passage.speed, passage.t, passage.next_t)
-
-
-def _contact_room(pair: ImpactPair, passage: shooting.Passage, knots):
-    """Least penetration at a turning point inside each contact where it is a minimum."""
-    if pair.kappa is None:
-        return jnp.full(passage.side.shape, _NOTHING)
-    wall = flow.membrane(pair, rolled=True)
-
-    def one(side, knot):
-        t, speed, stay = knot
-        force = flow.contact_force(pair.gamma, side, t)
-
-        def motion(s):
-            return jax.vmap(lambda s: flow.oscillate(wall, force, jnp.zeros_like(s), speed, s))(s)
-
-        def bend(s):
-            w, rate = motion(s)
-            return jax.vmap(force.at)(s) - wall.mu * rate - wall.kappa * wall.kappa * w
-
-        w, before = _turning_points(lambda s: motion(s)[0], lambda s: motion(s)[1], bend, jnp.maximum(stay, 0.0))
-        return jnp.nanmin(jnp.append(jnp.where(before < 0, w, jnp.nan), _NOTHING))
-
-    return jax.vmap(one)(passage.side, knots)
-
-
-def _tests(arc: Arc, y, tangent) -> Tests:
-    knots, x = _unpack(arc, y)
-    pair, real = arc.at(x), arc.sequence.real
-    around = shooting.monodromy(pair, arc.sequence, knots)
-    trace, determinant = around[0, 0] + around[1, 1], jnp.linalg.det(around)
-    # Padded impacts are given harmless knots.
-    knots = jnp.where(real[:, None], knots, 1.0)
-    passage = shooting.passages(pair, arc.sequence, knots)
-
-    def least(values):
-        return jnp.where(real, values, _NOTHING).min()
-
-    return Tests(
-        fold=tangent[-1],
-        plus=1 - trace + determinant,
-        minus=1 + trace + determinant,
-        speed=least(knots[:, 1]),
-        flight=least(_flight_room(pair, passage)),
-        contact=least(_contact_room(pair, passage, knots)),
-        exit=jnp.full_like(x, _NOTHING) if pair.kappa is None else least(passage.speed),
-        low=x - arc.low,
-        high=arc.high - x,
-    )
-
-
-class _Place(NamedTuple):
-    """Points of branches, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
-
-    And how Newton came there: the size of its last correction, and how many it took.
-    """
-
-    y: np.ndarray
-    tangent: np.ndarray
-    tests: np.ndarray
-    size: np.ndarray
-    trips: np.ndarray
-
-
-@jax.jit
-def _compiled(arcs: Arc, y, tangent, length):
-    def one(arc, y, tangent, length):
-        at = _correct(arc, y + length * tangent, tangent)
-        return _Place(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.trips)
-
-    return jax.vmap(one)(arcs, y, tangent, length)
-
-
-def _advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> _Place:
-    """From points of branches on by an arclength each: the compiled program behind every step and every search."""
-    count = y.shape[0]
-    size = next((size for size in _BATCHES if size >= count), count)
-    index = np.minimum(np.arange(size), count - 1)
-    rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], (arcs, y, tangent, length))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], _compiled(*rows))
 
 
 def _changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -227,22 +39,22 @@ def _changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 def _happenings(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """How many things happen between two points; a multiplier that passes +1 at a fold is one of them."""
     changed = Tests(*_changed(before, after).T)
-    ends = np.any(changed[_FIRST_END:], axis=0)
+    ends = np.any(changed[FIRST_END:], axis=0)
     return (changed.fold | changed.plus).astype(int) + changed.minus + ends
 
 
-def _follow(arcs: Arc, first: _Place, along: str, points: int) -> list["Branch"]:
+def _follow(arcs: Arc, first: Place, along: str, points: int) -> list["Branch"]:
     """One way from every start: all lanes together until none goes on; a step that does not do is halved."""
     lanes = first.y.shape[0]
     passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]
     y, tangent, tests = first.y, first.tangent, first.tests
     length, going = np.full(lanes, _FIRST), np.full(lanes, True)
     while going.any():
-        there = _advance(arcs, y, tangent, length)
+        there = advance(arcs, y, tangent, length)
         straight = (there.tangent * tangent).sum(axis=1)
         near = np.linalg.norm(there.y - y, axis=1) < 2 * length
         single = (_happenings(tests, there.tests) <= 1) | (length < _CROWDED)
-        good = going & (there.size <= _CLOSE) & (straight > _BEND) & near & single
+        good = going & (there.size <= CLOSE) & (straight > _BEND) & near & single
         for lane in np.flatnonzero(good):
             passed[lane].append((there.y[lane], there.tangent[lane], there.tests[lane], length[lane]))
         easy = (there.trips <= 3) & (straight > 1 - _EASY * (1 - _BEND))
@@ -250,7 +62,7 @@ def _follow(arcs: Arc, first: _Place, along: str, points: int) -> list["Branch"]
         new = (there.y, there.tangent, there.tests)
         y, tangent, tests = (np.where(good[:, None], *pair) for pair in zip(new, (y, tangent, tests), strict=True))
         length = np.where(good, longer, 0.5 * length)
-        real = (tests[:, _FIRST_END:] > 0).all(axis=1) | ~good
+        real = (tests[:, FIRST_END:] > 0).all(axis=1) | ~good
         short = np.array([len(lane) < points for lane in passed])
         going = going & (length > _SHORTEST) & real & short
     return [_branch(jax.tree.map(lambda x, i=i: x[i], arcs), rows, along, points) for i, rows in enumerate(passed)]
@@ -262,7 +74,7 @@ def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, te
     arcs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
 
     def look(s):
-        at = _advance(arcs, y, tangent, s)
+        at = advance(arcs, y, tangent, s)
         return at.tests[rows, test], at.y
 
     low, high = np.zeros_like(length), length
@@ -360,40 +172,49 @@ def follow(
         raise ValueError(f'direction must be "up", "down" or "both"; got {direction!r}')
     ahead = np.zeros_like(y)
     ahead[:, -1] = 1.0
-    first = _advance(arcs, y, ahead, np.zeros(len(orbit)))
+    first = advance(arcs, y, ahead, np.zeros(len(orbit)))
     found = [_follow(arcs, _heading(first, sign), along, points) for sign in ways[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]
 
 
-def _heading(place: _Place, sign: float) -> _Place:
+def _heading(place: Place, sign: float) -> Place:
     """The place, facing the other way where the sign is negative; the fold's test function turns with it."""
     tests = place.tests.copy()
-    tests[:, _FOLD] *= sign
+    tests[:, FOLD] *= sign
     return place._replace(tangent=sign * place.tangent, tests=tests)
 
 
 def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None):
     """Arcs and unknowns of the starts; what cannot be followed is refused."""
-    if along not in ALONG or (along == "kappa" and orbit.pair.kappa is None):
-        rigid = "; a rigid wall has no kappa" if orbit.pair.kappa is None else ""
-        raise ValueError(f"along must be one of {', '.join(ALONG)}; got {along!r}{rigid}")
-    low, high = map(float, within)
-    if not low < high:
-        raise ValueError(f"within must be two bounds, the lower first; got {within}")
     if (np.asarray(orbit.status) != Status.OK).any():
         index = int(np.argmax(np.asarray(orbit.status) != Status.OK))
         raise ValueError(f"orbit must hold orbits only; got {Status(int(orbit.status[index])).name} at index {index}")
     device = Harvester() if device is None else device
-    size = len(orbit)
-    ratio = jnp.full(size, device.s / device.A)
-    x = flow.PI * jnp.sqrt(orbit.pair.d / ratio) if along == "omega" else getattr(orbit.pair, along)
-    if not bool(((x >= low) & (x <= high)).all()):
-        raise ValueError(f"within must hold the start; got {within} and {along} = {float(x[0]):.6g}")
+    x = check_bounds(orbit.pair, along, within, device)
     if along == "gamma" and bool(orbit.sequence.mirrored.any()):
-        raise ValueError("orbit must not be closed half way to follow it along gamma; unfold it first")
+        raise ValueError("orbit must be closed in full to be followed along gamma; got one closed half way; unfold it")
+    size, (low, high) = len(orbit), within
+    ratio = jnp.full(size, device.s / device.A)
     arcs = Arc(orbit.pair, orbit.sequence, ratio, jnp.full(size, low), jnp.full(size, high), along)
     knots = jnp.where(orbit.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
+
+
+def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> Array:
+    """The parameter's value at a pair, or ValueError unless it can be followed from there within the bounds."""
+    if along not in ALONG or (along == "kappa" and pair.kappa is None):
+        rigid = "; a rigid wall has no kappa" if pair.kappa is None else ""
+        raise ValueError(f"along must be one of {', '.join(ALONG)}; got {along!r}{rigid}")
+    low, high = within
+    if not low < high:
+        raise ValueError(f"within must be two bounds, the lower first; got {within}")
+    for bound in within:
+        check(along, bound)
+    # The frequency at which the device's gap is d.
+    x = flow.PI * jnp.sqrt(pair.d * device.A / device.s) if along == "omega" else getattr(pair, along)
+    if not bool(((x >= low) & (x <= high)).all()):
+        raise ValueError(f"within must hold the start; got {within} and {along} = {float(jnp.ravel(x)[0]):.6g}")
+    return x
 
 
 def _branch(arc: Arc, rows: list[tuple], along: str, points: int) -> Branch:
@@ -403,7 +224,7 @@ def _branch(arc: Arc, rows: list[tuple], along: str, points: int) -> Branch:
     last, met = len(rows), []
     for event in sorted(_events(arc, y, tangent, tests, lengths), key=lambda event: (event.place, event.s)):
         kind = _kind(arc, event, y[event.place : event.place + 2])
-        if event.test in Tests._fields[_FIRST_END:]:
+        if event.test in Tests._fields[FIRST_END:]:
             end, last = kind, event.place + 1
         if kind not in ("low", "high"):
             met.append(Point(kind, float(event.y[-1] * (arc.high - arc.low)), _orbits(arc, event.y[None])))
@@ -429,9 +250,9 @@ def _events(arc: Arc, y, tangent, tests, lengths) -> list[_Event]:
         _Event(int(i), float(at), Tests._fields[t], y)
         for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
         # A multiplier that passes +1 at a fold is no second event.
-        if sure and not (t == _PLUS and ((index == i) & (test == _FOLD)).any())
+        if sure and not (t == PLUS and ((index == i) & (test == FOLD)).any())
     ]
-    ends = [event.s for event in found if event.place == len(y) - 2 and event.test in Tests._fields[_FIRST_END:]]
+    ends = [event.s for event in found if event.place == len(y) - 2 and event.test in Tests._fields[FIRST_END:]]
     return [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
 
 
@@ -453,7 +274,7 @@ def _kind(arc: Arc, event: _Event, neighbours: np.ndarray) -> str:
 def _orbits(arc: Arc, ys: np.ndarray) -> Orbit:
     """Points of a branch as orbits, verified."""
     wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(ys), *leaf.shape)), arc)
-    knots, x = jax.vmap(_unpack)(wide, jnp.asarray(ys))
+    knots, x = jax.vmap(unpack)(wide, jnp.asarray(ys))
     return orbits.proven(jax.vmap(Arc.at)(wide, x), wide.sequence, knots)
 
 
@@ -482,11 +303,10 @@ def switch(
     Raises:
         ValueError: A point at which nothing of the kind begins.
     """
-    closed_half = bool(point.orbit.sequence.mirrored[0])
-    if point.kind != "flip" and not (point.kind == "pitchfork" and closed_half):
+    if not _begins(point):
         raise ValueError(
-            f"point must be a flip, or a pitchfork of orbits closed half way; got a {point.kind}"
-            f"{'' if closed_half else '; follow orbit.halved(...) to meet it so'}"
+            f"point must be a flip, or a pitchfork of orbits closed half way (orbit.halved); got a {point.kind} of "
+            f"orbits closed {'half way' if point.orbit.sequence.mirrored[0] else 'in full'}"
         )
     doubled = orbits.doubled(point.orbit)
     arcs, y = _set_out(doubled, along, within, device)
@@ -495,5 +315,162 @@ def switch(
     slope = np.asarray(shooting.linearise(pair, sequence, knots).slope)
     away = np.append(np.linalg.svd(slope)[2][-1], 0.0)[None]
     # Test functions that vanish here would be met again at once.
-    first = _Place(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
+    first = Place(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
     return [_follow(arcs, _heading(first, sign), along, points)[0] for sign in (1.0, -1.0)]
+
+
+def _begins(point: Point) -> bool:
+    """Whether another branch begins there that `switch` can find."""
+    return point.kind == "flip" or (point.kind == "pitchfork" and bool(point.orbit.sequence.mirrored[0]))
+
+
+def family(
+    orbit: Orbit,
+    along: str,
+    within: tuple[float, float],
+    *,
+    device: Harvester | None = None,
+    generations: int = 1,
+    points: int = 4000,
+) -> list[Branch]:
+    """The branches of some orbits, and those that bifurcate from them at flips and pitchforks, and so on.
+
+    Args:
+        orbit, along, within, device, points: As in `follow`; symmetric orbits are closed half way.
+        generations: How often to switch; 0 follows the given orbits alone.
+    """
+    grown: list[Branch] = []
+    for index in range(len(orbit)):
+        one = orbit[index : index + 1]
+        closed = along != "gamma" and bool(orbits.symmetric(one)[0])
+        one = orbits.halved(one) if closed else one
+        grown += _new(follow(one, along, within, device=device, points=points), grown)
+    youngest = grown
+    for _ in range(generations):
+        where = [point for branch in youngest for point in branch.points if _begins(point)]
+        youngest = []
+        for point in where:
+            youngest += _new(switch(point, along, within, device=device, points=points), grown + youngest)
+        grown = grown + youngest
+    return grown
+
+
+def _new(found: list[Branch], known: list[Branch]) -> list[Branch]:
+    """Branches that met something which no known one has met: the same points lie on the same branch."""
+    old = [(point.kind, _traits(point)) for branch in known for point in branch.points]
+    new = []
+    for branch in found:
+        met = [(point.kind, _traits(point)) for point in branch.points]
+        seen = [any(kind == k and np.allclose(x, y, atol=_LEVEL) for k, y in old) for kind, x in met]
+        if not met or not all(seen):
+            new.append(branch)
+            old += met
+    return new
+
+
+def _traits(point: Point) -> np.ndarray:
+    """Numbers that tell orbits apart, whichever impact they begin with."""
+    return np.append(np.asarray(orbits.marks(orbits.unfolded(point.orbit)))[0], point.value)
+
+
+def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Dataset":
+    """Branches as one dataset: what every orbit is, and what was met, padded with NaN.
+
+    Args:
+        branches: Along one parameter.
+        device: Gives A, omega (unless that is the parameter) and the electrical constants; Tables I and II by default.
+
+    Returns:
+        Over (branch, point): the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the label's `period`,
+        `impacts_left`, `impacts_right`, `status`; over (branch, point, impact): `v_in`, `side`, `phase`, `duration`,
+        `depth` [m]; over (branch, event): `event`, and its `event_value`; over branch: `end_first`, `end_last`.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    device = Harvester() if device is None else device
+    along = branches[0].along
+    columns = [_columns(branch, device) for branch in branches]
+    found = {name: _padded([column[name] for column in columns]) for name in columns[0]}
+    dims = ("branch", "point", "impact")
+    variables = {name: (dims[: values.ndim], values, _ABOUT[name]) for name, values in found.items() if name != along}
+    events = [[point.kind for point in branch.points] for branch in branches]
+    text = np.dtypes.StringDType()
+    most = max(map(len, events), default=0)
+    kinds = np.array([names + [""] * (most - len(names)) for names in events], dtype=text).reshape(len(branches), most)
+    values = _padded([np.array([point.value for point in branch.points]) for branch in branches])
+    return xr.Dataset(
+        variables
+        | {"event": (("branch", "event_number"), kinds), "event_value": (("branch", "event_number"), values)}
+        | {f"end_{name}": ("branch", np.array([b.ends[i] for b in branches], dtype=text)) for i, name in _ENDS},
+        coords={along: (("branch", "point"), found[along], _about(along))} | _constants(branches[0]),
+        attrs={
+            "title": "Branches of periodic orbits of a vibro-impact pair",
+            "along": along,
+            "wall": "rigid" if branches[0].orbit.pair.kappa is None else "soft",
+        },
+    )
+
+
+def _about(parameter: str) -> dict[str, str]:
+    axis = AXES[parameter]
+    return {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
+
+
+def _constants(branch: Branch) -> "dict[str, tuple]":
+    """The parameters that do not move."""
+    moving = ("d", "kappa") if branch.along == "omega" else (branch.along,)
+    pair = {name: getattr(branch.orbit.pair, name) for name in ("d", "kappa", "r", "gamma") if name not in moving}
+    return {name: ((), float(values[0]), _about(name)) for name, values in pair.items() if values is not None}
+
+
+_ENDS = ((0, "first"), (1, "last"))
+_ABOUT = {
+    "multiplier": {"units": "1", "long_name": "largest modulus of a Floquet multiplier"},
+    "stable": {"units": "1", "long_name": "whether the orbit attracts: 1 or 0"},
+    "P": {"units": "J", "long_name": "energy harvested per half forcing period"},
+    "period": {"units": "1", "long_name": "forcing periods"},
+    "impacts_left": {"units": "1", "long_name": "left impacts in that time"},
+    "impacts_right": {"units": "1", "long_name": "right impacts in that time"},
+    "status": {"units": "1", "long_name": "0: verified by the impact map"},
+    "v_in": {"units": "1", "long_name": "velocity at the onset, in units of A pi / omega"},
+    "side": {"units": "1", "long_name": "wall: -1 left, 1 right"},
+    "phase": {
+        "units": "1",
+        "long_name": "phase of the onset, in half forcing periods",
+    },
+    "duration": {"units": "1", "long_name": "duration of the contact, in half forcing periods"},
+    "depth": {"units": "m", "long_name": "penetration of the membrane"},
+}
+
+
+def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
+    """What the dataset holds of a branch, a row a point."""
+    if branch.along == "omega":
+        device = dataclasses.replace(device, omega=jnp.asarray(branch.values[:, None]))
+    hits, label = orbits.impacts(branch.orbit), orbits.counts(branch.orbit)
+    length = orbits.depth_unit(branch.orbit, device)
+    columns = {
+        branch.along: branch.values,
+        "multiplier": np.abs(branch.orbit.multipliers).max(axis=1),
+        "stable": branch.stable.astype(float),
+        "P": orbits.power(branch.orbit, device),
+        "period": label.period,
+        "impacts_left": label.left,
+        "impacts_right": label.right,
+        "status": branch.orbit.status,
+        "v_in": hits.v_in,
+        "side": hits.side,
+        "phase": hits.t,
+        "duration": hits.duration,
+        "depth": hits.depth * length,
+    }
+    return {name: np.asarray(values, float) for name, values in columns.items()}
+
+
+def _padded(rows: list[np.ndarray]) -> np.ndarray:
+    """Arrays of several shapes as one, NaN beyond each."""
+    shape = np.max([row.shape for row in rows], axis=0)
+    table = np.full((len(rows), *shape), np.nan)
+    for index, row in enumerate(rows):
+        table[index][tuple(slice(size) for size in row.shape)] = row
+    return table

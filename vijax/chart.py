@@ -329,3 +329,72 @@ def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
             "path_effects": [Stroke(linewidth=2, foreground="white"), Normal()],
         }
         axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, **style)
+
+
+# --- branches -------------------------------------------------------------------------------------
+
+_MARKS = {"fold": "o", "flip": "s", "pitchfork": "^", "grazing": "x"}
+_STABLE, _UNSTABLE = "black", "red"
+_BRANCH_QUANTITIES = ("v_in", "phase", "duration", "depth", "P", "multiplier")
+
+
+def branches(dataset: "xr.Dataset", path: str | Path | None = None, quantity: str = "v_in") -> Figure:
+    """Branches of orbits over their parameter: stable black, unstable red, with what they met on the way.
+
+    Args:
+        dataset: What `vijax.branch.dataset` returned.
+        path: Where to write it, if anywhere; the ending chooses the format.
+        quantity: A variable over impacts, or over points.
+
+    Raises:
+        ValueError: A quantity that is none, a format that is none.
+    """
+    check_branch_quantity(quantity)
+    if path is not None:
+        check_format(path)
+    along = dataset[dataset.attrs["along"]]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+        axes = figure.subplots()
+        for index in range(dataset.sizes["branch"]):
+            one = dataset.isel(branch=index)
+            for colour, width, kept in ((_UNSTABLE, 0.8, 0.0), (_STABLE, 1.4, 1.0)):
+                # A segment belongs to the point it leads to, so that the two colours join.
+                shown = (one["stable"] == kept) | (one["stable"].shift(point=-1) == kept)
+                axes.plot(one[along.name], one[quantity].where(shown), color=colour, linewidth=width)
+            _mark_events(axes, one, quantity)
+        axes.set_xlabel(axis_label(along))
+        axes.set_ylabel(_QUANTITIES.get(quantity, "largest modulus of a multiplier"))
+        axes.set_title(title(dataset), fontsize="medium")
+        kinds = {str(kind).split()[0] for kind in dataset["event"].values.flat if kind}
+        lines = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
+        lines += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
+        figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False)
+        if path is not None:
+            with replacing(Path(path)) as part:
+                figure.savefig(part)
+    return figure
+
+
+def check_branch_quantity(quantity: str) -> None:
+    """Raise ValueError unless branches have the quantity."""
+    if quantity not in _BRANCH_QUANTITIES:
+        raise ValueError(f"quantity must be one of {', '.join(_BRANCH_QUANTITIES)}; got {quantity!r}")
+
+
+def _mark(kind: str, label: str | None = None) -> Line2D:
+    mark = Line2D([], [], linestyle="none", marker=_MARKS[kind], markersize=5, color="tab:blue", label=label)
+    mark.set_markerfacecolor("white")
+    return mark
+
+
+def _mark_events(axes: Axes, one: "xr.Dataset", quantity: str) -> None:
+    """What one branch met, on the curves of its quantity: at the point nearest to it along the branch."""
+    place = one[str(one.attrs["along"])].values
+    values = one[quantity].values.reshape(place.size, -1)
+    for kind, value in zip(one["event"].values, one["event_value"].values, strict=True):
+        if kind:
+            nearest = values[np.nanargmin(np.abs(place - value))]
+            mark = _mark(str(kind).split()[0])
+            mark.set_data(np.full(nearest.size, value), nearest)
+            axes.add_line(mark)

@@ -135,6 +135,7 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
         energies=False,
         asymmetry=False,
         tangent=False,
+        asymmetry=False,
         variants=1,
     )
     tile = _TILES[0] if rows.shape[0] <= _TILES[0] else _TILES[1]

@@ -236,14 +236,14 @@ def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses
 
     Source: Eqs. (28)-(29) ask for one sequence from one guess.
     """
-    sequences, period = _sequences(impacts, period)
+    every, period = sequences(impacts, period)
     draw = np.random.default_rng(seed)
-    found = [_search(pair, walls, period, guesses, draw) for walls in sequences]
+    found = [_search(pair, walls, period, guesses, draw) for walls in every]
     return distinct(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found))
 
 
-def _sequences(impacts: str, period: int | None) -> tuple[list[tuple[int, ...]], int]:
-    """Cyclically distinct sequences of walls, and the period."""
+def sequences(impacts: str, period: int | None = None) -> tuple[list[tuple[int, ...]], int]:
+    """Cyclically distinct sequences of walls that a text asks for, and the period; see `search`."""
     walls = {"L": -1, "R": 1}
     if impacts and set(impacts.upper()) <= set(walls):
         return [tuple(walls[letter] for letter in impacts.upper())], 1 if period is None else period
@@ -276,12 +276,12 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
 def distinct(orbit: Orbit) -> Orbit:
     """The orbits that are there, each once whichever impact it was begun with."""
     good = np.flatnonzero(np.asarray(orbit.status) == Status.OK)
-    marks = np.round(np.asarray(_marks(orbit))[good] / _SAME)
-    _, first = np.unique(marks, axis=0, return_index=True)
+    rounded = np.round(np.asarray(marks(orbit))[good] / _SAME)
+    _, first = np.unique(rounded, axis=0, return_index=True)
     return orbit[np.sort(good[first])]
 
 
-def _marks(orbit: Orbit) -> Float[Array, "orbit 4"]:
+def marks(orbit: Orbit) -> Float[Array, "orbit 4"]:
     """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
     t, speed, stay = jnp.moveaxis(orbit.knots, -1, 0)
     signed = orbit.sequence.side * speed
@@ -401,11 +401,15 @@ def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
 
     Source: Eq. (36), corrected.
     """
-    length = device.length_unit
-    if orbit.pair.kappa is None:
-        length = length * device.omega / (flow.PI * device.omega0)
-    energy = jnp.where(orbit.sequence.real, harvested_energy(device, orbit.depth * length), 0.0)
+    energy = jnp.where(orbit.sequence.real, harvested_energy(device, orbit.depth * depth_unit(orbit, device)), 0.0)
     return energy.sum(axis=1) / orbit.sequence.span
+
+
+def depth_unit(orbit: Orbit, device: Harvester) -> Any:
+    """Metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
+    if orbit.pair.kappa is None:
+        return device.length_unit * device.omega / (flow.PI * device.omega0)
+    return device.length_unit
 
 
 def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,0 +1,210 @@
+"""A branch of periodic orbits as a curve in the space of knots and one parameter, and one step along it.
+
+The orbit's equations go on through grazing into orbits that are none (`shooting`). What makes an orbit real, and what
+marks a bifurcation, are smooth functions along the curve: its test functions.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vijax import flow, shooting
+from vijax.model import ImpactPair
+from vijax.shooting import Sequence
+
+ALONG = ("d", "kappa", "r", "gamma", "omega")
+CLOSE = 1e-11  # size of the last correction
+_BATCHES = (8, 64, 512)  # lanes of one compiled call
+_ROUNDS = 6  # Newton corrections of a step, at most
+_SAMPLES = 48  # of a flight or contact, to find its extrema
+_NOTHING = 1.0  # clearance where there is nothing to clear
+
+
+class Tests(NamedTuple):
+    """Functions whose sign changes mark what happens on a branch; those from `speed` on are positive on real orbits."""
+
+    fold: Float[Array, ""]  # the parameter's share of the tangent
+    plus: Float[Array, ""]  # det(M - 1): a multiplier passes +1
+    minus: Float[Array, ""]  # det(M + 1): a multiplier passes -1
+    speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
+    flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
+    contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
+    exit: Float[Array, ""]  # least speed away from a wall: the ball stays
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+
+
+FOLD, PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
+FIRST_END = Tests._fields.index("speed")
+
+
+class Arc(eqx.Module):
+    """What a lane follows: the orbit's parameters where it began, its walls, and which parameter moves.
+
+    Attributes:
+        ratio: s/A of the device, that fixes d at a frequency (along="omega" only).
+        scale: Range of the parameter, the unit of its share of the arclength.
+    """
+
+    pair: ImpactPair
+    sequence: Sequence
+    ratio: Float[Array, ""]
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+    along: str = eqx.field(static=True)
+
+    def at(self, x: Float[Array, ""]) -> ImpactPair:
+        """The pair at a value of the parameter."""
+        if self.along != "omega":
+            return eqx.tree_at(lambda pair: getattr(pair, self.along), self.pair, x)
+        d = self.ratio * (x / flow.PI) ** 2
+        kappa = None if self.pair.kappa is None else self.pair.kappa * jnp.sqrt(self.pair.d / d)
+        return ImpactPair(d, kappa, self.pair.r, self.pair.gamma)
+
+
+def unpack(arc: Arc, y):
+    """Knots and parameter of a point of the curve."""
+    width = arc.sequence.side.shape[0]
+    return y[:-1].reshape(width, 3), y[-1] * (arc.high - arc.low)
+
+
+def _equations(arc: Arc, y) -> shooting.Linear:
+    """Gap and its derivatives in knots and parameter."""
+    knots, x = unpack(arc, y)
+    pair, moved = jax.jvp(arc.at, (x,), (arc.high - arc.low,))
+    return shooting.linearise(pair, arc.sequence, knots, moved)
+
+
+class _Arrival(NamedTuple):
+    """Newton's way back to the branch: the point, the tangent there, the size of the last correction, how many."""
+
+    y: Float[Array, "unknown"]
+    tangent: Float[Array, "unknown"]
+    size: Float[Array, ""]
+    trips: Int[Array, ""]
+
+
+def _correct(arc: Arc, guess, former) -> _Arrival:
+    """Newton in the plane across the former tangent, and the tangent there."""
+    ahead = jnp.zeros_like(guess).at[-1].set(1.0)
+
+    def once(at: _Arrival) -> _Arrival:
+        gap, slope = _equations(arc, at.y)
+        slope = jnp.concatenate([slope, former[None]])
+        miss = jnp.append(gap, former @ (at.y - guess))
+        step, tangent = jnp.linalg.solve(slope, jnp.stack([miss, ahead], axis=1)).T
+        return _Arrival(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.trips + 1)
+
+    def going(at: _Arrival):
+        return (at.size > CLOSE) & (at.size < 1.0) & (at.trips < _ROUNDS)
+
+    return lax.while_loop(going, once, _Arrival(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
+
+
+def _turning_points(position, velocity, acceleration, length):
+    """Positions at the zeros of the velocity inside a stretch, and its sign before each; NaN where there is none."""
+    s = jnp.linspace(0.0, 1.0, _SAMPLES + 1) * length
+    v = velocity(s)
+    low, high, before, after = s[:-1], s[1:], v[:-1], v[1:]
+    turns = before * after < 0
+    at = low + (high - low) * before / jnp.where(turns, before - after, 1.0)
+    for _ in range(2):
+        at = jnp.clip(at - velocity(at) / acceleration(at), low, high)
+    return jnp.where(turns, position(at), jnp.nan), before
+
+
+def _flight_room(pair: ImpactPair, passage: shooting.Passage):
+    """Least distance from a wall at a turning point of the flight that follows each contact."""
+
+    def one(side, speed, t, next_t):
+        place = lambda s: 0.5 * side * pair.d + flow.flight(pair.gamma, t, -side * speed, s)[0]  # noqa: E731
+        velocity = lambda s: flow.flight(pair.gamma, t, -side * speed, s)[1]  # noqa: E731
+        u, before = _turning_points(place, velocity, lambda s: flow.acceleration(pair.gamma, t + s), next_t - t)
+        room = jnp.where(before > 0, 0.5 * pair.d - u, 0.5 * pair.d + u)
+        return jnp.nanmin(jnp.append(room, _NOTHING))
+
+    return jax.vmap(one)(passage.side, passage.speed, passage.t, passage.next_t)
+
+
+def _contact_room(pair: ImpactPair, passage: shooting.Passage, knots):
+    """Least penetration at a turning point inside each contact where it is a minimum."""
+    if pair.kappa is None:
+        return jnp.full(passage.side.shape, _NOTHING)
+    wall = flow.membrane(pair, rolled=True)
+
+    def one(side, knot):
+        t, speed, stay = knot
+        force = flow.contact_force(pair.gamma, side, t)
+
+        def motion(s):
+            return jax.vmap(lambda s: flow.oscillate(wall, force, jnp.zeros_like(s), speed, s))(s)
+
+        def bend(s):
+            w, rate = motion(s)
+            return jax.vmap(force.at)(s) - wall.mu * rate - wall.kappa * wall.kappa * w
+
+        w, before = _turning_points(lambda s: motion(s)[0], lambda s: motion(s)[1], bend, jnp.maximum(stay, 0.0))
+        return jnp.nanmin(jnp.append(jnp.where(before < 0, w, jnp.nan), _NOTHING))
+
+    return jax.vmap(one)(passage.side, knots)
+
+
+def _tests(arc: Arc, y, tangent) -> Tests:
+    knots, x = unpack(arc, y)
+    pair, real = arc.at(x), arc.sequence.real
+    around = shooting.monodromy(pair, arc.sequence, knots)
+    trace, determinant = around[0, 0] + around[1, 1], jnp.linalg.det(around)
+    # Padded impacts are given harmless knots.
+    knots = jnp.where(real[:, None], knots, 1.0)
+    passage = shooting.passages(pair, arc.sequence, knots)
+
+    def least(values):
+        return jnp.where(real, values, _NOTHING).min()
+
+    return Tests(
+        fold=tangent[-1],
+        plus=1 - trace + determinant,
+        minus=1 + trace + determinant,
+        speed=least(knots[:, 1]),
+        flight=least(_flight_room(pair, passage)),
+        contact=least(_contact_room(pair, passage, knots)),
+        exit=jnp.full_like(x, _NOTHING) if pair.kappa is None else least(passage.speed),
+        low=x - arc.low,
+        high=arc.high - x,
+    )
+
+
+class Place(NamedTuple):
+    """Points of branches, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
+
+    And how Newton came there: the size of its last correction, and how many it took.
+    """
+
+    y: np.ndarray
+    tangent: np.ndarray
+    tests: np.ndarray
+    size: np.ndarray
+    trips: np.ndarray
+
+
+@jax.jit
+def _compiled(arcs: Arc, y, tangent, length):
+    def one(arc, y, tangent, length):
+        at = _correct(arc, y + length * tangent, tangent)
+        return Place(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.trips)
+
+    return jax.vmap(one)(arcs, y, tangent, length)
+
+
+def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> Place:
+    """From points of branches on by an arclength each: the compiled program behind every step and every search."""
+    count = y.shape[0]
+    size = next((size for size in _BATCHES if size >= count), count)
+    index = np.minimum(np.arange(size), count - 1)
+    rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], (arcs, y, tangent, length))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], _compiled(*rows))
