@@ -37,7 +37,6 @@ ROOMS: dict[str, set[str]] = {
     "summary": {"model", "quick", "cell", "relay"},
     "trips": {"model", "flow", "exact", "quick", "sampled", "ode", "rk4", "cell", "recurrence", "fold"},
     "simulate": {"model", "exact", "quick", "lanes", "method", "cell", "relay", "recurrence", "summary", "trips"},
-    "curve": {"model", "flow"},
     "trajectory": {"model", "flow", "exact", "ode", "rk4", "membrane", "method"},
     "shooting": {"model", "flow"},
     "impact_map": {"model", "quick", "sampled", "lanes", "cell", "trips"},
@@ -54,13 +53,14 @@ ROOMS: dict[str, set[str]] = {
     "compare": {"model", "dataset", "label", "grid"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
     "style": set(),
-    "chart": {"store", "style"},
+    "curve": {"model", "flow"},
     "paper": set(),
     "portrait": {"store", "style"},
     "cached": {"model", "orbit", "branch", "diagram", "paper"},
     "figures": {"model", "curve", "orbit", "paper", "portrait", "cached"},
     "evidence": {"model", "orbit", "branch", "attractor", "label", "cached", "paper"},
     "claims": {"model", "branch", "attractor", "diagram", "grid", "cached", "paper", "evidence"},
+    "chart": {"store", "style"},
     "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style"},
 }
 ROOMS["__init__"] = set(ROOMS)

@@ -133,7 +133,6 @@ def next_impacts(pair: ImpactPair, side, speed, t, *, level: bool) -> Next:
         level=level,
         deep=True,
         energies=False,
-        asymmetry=False,
         tangent=False,
         asymmetry=False,
         variants=1,
