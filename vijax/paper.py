@@ -224,6 +224,9 @@ def _at_frequency(letter: str, omega: float, title: str) -> View:
     return View(letter, "phase plane", both, title)
 
 
+_FAST_ORBIT = Source(SOFTENED, {"d": 0.2, "kappa": 4.0}, COLOURS[-1], r"$\kappa = 4$")
+
+
 def _fast(r: float) -> tuple[Source, ...]:
     """The three stiffest membranes at the frequencies of Fig. 16(b)."""
     stiff, medium, soft = _by_spring(r)[:3]
@@ -313,10 +316,11 @@ FIGURES: dict[int, PaperFigure] = {
                 r"$\kappa = 12.65$, $r = 0.5$, $d = 0.12$",
             ),
             View("c", "phase plane", _by_stiffness(0.1, d=0.16), "$r = 0.1$, $d = 0.16$"),
-            View("d", "phase plane", _by_stiffness(0.5, d=0.2), "$r = 0.5$, $d = 0.2$"),
+            View("d", "phase plane", (*_by_stiffness(0.5, d=0.2)[:-1], _FAST_ORBIT), "$r = 0.5$, $d = 0.2$"),
         ),
         f"Gray: the orbit; dots: its Poincare section over {SECTION_PERIODS} periods. The chaos of (a) is a long "
-        "transient: see the table of claims.",
+        "transient: see the table of claims. It may end within the sweep of Fig. 8, so that $\\kappa = 4$ "
+        "of (d) is from the sweep of Fig. 6.",
     ),
     12: PaperFigure(
         r"Soft against rigid walls over $\omega$: $\omega_0 = 400$ rad/s, $s = 0.2$ m, $r = 0.5$",
