@@ -95,6 +95,8 @@ def test_phase_planes_are_at_the_values_of_the_captions():
     assert [shown[12, letter]["omega"] for letter in "cdef"] == [np.pi / 3, np.pi, 7.79, 10.99]
     springs = [(source.where["k"], source.where["omega"]) for source in FIGURES[16].views[1].sources]
     assert springs == [(560.0, 10.0), (56.0, 10.0), (5.6, 10.5)]
+    restitutions = [{held(source.run)["r"] for source in view.sources} for view in FIGURES[16].views]
+    assert restitutions == [{0.5}, {0.5}, {0.1}, {0.95}]
 
 
 def test_a_stiffness_has_one_colour_everywhere():
