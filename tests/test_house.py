@@ -53,6 +53,13 @@ ROOMS: dict[str, set[str]] = {
     "compare": {"model", "dataset", "label", "grid"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
     "style": set(),
+    "curve": {"model", "flow"},
+    "paper": set(),
+    "portrait": {"store", "style"},
+    "cached": {"model", "orbit", "branch", "diagram", "paper"},
+    "figures": {"model", "curve", "orbit", "paper", "portrait", "cached"},
+    "evidence": {"model", "orbit", "branch", "attractor", "label", "cached", "paper"},
+    "claims": {"model", "branch", "attractor", "diagram", "grid", "cached", "paper", "evidence"},
     "chart": {"store", "style"},
     "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style"},
 }

@@ -1,0 +1,66 @@
+"""Diagrams, orbits and branches of the paper's figures and claims, each computed once."""
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vijax import branch, orbit
+from vijax.diagram import orbit_diagram
+from vijax.model import Harvester, impact_pair
+from vijax.paper import GAP_IN_METRES, Run
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Branches are followed so many at a time, of orbits padded to so many impacts: programs compile for a minute.
+_LANES, _IMPACTS = 4, 3
+
+
+@lru_cache(maxsize=16)
+def diagram(run: Run) -> "xr.Dataset":
+    """The orbit diagram of a run."""
+    axes: Any = {name: np.asarray(values) if isinstance(values, tuple) else values for name, values in run.axes}
+    return orbit_diagram(
+        along=run.along,
+        values=np.array(run.values),
+        direction=run.direction,
+        wall=run.wall,
+        periods=run.periods,
+        keep=run.keep,
+        **axes,
+    )
+
+
+@lru_cache(maxsize=64)
+def orbits(walls: str, d: float, kappa: float | None, r: float = 0.5, period: int = 1) -> orbit.Orbit:
+    """Every orbit found with these walls, stable or not; kappa is None of rigid walls."""
+    return orbit.search(impact_pair(d, kappa, r), walls, period)
+
+
+@lru_cache(maxsize=32)
+def branches(
+    walls: str, along: str, within: tuple[float, float], d: float, kappa: float | None, r: float = 0.5, period: int = 1
+) -> list[branch.Branch]:
+    """The branches of all orbits with these walls; along omega those of the device of Figs. 12-16."""
+    found = orbits(walls, d, kappa, r, period)
+    if not len(found):
+        return []
+    device = Harvester(s=GAP_IN_METRES) if along == "omega" else None
+    lanes = np.resize(np.arange(len(found)), max(_LANES, len(found)))
+    return branch.follow(_padded(found)[lanes], along, within, device=device)[: len(found)]
+
+
+def _padded(found: orbit.Orbit) -> orbit.Orbit:
+    width = found.knots.shape[1]
+
+    def pad(leaf: jax.Array) -> jax.Array:
+        if leaf.ndim < 2 or leaf.shape[1] != width or leaf is found.multipliers:
+            return leaf
+        blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
+        widths = [(0, 0), (0, max(_IMPACTS - width, 0)), *[(0, 0)] * (leaf.ndim - 2)]
+        return jnp.pad(leaf, widths, constant_values=blank)
+
+    return jax.tree.map(pad, found)

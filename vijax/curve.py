@@ -1,0 +1,95 @@
+"""The motion between impacts as a dense curve: what a phase plane or a time series draws."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vijax import flow
+from vijax.model import ImpactPair
+
+
+class Curve(NamedTuple):
+    """Times, displacements and velocities in order; NaN parts pieces that do not join."""
+
+    t: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+
+
+def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48) -> Curve:
+    """The motion from the first of successive impacts to the end of the last, in closed form.
+
+    Args:
+        pair: The cell, every field a scalar.
+        t: Times of onset on one clock (phase + 2 periods), ascending; impacts that are not there are NaN, at the end.
+        side: Walls, +1 or -1.
+        v_in, v_out: Signed velocities at onset and exit.
+        duration: Of the contacts; 0 on a rigid wall, unless the ball sticks there.
+        samples: Points in each contact that lasts, and as many in each flight.
+
+    Returns:
+        The `Curve`: `samples` points a contact and a flight, which begin and end on the wall. With no impact, empty.
+
+    Source: `vijax.flow`, Eqs. (6)-(7) and (20)-(21) corrected.
+    """
+    (t, side, v_in, v_out, duration), count = _padded(t, side, v_in, v_out, duration)
+    if not count:
+        return Curve(*np.empty((3, 0)))
+    until = np.append(t[1:], t[-1])
+    until[count - 1] = t[count - 1] + duration[count - 1]
+    pieces = _pieces(pair, t, side, v_in, v_out, duration, until, samples)
+    return Curve(*(np.asarray(piece)[:count].ravel() for piece in pieces))
+
+
+def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
+    (t, side, v_in, v_out, duration), count = _padded(t, side, v_in, v_out, duration)
+    index = np.searchsorted(t[:count], when, side="right") - 1
+    last = np.maximum(index, 0)
+    u, v = _at(pair, *(row[last] for row in (t, side, v_in, v_out, duration)), np.asarray(when, float))
+    return np.where(index < 0, np.nan, u), np.where(index < 0, np.nan, v)
+
+
+def _padded(*given) -> tuple[list[np.ndarray], int]:
+    """Rows without what is not there, repeated to a power of two, as every new length would compile anew."""
+    rows = [np.asarray(row, float) for row in given]
+    there = np.isfinite(rows[0])
+    count = int(there.sum())
+    width = 1 << max(count - 1, 0).bit_length()
+    return [np.resize(row[there], width) for row in rows], count
+
+
+@jax.jit
+def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, Array]:
+    """The ball a time after each impact."""
+    inside = when - t <= duration
+    u, v = jax.vmap(partial(_contact, pair))(t, side, v_in, jnp.where(inside, when - t, 0.0))
+    rise, speed = flow.flight(pair.gamma, t + duration, v_out, jnp.where(inside, 0.0, when - t - duration))
+    return jnp.where(inside, u, 0.5 * side * pair.d + rise), jnp.where(inside, v, speed)
+
+
+@partial(jax.jit, static_argnames="samples")
+def _pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int) -> tuple[Array, ...]:
+    """(t, u, v) of contact and flight of every impact: [impact, 2 samples]."""
+    parts = jnp.linspace(0.0, 1.0, samples)
+    held, aloft = duration[:, None] * parts, (until - t - duration)[:, None] * parts
+    over_parts = jax.vmap(partial(_contact, pair), in_axes=(None, None, None, 0))
+    u, v = jax.vmap(over_parts)(t, side, v_in, held)
+    rise, w = flow.flight(pair.gamma, (t + duration)[:, None], v_out[:, None], aloft)
+    clock = jnp.concatenate([t[:, None] + held, (t + duration)[:, None] + aloft], axis=1)
+    wall = (0.5 * side * pair.d)[:, None]
+    return clock, jnp.concatenate([u, wall + rise], axis=1), jnp.concatenate([v, w], axis=1)
+
+
+def _contact(pair: ImpactPair, t, side, v_in, s) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Displacement and velocity a time s after an onset; on a rigid wall, where only sticking lasts, at rest."""
+    if pair.kappa is None:
+        return 0.5 * side * pair.d, jnp.where(s > 0, 0.0, v_in)
+    w, z = flow.oscillate(
+        flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t), 0.0 * s, side * v_in, s
+    )
+    return side * (0.5 * pair.d + w), side * z
