@@ -55,9 +55,8 @@ def reference_orbits() -> list[ReferenceOrbit]:
         pair = ImpactPair(*(jnp.asarray(float(row[name])) for name in ("d", "kappa", "r", "gamma")))
         knots = np.stack([t, np.abs(v), stay], axis=1)[order]
         multipliers = np.array([complex(*map(float, parts)) for parts in row["multipliers_mp_contact_map"]])
-        found.append(
-            ReferenceOrbit(pair, tuple(np.sign(v[order]).astype(int)), knots, depth[order], multipliers, float(row["P_J"]))
-        )
+        side = tuple(np.sign(v[order]).astype(int))
+        found.append(ReferenceOrbit(pair, side, knots, depth[order], multipliers, float(row["P_J"])))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Multiple shooting: the equations hold on 50-digit orbits, their derivatives are those of the equations, Newton ends."""
+"""Multiple shooting: 50-digit orbits solve the equations, derivatives are those of the equations, Newton ends."""
 
 import math
 
