@@ -33,7 +33,7 @@ class Orbit(eqx.Module):
     Attributes:
         pair: Parameters.
         sequence: Walls met, and how the orbit closes; see `shooting.Sequence`.
-        knots: Onset time, speed into the wall and contact time of each impact.
+        knots: Onset time, speed into the wall and contact time of each impact; NaN where no orbit was found.
         depth, work: Largest penetration and energy given to the membrane (per unit mass) of each impact; NaN unless OK.
         multipliers: Floquet multipliers of the full orbit, larger modulus first.
         residual: Largest violation of the equations; inf where no orbit was found.
@@ -72,14 +72,7 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impac
     Returns:
         Orbits in the order of the guesses, each with its `status`.
     """
-    level = _level(pair)
-
-    def work(part):
-        pair, sequence, guess = part
-        knots, residual, around = _shoot(pair, sequence, guess)
-        return _verify(pair, sequence, knots, residual, around, level)
-
-    return _by_tiles(work, (pair, sequence, knots))
+    return _by_tiles(partial(_tile, _shoot, _level(pair)), (pair, sequence, knots))
 
 
 def _level(pair: ImpactPair) -> bool:
@@ -114,21 +107,19 @@ def _once_around(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbi
 
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
     """Orbits from knots that solve the equations already, even where Newton is singular: points of a branch."""
-    level = _level(pair)
+    return _by_tiles(partial(_tile, _measured, _level(pair)), (pair, sequence, knots))
 
-    def work(part):
-        pair, sequence, knots = part
-        residual, around = _measured(pair, sequence, knots)
-        return _verify(pair, sequence, knots, residual, around, level)
 
-    return _by_tiles(work, (pair, sequence, knots))
+def _tile(solved: Callable[..., tuple], level: bool, rows: tuple) -> Orbit:
+    pair, sequence, knots = rows
+    knots, residual, around = solved(pair, sequence, knots)
+    return _verify(pair, sequence, knots, residual, around, level)
 
 
 @jax.jit
 def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
-    """Residuals, and what `_once_around` says."""
     residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
-    return residual, _once_around(pair, sequence, knots)
+    return knots, residual, _once_around(pair, sequence, knots)
 
 
 def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level: bool) -> Orbit:
@@ -155,7 +146,7 @@ def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level
     return Orbit(
         pair=pair,
         sequence=sequence,
-        knots=jnp.where(real[..., None], knots, jnp.nan),
+        knots=jnp.where((real & found[:, None])[..., None], knots, jnp.nan),
         depth=jnp.where(good, depth, jnp.nan),
         work=jnp.where(good, work, jnp.nan),
         multipliers=jnp.where(found[:, None], multipliers, jnp.nan),
