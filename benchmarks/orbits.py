@@ -70,7 +70,7 @@ def throughput() -> None:
     """Symmetric 1:1 orbits of many kappa, closed half way, each from a neighbour's knots, all of them verified."""
     start = orbits.search(impact_pair(D, 40.0, 0.5), "RL", guesses=1024)
     start = orbits.halved(start[np.flatnonzero(np.asarray(orbits.symmetric(start)))])
-    fast = start[[int(jnp.argmax(start.knots[:, 0, 1]))]]
+    fast = start[jnp.argmax(start.knots[:, 0, 1], keepdims=True)]
     (along,) = branch.follow(fast, "kappa", (3.0, 400.0))
     say("the branch they lie on: kappa from, to", f"{along.values.min():.4g}, {along.values.max():.4g}")
     kappa = np.geomspace(max(along.values.min(), 3.0), min(along.values.max(), 400.0), ORBITS)

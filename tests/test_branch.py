@@ -56,6 +56,8 @@ def test_every_orbit_is_one_and_the_multiplier_decides_between_stable_and_not(fa
         assert (np.asarray(one.orbit.residual) < 1e-13).all()
         assert np.abs(np.diff(one.values)).max() < 0.01 * (SPAN[1] - SPAN[0])
     symmetric = family[0]
+    # To the very ends, and each end once.
+    np.testing.assert_allclose(symmetric.values[[0, -1]], SPAN, rtol=1e-12)
     np.testing.assert_array_equal(symmetric.stable, symmetric.values > PITCHFORK)
     assert symmetric.ends == ("low", "high")
 
@@ -97,6 +99,8 @@ def test_the_dataset_and_its_picture(family, tmp_path):
         ({"along": "omega0"}, "along must be one of"),
         ({"along": "kappa"}, "a rigid wall has no kappa"),
         ({"within": (0.3, 0.1)}, "within must be two bounds"),
+        ({"within": (0.1,)}, "within must be two bounds"),
+        ({"points": 1}, "points must be a whole number"),
         ({"within": (0.25, 0.3)}, "within must hold the start"),
         ({"direction": "sideways"}, "direction must be"),
         ({"along": "gamma", "within": (-0.1, 0.1)}, "orbit must be closed in full"),

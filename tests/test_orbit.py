@@ -43,7 +43,7 @@ def test_the_unstable_orbit_is_found(rigid):
     assert len(rigid) == 1
     # Unstable by a flip.
     assert rigid.multipliers[0, 0].real < -1.1
-    assert orbits.counts(rigid) == orbits.Counts(*(np.array([n]) for n in (2, 1, 1)))
+    assert tuple(int(x[0]) for x in orbits.counts(rigid)) == (2, 1, 1)
     # One turn of the careful engine comes back to it, but for what its instability makes of rounding.
     hits = orbits.impacts(rigid)
     again = vijax.trajectory(rigid.pair, 0.09, hits.v_out[:, 0], periods=5, t0=hits.t[:, 0])
@@ -71,6 +71,11 @@ def test_from_states_to_orbits_and_their_labels():
     assert [tuple(int(x) for x in row) for row in np.transpose(orbits.counts(found))][:2] == [(1, 1, 1)] * 2
     np.testing.assert_allclose(orbits.power(found, Harvester())[:2], [float(r["P_J"]) for r in rows[:2]], rtol=1e-12)
     assert np.isinf(found.residual[2])
+
+
+def test_motion_that_only_touches_a_wall_is_no_orbit():
+    # d > 2/pi^2: the neutral motion about the middle, moved sideways until it grazes, solves the equations.
+    assert len(orbits.search(impact_pair(0.5, None, 0.9), "L", guesses=256)) == 0
 
 
 def test_a_symmetric_orbit_closed_half_way_is_the_same():
@@ -117,8 +122,13 @@ def test_the_path_is_the_motion():
         (lambda p: orbits.search(p, "RXL"), "impacts must be walls"),
         (lambda p: orbits.search(p, "0:0"), "impacts must be walls"),
         (lambda p: orbits.search(p, "1:2/2T", 3), "period must agree"),
-        (lambda p: orbits.from_state(p, 0.0, 0.1, period=0), "period must be at least 1"),
-        (lambda p: orbits.from_state(p, 0.0, 0.1, settle=-1), "settle must be at least 0"),
+        (lambda p: orbits.search(p, "1:1/0T"), "impacts must be walls"),
+        (lambda p: orbits.search(p, "RL", 1.5), "period must be a whole number"),
+        (lambda p: orbits.search(p, "RL", guesses=0), "guesses must be a whole number"),
+        (lambda p: orbits.search(impact_pair([0.1, 0.2], 40.0, 0.5), "RL"), "pair must be one cell"),
+        (lambda p: orbits.from_state(p, 0.0, 0.1, 2.5), "t must lie in"),
+        (lambda p: orbits.from_state(p, 0.0, 0.1, period=0), "period must be a whole number of at least 1"),
+        (lambda p: orbits.from_state(p, 0.0, 0.1, settle=-1), "settle must be a whole number of at least 0"),
     ],
 )
 def test_bad_input_is_told(call, message):

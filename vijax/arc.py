@@ -34,7 +34,7 @@ class Tests(NamedTuple):
     speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
     flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
     contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
-    exit: Float[Array, ""]  # least speed away from a wall: the ball stays
+    exit: Float[Array, ""]  # least speed away from a wall, over that into it: the ball stays
     low: Float[Array, ""]
     high: Float[Array, ""]
 
@@ -173,7 +173,7 @@ def _tests(arc: Arc, y, tangent) -> Tests:
         speed=least(knots[:, 1]),
         flight=least(_flight_room(pair, passage)),
         contact=least(_contact_room(pair, passage, knots)),
-        exit=jnp.full_like(x, _NOTHING) if pair.kappa is None else least(passage.speed),
+        exit=jnp.full_like(x, _NOTHING) if pair.kappa is None else least(passage.speed / knots[:, 1]),
         low=x - arc.low,
         high=arc.high - x,
     )

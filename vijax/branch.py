@@ -15,6 +15,7 @@ from vijax import flow, shooting
 from vijax import orbit as orbits
 from vijax.arc import ALONG, CLOSE, FIRST_END, FOLD, PLUS, Arc, Place, Tests, advance, unpack
 from vijax.axes import AXES
+from vijax.method import whole
 from vijax.model import Harvester, ImpactPair, Status, check
 from vijax.orbit import Orbit
 
@@ -28,6 +29,7 @@ _BEND = 0.98  # least cosine between the tangents at the ends of a step
 _EASY = 0.2  # share of that bend after which the next step is longer
 _ZERO = 1e-3  # part of a test function's ends that is zero
 _LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
+_AWAY = 20  # steps before a branch can have closed
 _NARROWINGS = 40  # of an interval that holds an event: false position with every third step a bisection
 
 
@@ -48,7 +50,7 @@ def _follow(arcs: Arc, first: Place, along: str, points: int) -> list["Branch"]:
     lanes = first.y.shape[0]
     passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]
     y, tangent, tests = first.y, first.tangent, first.tests
-    length, going = np.full(lanes, _FIRST), np.full(lanes, True)
+    length, going, closed = np.full(lanes, _FIRST), np.full(lanes, True), np.full(lanes, False)
     while going.any():
         there = advance(arcs, y, tangent, length)
         straight = (there.tangent * tangent).sum(axis=1)
@@ -64,8 +66,14 @@ def _follow(arcs: Arc, first: Place, along: str, points: int) -> list["Branch"]:
         length = np.where(good, longer, 0.5 * length)
         real = (tests[:, FIRST_END:] > 0).all(axis=1) | ~good
         short = np.array([len(lane) < points for lane in passed])
-        going = going & (length > _SHORTEST) & real & short
-    return [_branch(jax.tree.map(lambda x, i=i: x[i], arcs), rows, along, points) for i, rows in enumerate(passed)]
+        # A closed branch comes by its start again, in the same direction.
+        back = np.linalg.norm(y - first.y, axis=1) < _LONGEST
+        home = back & ((tangent * first.tangent).sum(axis=1) > _BEND) & np.array([len(lane) > _AWAY for lane in passed])
+        closed |= going & home
+        going = going & (length > _SHORTEST) & real & short & ~home
+    ends = np.where(closed, "closed", np.where([len(rows) >= points for rows in passed], "points", "lost"))
+    lanes_of = [jax.tree.map(lambda x, i=i: x[i], arcs) for i in range(lanes)]
+    return [_branch(arc, rows, along, str(end)) for arc, rows, end in zip(lanes_of, passed, ends, strict=True)]
 
 
 def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, test: np.ndarray, low_f: np.ndarray):
@@ -122,7 +130,8 @@ class Branch(NamedTuple):
         orbit: The orbits, with multipliers.
         points: What was met on the way, in order.
         ends: Why it stops at its first and at its last orbit: "start", a kind of `Point` where no orbit goes on, "low"
-            or "high" (bound of the parameter), "points" (as many as asked for), "lost" (no step was short enough).
+            or "high" (bound of the parameter), "closed" (back at its start), "points" (as many as asked for), "lost"
+            (no step was short enough).
     """
 
     along: str
@@ -170,6 +179,7 @@ def follow(
     ways = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
     if direction not in ways:
         raise ValueError(f'direction must be "up", "down" or "both"; got {direction!r}')
+    points = whole("points", points, 2)
     ahead = np.zeros_like(y)
     ahead[:, -1] = 1.0
     first = advance(arcs, y, ahead, np.zeros(len(orbit)))
@@ -186,6 +196,8 @@ def _heading(place: Place, sign: float) -> Place:
 
 def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None):
     """Arcs and unknowns of the starts; what cannot be followed is refused."""
+    if not len(orbit):
+        raise ValueError("orbit must hold an orbit to follow; got none; search with more guesses")
     if (np.asarray(orbit.status) != Status.OK).any():
         index = int(np.argmax(np.asarray(orbit.status) != Status.OK))
         raise ValueError(f"orbit must hold orbits only; got {Status(int(orbit.status[index])).name} at index {index}")
@@ -205,9 +217,9 @@ def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], devi
     if along not in ALONG or (along == "kappa" and pair.kappa is None):
         rigid = "; a rigid wall has no kappa" if pair.kappa is None else ""
         raise ValueError(f"along must be one of {', '.join(ALONG)}; got {along!r}{rigid}")
-    low, high = within
-    if not low < high:
+    if len(within) != 2 or not within[0] < within[1]:
         raise ValueError(f"within must be two bounds, the lower first; got {within}")
+    low, high = within
     for bound in within:
         check(along, bound)
     # The frequency at which the device's gap is d.
@@ -217,18 +229,21 @@ def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], devi
     return x
 
 
-def _branch(arc: Arc, rows: list[tuple], along: str, points: int) -> Branch:
+def _branch(arc: Arc, rows: list[tuple], along: str, end: str) -> Branch:
     """A lane's record as a branch: what was met between its points, and where it ends."""
     y, tangent, tests, lengths = (np.array(column) for column in zip(*rows, strict=True))
-    end = "points" if len(rows) >= points else "lost"
-    last, met = len(rows), []
+    last, met, ys = len(rows), [], y
     for event in sorted(_events(arc, y, tangent, tests, lengths), key=lambda event: (event.place, event.s)):
         kind = _kind(arc, event, y[event.place : event.place + 2])
         if event.test in Tests._fields[FIRST_END:]:
             end, last = kind, event.place + 1
+            ys = np.concatenate([y[:last], event.y[None]])
         if kind not in ("low", "high"):
             met.append(Point(kind, float(event.y[-1] * (arc.high - arc.low)), _orbits(arc, event.y[None])))
-    return Branch(along, y[:last, -1] * float(arc.high - arc.low), _orbits(arc, y[:last]), met, ("start", end))
+    orbit = _orbits(arc, ys)
+    # At a bound the last orbit is there; at a grazing rounding decides whether it is one.
+    count = len(ys) if int(orbit.status[-1]) == Status.OK else last
+    return Branch(along, ys[:count, -1] * float(arc.high - arc.low), orbit[:count], met, ("start", end))
 
 
 class _Event(NamedTuple):
@@ -279,7 +294,9 @@ def _orbits(arc: Arc, ys: np.ndarray) -> Orbit:
 
 
 def _joined(down: Branch, up: Branch) -> Branch:
-    """Two ways from one start as one branch, from the end of the first to that of the second."""
+    """Two ways from one start as one branch, from end to end; where it closes one way is all of it."""
+    if down.ends[1] == "closed":
+        return down
     orbit = jax.tree.map(lambda a, b: jnp.concatenate([a[::-1], b[1:]]), down.orbit, up.orbit)
     values = np.concatenate([down.values[::-1], up.values[1:]])
     return Branch(down.along, values, orbit, down.points[::-1] + up.points, (down.ends[1], up.ends[1]))
@@ -387,6 +404,8 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     """
     import xarray as xr  # here, as importing vijax must not load it
 
+    if not branches:
+        raise ValueError("branches must hold at least one; got none")
     device = Harvester() if device is None else device
     along = branches[0].along
     columns = [_columns(branch, device) for branch in branches]

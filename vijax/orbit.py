@@ -18,10 +18,12 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from vijax import flow, shooting
 from vijax.energy import harvested_energy
 from vijax.impact_map import next_impacts
-from vijax.model import Harvester, Impact, ImpactPair, Status
+from vijax.method import whole
+from vijax.model import Harvester, Impact, ImpactPair, Status, check
 from vijax.shooting import Sequence
 from vijax.trajectory import trajectory
 
+_TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
 _SAME = 1e-6  # how closely the impact map must meet the next impact of a real orbit
 _FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
 _TILES = (32, 256, 4096)  # orbits of one compiled call
@@ -96,6 +98,8 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
 @jax.jit
 def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]):
     knots, residual = shooting.newton(pair, sequence, guess)
+    touches = (sequence.real & (knots[..., 1] < _TOUCH)).any(axis=1)
+    residual = jnp.where(touches, jnp.inf, residual)
     return knots, residual, _once_around(pair, sequence, knots)
 
 
@@ -125,8 +129,8 @@ def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit i
 def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level: bool) -> Orbit:
     """Fly from the end of every contact: the impact map must meet the next impact, and end its contact in time."""
     multipliers, passage = around
-    found = jnp.isfinite(residual)
     real = sequence.real
+    found = jnp.isfinite(residual) & real.any(axis=1)
     wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], real.shape).reshape(-1), pair)
     phase, periods = flow.wrap_phase(passage.t)
     flown = next_impacts(wide, passage.side.reshape(-1), passage.speed.reshape(-1), phase.reshape(-1), level=level)
@@ -187,20 +191,24 @@ def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 
     Raises:
         ValueError: period below 1, settle below 0, or an inadmissible pair or state.
     """
-    for name, value, least in (("period", period, 1), ("settle", settle, 0)):
-        if value < least:
-            raise ValueError(f"{name} must be at least {least}; got {value}")
+    period, settle = whole("period", period, 1), whole("settle", settle, 0)
+    _check_pair(pair)
     u, v, t = (jnp.atleast_1d(jnp.asarray(x, float)) for x in (u, v, t))
     shape = jnp.broadcast_shapes(u.shape, v.shape, t.shape, *(jnp.shape(x) for x in jax.tree.leaves(pair)))
     pair = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), pair)
     u, v, t = (jnp.broadcast_to(x, shape) for x in (u, v, t))
+    if not bool(((t >= 0) & (t < 2)).all()):
+        raise ValueError(f"t must lie in [0, 2); got {t}")
+    lost = jnp.zeros(shape, bool)
     if settle:
         last = jax.tree.map(lambda x: x[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
-        u, v, t = last.u, last.v, jnp.zeros_like(t)
+        # More impacts than a trajectory has room for: the state is not known.
+        lost = ~jnp.isfinite(last.u + last.v)
+        u, v, t = jnp.where(lost, 0.0, last.u), jnp.where(lost, 0.0, last.v), jnp.zeros_like(t)
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
     found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
     onset = 2 * found.n.astype(found.t.dtype) + found.t
-    inside = np.asarray(onset < onset[:, :1] + 2 * period - _SAME)
+    inside = np.asarray((onset < onset[:, :1] + 2 * period - _SAME) & ~lost[:, None])
     width = 1 << max(int(inside.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
     mask = jnp.asarray(inside[:, :width])
     side = jnp.where(mask, found.side[:, :width], 0)
@@ -228,18 +236,28 @@ def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses
 
     Source: Eqs. (28)-(29) ask for one sequence from one guess.
     """
+    guesses = whole("guesses", guesses, 1)
+    _check_pair(pair)
+    if jnp.ndim(pair.d):
+        raise ValueError(f"pair must be one cell; got {jnp.size(pair.d)} of them; search each")
     every, period = sequences(impacts, period)
     draw = np.random.default_rng(seed)
     found = [_search(pair, walls, period, guesses, draw) for walls in every]
     return distinct(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found))
 
 
+def _check_pair(pair: ImpactPair) -> None:
+    for name in ("d", "kappa", "r", "gamma"):
+        if getattr(pair, name) is not None:
+            check(name, getattr(pair, name))
+
+
 def sequences(impacts: str, period: int | None = None) -> tuple[list[tuple[int, ...]], int]:
     """Cyclically distinct sequences of walls that a text asks for, and the period; see `search`."""
     walls = {"L": -1, "R": 1}
     if impacts and set(impacts.upper()) <= set(walls):
-        return [tuple(walls[letter] for letter in impacts.upper())], 1 if period is None else period
-    match = re.fullmatch(r"(\d+):(\d+)(?:/(\d*)T)?", impacts)
+        return [tuple(walls[letter] for letter in impacts.upper())], 1 if period is None else whole("period", period, 1)
+    match = re.fullmatch(r"(\d+):(\d+)(?:/([1-9]\d*)T)?", impacts)
     if match is None or int(match[1]) + int(match[2]) == 0:
         raise ValueError(f"impacts must be walls such as RLL or a label such as 1:2/2T; got {impacts!r}")
     named = int(match[3] or 1)
