@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vijax import flow, shooting
+from vijax import flow, lanes, shooting
 from vijax.energy import harvested_energy
 from vijax.impact_map import next_impacts
 from vijax.method import whole
@@ -74,7 +74,7 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impac
     Returns:
         Orbits in the order of the guesses, each with its `status`.
     """
-    return _by_tiles(partial(_tile, _shoot, _level(pair)), (pair, sequence, knots))
+    return _by_tiles(partial(_tile, _compiled(_shoot), _level(pair)), (pair, sequence, knots))
 
 
 def _level(pair: ImpactPair) -> bool:
@@ -95,7 +95,6 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
 
 
-@jax.jit
 def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]):
     knots, residual = shooting.newton(pair, sequence, guess)
     touches = (sequence.real & (knots[..., 1] < _TOUCH)).any(axis=1)
@@ -111,7 +110,12 @@ def _once_around(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbi
 
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
     """Orbits from knots that solve the equations already, even where Newton is singular: points of a branch."""
-    return _by_tiles(partial(_tile, _measured, _level(pair)), (pair, sequence, knots))
+    return _by_tiles(partial(_tile, _compiled(_measured), _level(pair)), (pair, sequence, knots))
+
+
+@lru_cache(maxsize=2)
+def _compiled(work: Callable[..., tuple]) -> Callable[..., tuple]:
+    return jax.jit(work, compiler_options=lanes.compiler_options())
 
 
 def _tile(solved: Callable[..., tuple], level: bool, rows: tuple) -> Orbit:
@@ -120,7 +124,6 @@ def _tile(solved: Callable[..., tuple], level: bool, rows: tuple) -> Orbit:
     return _verify(pair, sequence, knots, residual, around, level)
 
 
-@jax.jit
 def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
     residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
     return knots, residual, _once_around(pair, sequence, knots)
@@ -291,11 +294,13 @@ def distinct(orbit: Orbit) -> Orbit:
     return orbit[np.sort(good[first])]
 
 
-def marks(orbit: Orbit) -> Float[Array, "orbit 4"]:
+def marks(orbit: Orbit) -> Float[Array, "orbit 6"]:
     """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
     t, speed, stay = jnp.moveaxis(orbit.knots, -1, 0)
     signed = orbit.sequence.side.astype(speed.dtype) * speed
-    parts = [signed * jnp.cos(jnp.pi * t), signed * jnp.sin(jnp.pi * t), signed + speed, stay * speed]
+    # Odd harmonics are alike for mirror images, (side, t) -> (-side, t + 1); even ones change sign.
+    waves = [wave(jnp.pi * order * t) for order in (1, 2) for wave in (jnp.cos, jnp.sin)]
+    parts = [*(signed * wave for wave in waves), signed + speed, stay * speed]
     return jnp.stack([jnp.nansum(part, axis=-1) for part in parts], axis=-1)
 
 
