@@ -91,6 +91,11 @@ def test_the_dataset_and_its_picture(family, tmp_path):
     first = family[0]
     np.testing.assert_allclose(found["P"][0, : len(first.values)], orbits.power(first.orbit, Harvester()))
     assert sorted(k for k in found["event"].values.flat if k) == sorted(p.kind for b in family for p in b.points)
+    # Marks lie on the sheet of the branch that met them.
+    for index, one in enumerate(family):
+        for number, point in enumerate(one.points):
+            place = int(found["event_point"][index, number])
+            assert np.nanmax(np.abs(one.orbit.knots[place, :, 1] - point.orbit.knots[0, :, 1])) < 0.02
     chart.branches(found, tmp_path / "branches.png")
     assert (tmp_path / "branches.png").stat().st_size > 10_000
 

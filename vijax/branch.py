@@ -400,7 +400,8 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     Returns:
         Over (branch, point): the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the label's `period`,
         `impacts_left`, `impacts_right`, `status`; over (branch, point, impact): `v_in`, `side`, `phase`, `duration`,
-        `depth` [m]; over (branch, event): `event`, and its `event_value`; over branch: `end_first`, `end_last`.
+        `depth` [m]; over (branch, event_number): `event`, its `event_value`, and
+        `event_point`, the point nearest to it; over branch: `end_first`, `end_last`.
     """
     import xarray as xr  # here, as importing vijax must not load it
 
@@ -417,9 +418,11 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     most = max(map(len, events), default=0)
     kinds = np.array([names + [""] * (most - len(names)) for names in events], dtype=text).reshape(len(branches), most)
     values = _padded([np.array([point.value for point in branch.points]) for branch in branches])
+    places = _padded([_places(branch) for branch in branches])
     return xr.Dataset(
         variables
         | {"event": (("branch", "event_number"), kinds), "event_value": (("branch", "event_number"), values)}
+        | {"event_point": (("branch", "event_number"), places)}
         | {f"end_{name}": ("branch", np.array([b.ends[i] for b in branches], dtype=text)) for i, name in _ENDS},
         coords={along: (("branch", "point"), found[along], _about(along))} | _constants(branches[0]),
         attrs={
@@ -484,6 +487,13 @@ def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
         "depth": hits.depth * length,
     }
     return {name: np.asarray(values, float) for name, values in columns.items()}
+
+
+def _places(branch: Branch) -> np.ndarray:
+    """Index of the orbit nearest to each thing met: on the right sheet, where a fold has made several."""
+    passed = np.column_stack([np.asarray(orbits.marks(branch.orbit)), branch.values])
+    met = [np.append(np.asarray(orbits.marks(point.orbit))[0], point.value) for point in branch.points]
+    return np.array([np.abs(passed - traits).sum(axis=1).argmin() for traits in met], dtype=float)
 
 
 def _padded(rows: list[np.ndarray]) -> np.ndarray:

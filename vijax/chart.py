@@ -389,12 +389,11 @@ def _mark(kind: str, label: str | None = None) -> Line2D:
 
 
 def _mark_events(axes: Axes, one: "xr.Dataset", quantity: str) -> None:
-    """What one branch met, on the curves of its quantity: at the point nearest to it along the branch."""
-    place = one[str(one.attrs["along"])].values
-    values = one[quantity].values.reshape(place.size, -1)
-    for kind, value in zip(one["event"].values, one["event_value"].values, strict=True):
+    """What one branch met, on the curves of its quantity."""
+    values = one[quantity].values.reshape(one.sizes["point"], -1)
+    events = (one["event"].values, one["event_value"].values, one["event_point"].values)
+    for kind, value, place in zip(*events, strict=True):
         if kind:
-            nearest = values[np.nanargmin(np.abs(place - value))]
             mark = _mark(str(kind).split()[0])
-            mark.set_data(np.full(nearest.size, value), nearest)
+            mark.set_data(np.full(values.shape[1], value), values[int(place)])
             axes.add_line(mark)
