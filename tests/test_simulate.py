@@ -277,15 +277,6 @@ def test_a_window_has_an_exponent_too():
     assert window.lyapunov[0] == pytest.approx(largest_exponent(orbit), abs=0.05)
 
 
-def test_float32_agrees_as_far_as_it_reaches(plane):
-    sharp = np.flatnonzero(PERIODIC & (known("p") == 1) & (known("attractors_found") == 1))
-    rough = summarise([PLANE[i] for i in sharp], dtype="float32")
-    assert rough.P.dtype == np.float32
-    agree = (rough.period == 1) & (rough.impacts_left == plane.impacts_left[sharp])
-    assert agree.mean() > 0.9
-    np.testing.assert_allclose(rough.P[agree, 0], plane.P[sharp[agree], 0], rtol=1e-2)
-
-
 def test_inclined_cells_know_the_50_digit_orbit_and_run_into_attractors():
     orbit = next(orbit for orbit in ORBITS if orbit["gamma"] != 0)
     found = summarise([orbit_cell(orbit), cell(0.3, 12.65, gamma=0.1), cell(0.2, 400.0, gamma=0.1)], 60)
