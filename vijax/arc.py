@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import flow, shooting
+from vijax import flow, lanes, shooting
 from vijax.model import ImpactPair
 from vijax.shooting import Sequence
 
@@ -203,8 +203,8 @@ def _compiled(arcs: Arc, y, tangent, length):
 
 def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> Place:
     """From points of branches on by an arclength each: the compiled program behind every step and every search."""
-    count = y.shape[0]
-    size = next((size for size in _BATCHES if size >= count), count)
-    index = np.minimum(np.arange(size), count - 1)
-    rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], (arcs, y, tangent, length))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], _compiled(*rows))
+    parts = []
+    for tile in lanes.tiles(y.shape[0], _BATCHES):
+        rows = jax.tree.map(lambda leaf, rows=tile.rows: jnp.asarray(leaf)[rows], (arcs, y, tangent, length))
+        parts.append(jax.tree.map(lambda leaf, real=tile.real: np.asarray(leaf)[:real], _compiled(*rows)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

@@ -15,8 +15,7 @@ from vijax.paper import GAP_IN_METRES, Run
 if TYPE_CHECKING:
     import xarray as xr
 
-# Branches are followed so many at a time, of orbits padded to so many impacts: programs compile for a minute.
-_LANES, _IMPACTS = 4, 3
+_IMPACTS = 3  # orbits are padded to so many, so that one program follows the branches of several sequences
 
 
 @lru_cache(maxsize=16)
@@ -49,8 +48,7 @@ def branches(
     if not len(found):
         return []
     device = Harvester(s=GAP_IN_METRES) if along == "omega" else None
-    lanes = np.resize(np.arange(len(found)), max(_LANES, len(found)))
-    return branch.follow(_padded(found)[lanes], along, within, device=device)[: len(found)]
+    return branch.follow(_padded(found), along, within, device=device)
 
 
 def _padded(found: orbit.Orbit) -> orbit.Orbit:

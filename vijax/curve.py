@@ -41,8 +41,8 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
         return Curve(*np.empty((3, 0)))
     until = np.append(t[1:], t[-1])
     until[count - 1] = t[count - 1] + duration[count - 1]
-    pieces = _pieces(pair, t, side, v_in, v_out, duration, until, samples)
-    return Curve(*(np.asarray(piece)[:count].ravel() for piece in pieces))
+    rows = pieces(pair, t, side, v_in, v_out, duration, until, samples)
+    return Curve(*(np.asarray(row)[:count].ravel() for row in rows))
 
 
 def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
@@ -73,8 +73,8 @@ def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, 
 
 
 @partial(jax.jit, static_argnames="samples")
-def _pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int) -> tuple[Array, ...]:
-    """(t, u, v) of contact and flight of every impact: [impact, 2 samples]."""
+def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int) -> tuple[Array, ...]:
+    """(t, u, v) [impact, 2 samples] in each contact and in the flight after it, up to the time `until`."""
     parts = jnp.linspace(0.0, 1.0, samples)
     held, aloft = duration[:, None] * parts, (until - t - duration)[:, None] * parts
     over_parts = jax.vmap(partial(_contact, pair), in_axes=(None, None, None, 0))

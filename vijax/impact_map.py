@@ -52,13 +52,10 @@ def _compiled(answer: Callable, plan: Plan):
 
 def _answered(work: Callable, requests: trips.Request) -> tuple[Next, np.ndarray]:
     """What the work says of every request, in padded tiles."""
-    count = requests.held.size
-    tile = next((size for size in _TILES if size >= count), _TILES[-1])
     parts = []
-    for start in range(0, count, tile):
-        index = np.minimum(np.arange(start, start + tile), count - 1)
-        part = work(jax.tree.map(lambda leaf, rows=index: leaf[rows], requests))
-        parts.append(jax.tree.map(lambda leaf, real=count - start: np.asarray(leaf)[:real], part))
+    for tile in lanes.tiles(requests.held.size, _TILES):
+        part = work(jax.tree.map(lambda leaf, rows=tile.rows: leaf[rows], requests))
+        parts.append(jax.tree.map(lambda leaf, real=tile.real: np.asarray(leaf)[:real], part))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 

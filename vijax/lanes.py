@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -71,6 +72,20 @@ class Program(NamedTuple):
     done: Callable[[Carry], Bool[Array, "lane"]]
     unload: Callable[[Carry], Float[Array, "row out"]]
     service: Service | None = None
+
+
+class Tile(NamedTuple):
+    """Rows of one compiled call, padded by the last one; how many come first that are no padding."""
+
+    rows: np.ndarray
+    real: int
+
+
+def tiles(count: int, sizes: tuple[int, ...]) -> list[Tile]:
+    """`count` rows in calls of few sizes, ascending, so that few programs are compiled for every number of rows."""
+    size = next((size for size in sizes if size >= count), sizes[-1])
+    starts = range(0, count, size)
+    return [Tile(np.minimum(np.arange(start, start + size), count - 1), min(size, count - start)) for start in starts]
 
 
 class _Queue(NamedTuple):

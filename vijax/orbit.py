@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vijax import flow, lanes, shooting
+from vijax.curve import pieces
 from vijax.energy import harvested_energy
 from vijax.impact_map import next_impacts
 from vijax.method import whole
@@ -83,15 +84,12 @@ def _level(pair: ImpactPair) -> bool:
 
 def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
     """The work on every row, in padded tiles of few sizes so that few programs are compiled, a thread a core."""
-    count = jax.tree.leaves(rows)[0].shape[0]
-    tile = next((size for size in _TILES if size >= count), _TILES[-1])
 
-    def part(start: int) -> Orbit:
-        index = np.minimum(np.arange(start, start + tile), count - 1)
-        return work(jax.tree.map(lambda leaf: leaf[index], rows))[: count - start]
+    def part(tile: lanes.Tile) -> Orbit:
+        return work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))[: tile.real]
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        found = list(pool.map(part, range(0, count, tile)))
+        found = list(pool.map(part, lanes.tiles(jax.tree.leaves(rows)[0].shape[0], _TILES)))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
 
 
@@ -141,9 +139,9 @@ def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level
     miss = jnp.abs(flown.t + 2 * periods - passage.next_t) + jnp.abs(flown.side * flown.v_in - passage.next_speed)
     miss = miss + jnp.abs(flown.duration - passage.next_stay)
     met = flown.real & (flown.side == passage.next_side) & (miss < _SAME)
-    whole = found & (met | ~real).all(axis=1)
-    status = jnp.where(whole, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
-    good = whole[:, None] & real
+    verified = found & (met | ~real).all(axis=1)
+    status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
+    good = verified[:, None] & real
     # What was flown to is the impact after each.
     place = jnp.arange(real.shape[1], dtype=jnp.int32)
     before = jnp.where(place == 0, real.sum(axis=1, dtype=jnp.int32)[:, None] - 1, place - 1)
@@ -362,6 +360,9 @@ def _unfolded(orbit: Orbit, twice: Bool[Array, "orbit"]) -> Orbit:
     return proven(orbit.pair, sequence, jnp.where(there[..., None], knots, 0.0))
 
 
+_compiled_passages = jax.jit(jax.vmap(shooting.passages))
+
+
 class Counts(NamedTuple):
     """Label of orbits: impacts on the left, on the right, per forcing periods; n:m/pT."""
 
@@ -392,7 +393,7 @@ def counts(orbit: Orbit) -> Counts:
 def impacts(orbit: Orbit) -> Impact:
     """The impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
     full = unfolded(orbit)
-    passage = jax.jit(jax.vmap(shooting.passages))(full.pair, full.sequence, full.knots)
+    passage = _compiled_passages(full.pair, full.sequence, full.knots)
     side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
     phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
     blank, wall = jnp.where(side == 0, jnp.nan, 0.0), side.astype(t.dtype)
@@ -434,28 +435,9 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
         Time, displacement and velocity, each [orbit, instant], in order; NaN where padded. Velocity jumps at a rigid
         wall.
     """
-    full = unfolded(orbit)
-    rows = jax.jit(jax.vmap(partial(_path, samples)))(full.pair, full.sequence, full.knots)
-    t, u, v = (np.asarray(x).reshape(len(full), -1) for x in rows)
-    return t, u, v
-
-
-def _path(samples: int, pair: ImpactPair, sequence: Sequence, knots):
-    passage = shooting.passages(pair, sequence, knots)
-    share = jnp.linspace(0.0, 1.0, samples)
-
-    def one(real, side, knot, out, leaves, arrives):
-        t, speed, stay = knot
-        inside = share * stay
-        w, z = jnp.zeros_like(share), jnp.full_like(share, speed)
-        if pair.kappa is not None:
-            force, wall = flow.contact_force(pair.gamma, side, t), flow.membrane(pair, rolled=True)
-            start = jnp.zeros_like(t)
-            w, z = jax.vmap(lambda s: flow.oscillate(wall, force, start, speed, s))(inside)
-        aloft = share * (arrives - leaves)
-        rise, v = jax.vmap(lambda s: flow.flight(pair.gamma, leaves, -side * out, s))(aloft)
-        u = jnp.concatenate([side * (0.5 * pair.d + w), 0.5 * side * pair.d + rise])
-        rows = jnp.concatenate([t + inside, leaves + aloft]), u, jnp.concatenate([side * z, v])
-        return jax.tree.map(lambda x: jnp.where(real, x, jnp.nan), rows)
-
-    return jax.vmap(one)(sequence.real, passage.side, knots, passage.speed, passage.t, passage.next_t)
+    full, hits = unfolded(orbit), impacts(orbit)
+    until = _compiled_passages(full.pair, full.sequence, full.knots).next_t
+    t, stay, side = full.knots[..., 0], full.knots[..., 2], hits.side.astype(until.dtype)
+    rows = jax.vmap(partial(pieces, samples=samples))(full.pair, t, side, hits.v_in, hits.v_out, stay, until)
+    clock, u, v = (np.where(full.sequence.real[..., None], row, np.nan).reshape(len(full), -1) for row in rows)
+    return clock, u, v

@@ -93,16 +93,13 @@ def _compiled():
 
 def _advance(pair: ImpactPair, states: State, periods: int) -> tuple[State, np.ndarray, _Step, np.ndarray]:
     """Balls some steps on: where they are, which have arrived, the steps [ball, step], which of these were taken."""
-    count = states.u.size
     parts = []
-    for first in range(0, count, _TILE):
-        index = np.minimum(np.arange(first, first + _TILE), count - 1)
-        args = jax.tree.map(lambda x, index=index: x[index], (pair, states))
-        idle = np.arange(first, first + _TILE) >= count
+    for tile in lanes.tiles(states.u.size, (_TILE,)):
+        args = jax.tree.map(lambda x, rows=tile.rows: x[rows], (pair, states))
+        idle = np.arange(_TILE) >= tile.real
         (after, over), (steps, real) = _compiled()(*args, idle, np.int32(periods))
         steps, real = jax.tree.map(lambda x: np.asarray(x).swapaxes(0, 1), (steps, real))
-        whole = jax.tree.map(lambda x, idle=idle: np.asarray(x)[~idle], (after, over, steps, real))
-        parts.append(whole)
+        parts.append(jax.tree.map(lambda x, real=tile.real: np.asarray(x)[:real], (after, over, steps, real)))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
@@ -134,8 +131,7 @@ def _strobes(pair: ImpactPair, ball: np.ndarray, steps: Any, count: int, periods
     apart = 2.0 * (clock.max() - clock.min() + 2 * periods)
     index = np.searchsorted(ball * apart + clock, cell * apart + 2.0 * period, side="right") - 1
     when = 2.0 * (period - steps.begun.n[index]) - steps.begun.t[index]
-    for first in range(0, cell.size, _STROBES):
-        some = np.minimum(np.arange(first, first + _STROBES), cell.size - 1)
+    for some, _ in lanes.tiles(cell.size, (_STROBES,)):
         taken = jax.tree.map(lambda x, some=some: x[index[some]], steps)
         own = jax.tree.map(lambda x, some=some: x[cell[some]], pair)
         at = _compiled_balls()(own, taken, when[some])
