@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import lru_cache, partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -87,9 +88,10 @@ def next_impacts(
         tangent=False,
         variants=1,
     )
-    zero = jnp.zeros_like(t)
+    pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
+    zero: Any = np.zeros_like(t)
     ball = Lanes(0.5 * side * pair.d, -side * speed, t, zero)
-    requests = jax.tree.map(np.asarray, trips.Request(pair, ball, zero, zero + _HORIZON))
+    requests = trips.Request(pair, ball, zero, zero + _HORIZON)
     # What one step is not sure of is left to the next, which costs several times as much.
     steps = [trips.sampled_answer, trips.careful_answer]
     found, sure = _answered(_compiled(_quick_answer if level else steps.pop(0), plan), requests)

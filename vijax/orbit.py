@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from vijax import flow, lanes, shooting
 from vijax.curve import pieces
 from vijax.energy import harvested_energy
-from vijax.impact_map import next_impacts
+from vijax.impact_map import Next, next_impacts
 from vijax.method import whole
 from vijax.model import Harvester, Impact, ImpactPair, Status, check
 from vijax.shooting import Sequence
@@ -84,26 +84,44 @@ def _level(pair: ImpactPair) -> bool:
 
 def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
     """The work on every row, in padded tiles of few sizes so that few programs are compiled, a thread a core."""
+    # Rows are cut and joined by numpy: an eager JAX operation costs more than what it does to a tile.
+    rows = jax.tree.map(np.asarray, rows)
 
     def part(tile: lanes.Tile) -> Orbit:
-        return work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))[: tile.real]
+        found = work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[: tile.real], found)
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         found = list(pool.map(part, lanes.tiles(jax.tree.leaves(rows)[0].shape[0], _TILES)))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *found)
 
 
-def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]):
+class _Claim(NamedTuple):
+    """Knots that are to be an orbit's, and where the ball is to fly from the end of every contact."""
+
+    knots: Float[Array, "orbit impact 3"]
+    residual: Float[Array, "orbit"]
+    multipliers: Complex[Array, "orbit 2"]
+    passage: shooting.Passage
+    phase: Float[Array, "orbit impact"]
+    periods: Float[Array, "orbit impact"]
+
+
+def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]) -> _Claim:
     knots, residual = shooting.newton(pair, sequence, guess)
     touches = (sequence.real & (knots[..., 1] < _TOUCH)).any(axis=1)
-    residual = jnp.where(touches, jnp.inf, residual)
-    return knots, residual, _once_around(pair, sequence, knots)
+    return _claim(pair, sequence, knots, jnp.where(touches, jnp.inf, residual))
 
 
-def _once_around(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
-    """Multipliers, and the passages to verify."""
+def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> _Claim:
+    residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
+    return _claim(pair, sequence, knots, residual)
+
+
+def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[Array, "orbit"]) -> _Claim:
     around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
-    return floquet(around, sequence.mirrored), jax.vmap(shooting.passages)(pair, sequence, knots)
+    passage = jax.vmap(shooting.passages)(pair, sequence, knots)
+    return _Claim(knots, residual, floquet(around, sequence.mirrored), passage, *flow.wrap_phase(passage.t))
 
 
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
@@ -112,32 +130,28 @@ def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impa
 
 
 @lru_cache(maxsize=2)
-def _compiled(work: Callable[..., tuple]) -> Callable[..., tuple]:
+def _compiled(work: Callable[..., _Claim]) -> Callable[..., _Claim]:
     return jax.jit(work, compiler_options=lanes.compiler_options())
 
 
-def _tile(solved: Callable[..., tuple], level: bool, rows: tuple) -> Orbit:
-    pair, sequence, knots = rows
-    knots, residual, around = solved(pair, sequence, knots)
-    return _verify(pair, sequence, knots, residual, around, level)
-
-
-def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]):
-    residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
-    return knots, residual, _once_around(pair, sequence, knots)
-
-
-def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level: bool) -> Orbit:
+def _tile(solved: Callable[..., _Claim], level: bool, rows: tuple) -> Orbit:
     """Fly from the end of every contact: the impact map must meet the next impact, and end its contact in time."""
-    multipliers, passage = around
-    real = sequence.real
-    found = jnp.isfinite(residual) & real.any(axis=1)
-    wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], real.shape).reshape(-1), pair)
-    phase, periods = flow.wrap_phase(passage.t)
-    flown = next_impacts(wide, passage.side.reshape(-1), passage.speed.reshape(-1), phase.reshape(-1), level=level)
-    flown = jax.tree.map(lambda leaf: leaf.reshape(real.shape), flown)
-    miss = jnp.abs(flown.t + 2 * periods - passage.next_t) + jnp.abs(flown.side * flown.v_in - passage.next_speed)
-    miss = miss + jnp.abs(flown.duration - passage.next_stay)
+    pair, sequence, guess = rows
+    claim = solved(pair, sequence, guess)
+    shape = sequence.side.shape
+    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf[:, None], shape), pair)
+    balls = (wide, claim.passage.side, claim.passage.speed, claim.phase)
+    flown = next_impacts(*jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1), balls), level=level)
+    return _judged(pair, sequence, claim, jax.tree.map(lambda leaf: leaf.reshape(shape), flown))
+
+
+@jax.jit
+def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) -> Orbit:
+    """What the flights say of the claims."""
+    real, passage = sequence.real, claim.passage
+    found = jnp.isfinite(claim.residual) & real.any(axis=1)
+    miss = jnp.abs(flown.t + 2 * claim.periods - passage.next_t)
+    miss = miss + jnp.abs(flown.side * flown.v_in - passage.next_speed) + jnp.abs(flown.duration - passage.next_stay)
     met = flown.real & (flown.side == passage.next_side) & (miss < _SAME)
     verified = found & (met | ~real).all(axis=1)
     status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
@@ -147,15 +161,15 @@ def _verify(pair: ImpactPair, sequence: Sequence, knots, residual, around, level
     before = jnp.where(place == 0, real.sum(axis=1, dtype=jnp.int32)[:, None] - 1, place - 1)
     depth, work = (jnp.take_along_axis(leaf, before, axis=1) for leaf in (flown.depth, flown.work))
     # The first impact is put into the first period.
-    knots = knots.at[..., 0].add(-2 * jnp.floor(0.5 * knots[:, :1, 0]))
+    knots = claim.knots.at[..., 0].add(-2 * jnp.floor(0.5 * claim.knots[:, :1, 0]))
     return Orbit(
         pair=pair,
         sequence=sequence,
         knots=jnp.where((real & found[:, None])[..., None], knots, jnp.nan),
         depth=jnp.where(good, depth, jnp.nan),
         work=jnp.where(good, work, jnp.nan),
-        multipliers=jnp.where(found[:, None], multipliers, jnp.nan),
-        residual=residual,
+        multipliers=jnp.where(found[:, None], claim.multipliers, jnp.nan),
+        residual=claim.residual,
         status=status,
     )
 

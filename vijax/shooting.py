@@ -52,27 +52,62 @@ class Linear(NamedTuple):
     slope: Float[Array, "3*impact unknown"]
 
 
-def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]):
-    """Penetration at the end of the contact over its length, and w' there."""
+class _Contact(NamedTuple):
+    """The end of a contact: penetration there over the contact's length, and w'; each in onset, speed and length."""
+
+    place: Float[Array, ""]
+    rate: Float[Array, ""]
+    place_slope: Float[Array, "3"]
+    rate_slope: Float[Array, "3"]
+
+
+def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
+    """A contact and its derivatives: all of them follow from the free response and the forcing at both ends.
+
+    An onset moved at the same length moves the whole motion, less the free motion of what the state at the onset gains.
+    Automatic derivatives would run a tangent of the closed form for every unknown, at five times the cost.
+    """
     t, speed, stay, _, _ = knot
+    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
     if pair.kappa is None:
-        return stay, -pair.r * speed
-    force = flow.contact_force(pair.gamma, side, t)
-    w, rate = flow.oscillate(flow.membrane(pair, rolled=True), force, jnp.zeros_like(t), speed, stay)
-    return w / stay, rate
+        return _Contact(stay, -pair.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -pair.r, zero]))
+    wall, force = flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t)
+    w, rate = flow.oscillate(wall, force, zero, speed, stay)
+    h, slope = flow.free_response(wall, stay)
+    square, begin = wall.kappa * wall.kappa, force.c - force.g
+    push = force.at(stay) - wall.mu * rate - square * w
+    onset = rate - slope * speed - h * begin
+    rate_onset = push + square * h * speed - slope * (begin - wall.mu * speed)
+    return _Contact(
+        w / stay,
+        rate,
+        jnp.stack([onset, h, rate - w / stay]) / stay,
+        jnp.stack([rate_onset, slope, push]),
+    )
 
 
-def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> Float[Array, "3"]:
-    """Equations of one contact and the flight after it to the wall `onward`; `knot` ends with the next time and speed.
+def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Float[Array, "3"], Float[Array, "3 5"]]:
+    """Equations of one contact and the flight after it to the wall `onward`, and their derivatives in the knot.
 
-    Divided by the contact's length, and by the flight's where it returns to its wall: no trivial root at length zero.
+    `knot` ends with the next time and speed. Divided by the contact's length, and by the flight's where it returns to
+    its wall: no trivial root at length zero.
     """
     t, _, stay, next_t, next_speed = knot
-    first, rate = _contact(pair, side, knot)
-    length = next_t - t - stay
-    rise, v = flow.flight(pair.gamma, t + stay, side * rate, length)
-    place = jnp.where(side == onward, rise / length, rise - onward * pair.d)
-    return jnp.stack([first, place, onward * v - next_speed])
+    contact = _contact(pair, side, knot)
+    leave, length, speed = t + stay, next_t - t - stay, side * contact.rate
+    rise, v = flow.flight(pair.gamma, leave, speed, length)
+    # In (onset, speed, stay, next onset, next speed): how each end of the flight moves.
+    unit = jnp.eye(5, dtype=knot.dtype)
+    d_leave, d_next, d_next_speed = unit[0] + unit[2], unit[3], unit[4]
+    d_speed = side * jnp.pad(contact.rate_slope, (0, 2))
+    push = flow.acceleration(pair.gamma, leave)
+    d_rise = v * d_next + length * d_speed - (speed + length * push) * d_leave
+    d_v = flow.acceleration(pair.gamma, next_t) * d_next + d_speed - push * d_leave
+    back = side == onward
+    place = jnp.where(back, rise / length, rise - onward * pair.d)
+    d_place = jnp.where(back, (d_rise - rise / length * (d_next - d_leave)) / length, d_rise)
+    value = jnp.stack([contact.place, place, onward * v - next_speed])
+    return value, jnp.stack([jnp.pad(contact.place_slope, (0, 2)), d_place, onward * d_v - d_next_speed])
 
 
 def _following(sequence: Sequence):
@@ -99,7 +134,7 @@ def _joined(sequence: Sequence, knots: Knots):
 def gap(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "3*impact"]:
     """What is missing to an orbit: zero at one, and where there is no impact."""
     side, wall, joined = _joined(sequence, knots)
-    pieces = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
+    pieces, _ = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
 
@@ -110,15 +145,8 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactP
         moved: Change of the pair along a parameter, whose derivative becomes the last column.
     """
     side, wall, joined = _joined(sequence, knots)
-    if moved is not None:
-        joined = jnp.concatenate([joined, jnp.zeros_like(joined[:, :1])], axis=1)
-
-    def both(knot, side, wall):
-        there = pair if moved is None else jax.tree.map(lambda x, dx: x + knot[5] * dx, pair, moved)
-        value = _pieces(there, side, wall, knot[:5])
-        return value, value
-
-    blocks, pieces = jax.vmap(jax.jacfwd(both, has_aux=True))(joined, side, wall)
+    each = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))
+    pieces, blocks = each(pair, side, wall, joined)
     real, width = sequence.real, knots.shape[0]
     here = jnp.eye(width, dtype=knots.dtype)
     there = jax.nn.one_hot(_following(sequence)[0], width, dtype=knots.dtype)
@@ -129,7 +157,8 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactP
     full = jnp.where(real[:, None, None, None], full, idle)
     slope, missing = full.reshape(3 * width, 3 * width), jnp.where(real[:, None], pieces, 0.0).reshape(-1)
     if moved is not None:
-        change = jnp.where(real[:, None], blocks[..., 5], 0.0)
+        _, change = jax.jvp(lambda pair: each(pair, side, wall, joined)[0], (pair,), (moved,))
+        change = jnp.where(real[:, None], change, 0.0)
         slope = jnp.concatenate([slope, change.reshape(-1, 1)], axis=1)
     return Linear(missing, slope)
 
@@ -150,7 +179,7 @@ def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
     """How each contact ends, and where the flight after it is to lead."""
     side, wall, joined = _joined(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
-    rate = jax.vmap(lambda side, knot: _contact(pair, side, knot)[1])(side, joined)
+    rate = jax.vmap(lambda side, knot: _contact(pair, side, knot).rate)(side, joined)
     next_stay = knots[_following(sequence)[0], 2]
     return Passage(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
 
