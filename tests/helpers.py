@@ -80,7 +80,8 @@ def _program(steps: int):
 
         return jax.lax.scan(advance, state, None, length=steps)[1]
 
-    return jax.jit(jax.vmap(one))
+    # Unlike other programs of tests (see conftest) it runs for longer than it takes to compile.
+    return jax.jit(jax.vmap(one), compiler_options={"xla_backend_optimization_level": 1})
 
 
 def march(pair: ImpactPair, state: State, steps: int = STEPS, tile: int = TILE) -> March:

@@ -174,6 +174,7 @@ def test_exponent_of_a_rigid_orbit_follows_from_the_losses_where_its_multipliers
 # --- windows ---------------------------------------------------------------------------------------------------------
 
 WINDOW = dict(transient=10, periods=40)
+WINDOWED = frozenset({"P", "deepest", "lyapunov"})  # one program for all windows
 FEW = PLANE[:24]
 
 
@@ -191,7 +192,7 @@ def recorded():
 
 
 def test_window_counts_the_impacts_with_their_onset_in_it(recorded):
-    found = summarise(FEW, until="window", outputs=frozenset({"P", "deepest"}), **WINDOW)
+    found = summarise(FEW, until="window", outputs=WINDOWED, **WINDOW)
     for i in range(len(FEW)):
         hit = jax.tree.map(lambda leaf, i=i: leaf[i], recorded.impacts)
         inside = (hit.side != 0) & (hit.n >= WINDOW["transient"])
@@ -273,7 +274,7 @@ def test_a_start_inside_a_soft_wall_is_a_contact_without_onset():
 
 def test_a_window_has_an_exponent_too():
     orbit = next(orbit for orbit in ORBITS if orbit["gamma"] == 0)
-    window = summarise([orbit_cell(orbit)], 200, until="window", outputs=frozenset({"lyapunov"}))
+    window = summarise([orbit_cell(orbit)], 200, until="window", outputs=WINDOWED)
     assert window.lyapunov[0] == pytest.approx(largest_exponent(orbit), abs=0.05)
 
 

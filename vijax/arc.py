@@ -68,9 +68,8 @@ class Arc(eqx.Module):
 
 
 def unpack(arc: Arc, y):
-    """Knots and parameter of a point of the curve."""
-    width = arc.sequence.side.shape[0]
-    return y[:-1].reshape(width, 3), y[-1] * (arc.high - arc.low)
+    """Knots and parameter of a point of the curve, or of many along leading axes."""
+    return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (arc.high - arc.low)
 
 
 def _equations(arc: Arc, y) -> shooting.Linear:
@@ -205,6 +204,6 @@ def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -
     """From points of branches on by an arclength each: the compiled program behind every step and every search."""
     parts = []
     for tile in lanes.tiles(y.shape[0], _BATCHES):
-        rows = jax.tree.map(lambda leaf, rows=tile.rows: jnp.asarray(leaf)[rows], (arcs, y, tangent, length))
+        rows = jax.tree.map(lambda leaf, rows=tile.rows: np.asarray(leaf)[rows], (arcs, y, tangent, length))
         parts.append(jax.tree.map(lambda leaf, real=tile.real: np.asarray(leaf)[:real], _compiled(*rows)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

@@ -79,7 +79,7 @@ def _follow(arcs: Arc, first: Place, along: str, points: int) -> list["Branch"]:
 def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, test: np.ndarray, low_f: np.ndarray):
     """Arclengths from points of a branch at which test functions vanish, the points, and which are zeros, no poles."""
     rows = np.arange(test.size)
-    arcs = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
+    arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
 
     def look(s):
         at = advance(arcs, y, tangent, s)
@@ -208,7 +208,9 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
     size, (low, high) = len(orbit), within
     ratio = jnp.full(size, device.s / device.A)
     arcs = Arc(orbit.pair, orbit.sequence, ratio, jnp.full(size, low), jnp.full(size, high), along)
-    knots = jnp.where(orbit.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
+    # By NumPy from here on: branches differ in length, and JAX would compile a program for each.
+    arcs = jax.tree.map(np.asarray, arcs)
+    knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 
@@ -288,16 +290,16 @@ def _kind(arc: Arc, event: _Event, neighbours: np.ndarray) -> str:
 
 def _orbits(arc: Arc, ys: np.ndarray) -> Orbit:
     """Points of a branch as orbits, verified."""
-    wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(ys), *leaf.shape)), arc)
-    knots, x = jax.vmap(unpack)(wide, jnp.asarray(ys))
-    return orbits.proven(jax.vmap(Arc.at)(wide, x), wide.sequence, knots)
+    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), arc)
+    knots, x = unpack(wide, ys)
+    return orbits.proven(wide.at(x), wide.sequence, knots)
 
 
 def _joined(down: Branch, up: Branch) -> Branch:
     """Two ways from one start as one branch, from end to end; where it closes one way is all of it."""
     if down.ends[1] == "closed":
         return down
-    orbit = jax.tree.map(lambda a, b: jnp.concatenate([a[::-1], b[1:]]), down.orbit, up.orbit)
+    orbit = orbits.concatenate([down.orbit[::-1], up.orbit[1:]])
     values = np.concatenate([down.values[::-1], up.values[1:]])
     return Branch(down.along, values, orbit, down.points[::-1] + up.points, (down.ends[1], up.ends[1]))
 
@@ -329,7 +331,7 @@ def switch(
     arcs, y = _set_out(doubled, along, within, device)
     knots = y[0, :-1].reshape(-1, 3)
     pair, sequence = jax.tree.map(lambda x: x[0], (doubled.pair, doubled.sequence))
-    slope = np.asarray(shooting.linearise(pair, sequence, knots).slope)
+    slope = np.asarray(jax.jit(shooting.linearise)(pair, sequence, knots).slope)
     away = np.append(np.linalg.svd(slope)[2][-1], 0.0)[None]
     # Test functions that vanish here would be met again at once.
     first = Place(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))

@@ -59,7 +59,8 @@ class Orbit(eqx.Module):
 
     def __getitem__(self, index: Any) -> "Orbit":
         """Some of the orbits, by an index array, a mask or a slice."""
-        return jax.tree.map(lambda leaf: leaf[index], self)
+        # Not by JAX, which compiles a program for every slice and every number of orbits.
+        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[index]), self)
 
     def __len__(self) -> int:
         return self.knots.shape[0]
@@ -93,6 +94,11 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         found = list(pool.map(part, lanes.tiles(jax.tree.leaves(rows)[0].shape[0], _TILES)))
+    return concatenate(found)
+
+
+def concatenate(found: list[Orbit]) -> Orbit:
+    """Orbits of one number of impacts as one batch."""
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *found)
 
 
@@ -258,7 +264,7 @@ def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses
     every, period = sequences(impacts, period)
     draw = np.random.default_rng(seed)
     found = [_search(pair, walls, period, guesses, draw) for walls in every]
-    return distinct(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found))
+    return distinct(concatenate(found))
 
 
 def _check_pair(pair: ImpactPair) -> None:
@@ -306,27 +312,31 @@ def distinct(orbit: Orbit) -> Orbit:
     return orbit[np.sort(good[first])]
 
 
-def marks(orbit: Orbit) -> Float[Array, "orbit 6"]:
+# What follows asks about orbits in any number: by NumPy, as JAX would compile a program for each number.
+
+
+def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
     """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
-    t, speed, stay = jnp.moveaxis(orbit.knots, -1, 0)
-    signed = orbit.sequence.side.astype(speed.dtype) * speed
+    t, speed, stay = np.moveaxis(np.asarray(orbit.knots), -1, 0)
+    signed = np.asarray(orbit.sequence.side) * speed
     # Odd harmonics are alike for mirror images, (side, t) -> (-side, t + 1); even ones change sign.
-    waves = [wave(jnp.pi * order * t) for order in (1, 2) for wave in (jnp.cos, jnp.sin)]
+    waves = [wave(np.pi * order * t) for order in (1, 2) for wave in (np.cos, np.sin)]
     parts = [*(signed * wave for wave in waves), signed + speed, stay * speed]
-    return jnp.stack([jnp.nansum(part, axis=-1) for part in parts], axis=-1)
+    return np.stack([np.nansum(part, axis=-1) for part in parts], axis=-1)
 
 
-def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[Array, "orbit"]:
+def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"]:
     """Whether each orbit, run through once, is its own mirror image half a span later."""
-    count = orbit.count
-    index = jnp.arange(orbit.knots.shape[1], dtype=jnp.int32)
-    half = jnp.where(index < (count // 2)[:, None], index + (count // 2)[:, None], index)
-    wait = jnp.array([0.5, 0.0, 0.0]) * orbit.sequence.span[:, None, None]
-    moved = jnp.take_along_axis(orbit.knots, half[..., None], axis=1) - orbit.knots - wait
-    opposite = jnp.take_along_axis(orbit.sequence.side, half, axis=1) == -orbit.sequence.side
+    host = jax.tree.map(np.asarray, orbit)
+    count = host.count
+    index = np.arange(host.knots.shape[1])
+    half = np.where(index < (count // 2)[:, None], index + (count // 2)[:, None], index)
+    wait = np.array([0.5, 0.0, 0.0]) * host.sequence.span[:, None, None]
+    moved = np.take_along_axis(host.knots, half[..., None], axis=1) - host.knots - wait
+    opposite = np.take_along_axis(host.sequence.side, half, axis=1) == -host.sequence.side
     first = index < (count // 2)[:, None]
-    same = (jnp.abs(moved).max(axis=2) < tolerance) & opposite
-    return orbit.sequence.mirrored | ((count % 2 == 0) & (orbit.pair.gamma == 0) & (same | ~first).all(axis=1))
+    same = (np.abs(moved).max(axis=2) < tolerance) & opposite
+    return host.sequence.mirrored | ((count % 2 == 0) & (host.pair.gamma == 0) & (same | ~first).all(axis=1))
 
 
 def halved(orbit: Orbit) -> Orbit:
@@ -339,39 +349,41 @@ def halved(orbit: Orbit) -> Orbit:
         raise ValueError(f"orbit must be symmetric to be closed half way; got {np.asarray(symmetric(orbit))}")
     if bool(orbit.sequence.mirrored.all()):
         return orbit
-    index = jnp.arange(orbit.knots.shape[1], dtype=jnp.int32)
-    kept = index < (orbit.count // 2)[:, None]
-    width = orbit.knots.shape[1] // 2
-    side = jnp.where(kept, orbit.sequence.side, 0)[:, :width]
-    sequence = Sequence(side, 0.5 * orbit.sequence.span, jnp.ones_like(orbit.sequence.mirrored))
-    return solve(orbit.pair, sequence, jnp.where(kept[..., None], orbit.knots, 0.0)[:, :width])
+    host = jax.tree.map(np.asarray, orbit)
+    kept = np.arange(host.knots.shape[1]) < (host.count // 2)[:, None]
+    width = host.knots.shape[1] // 2
+    side = np.where(kept, host.sequence.side, 0)[:, :width]
+    sequence = Sequence(jnp.asarray(side), 0.5 * host.sequence.span, jnp.ones(len(orbit), bool))
+    return solve(host.pair, sequence, jnp.asarray(np.where(kept[..., None], host.knots, 0.0)[:, :width]))
 
 
 def doubled(orbit: Orbit) -> Orbit:
     """Orbits run through twice, or in full where they were closed half way."""
-    return _unfolded(orbit, jnp.ones_like(orbit.sequence.mirrored))
+    return _unfolded(orbit, np.ones(len(orbit), bool))
 
 
 def unfolded(orbit: Orbit) -> Orbit:
     """Orbits in full, those closed half way too."""
-    return _unfolded(orbit, orbit.sequence.mirrored) if bool(orbit.sequence.mirrored.any()) else orbit
+    mirrored = np.asarray(orbit.sequence.mirrored)
+    return _unfolded(orbit, mirrored) if mirrored.any() else orbit
 
 
-def _unfolded(orbit: Orbit, twice: Bool[Array, "orbit"]) -> Orbit:
+def _unfolded(orbit: Orbit, twice: Bool[np.ndarray, "orbit"]) -> Orbit:
     """The second turn appended to the first where asked."""
-    count, width = orbit.count[:, None], orbit.knots.shape[1]
-    index = jnp.arange(2 * width, dtype=jnp.int32)
+    host = jax.tree.map(np.asarray, orbit)
+    count, width = host.count[:, None], host.knots.shape[1]
+    index = np.arange(2 * width)
     again = index >= count
-    from_first = jnp.where(again, index - count, index)
+    from_first = np.where(again, index - count, index)
     there = (index < count) | (twice[:, None] & again & (index < 2 * count))
-    from_first = jnp.clip(from_first, 0, width - 1)
-    side = jnp.take_along_axis(orbit.sequence.side, from_first, axis=1)
-    side = jnp.where(again & orbit.sequence.mirrored[:, None], -side, side)
-    knots = jnp.take_along_axis(orbit.knots, from_first[..., None], axis=1)
-    knots = knots.at[..., 0].add(jnp.where(again, orbit.sequence.span[:, None], 0.0))
-    span = jnp.where(twice, 2 * orbit.sequence.span, orbit.sequence.span)
-    sequence = Sequence(jnp.where(there, side, 0), span, orbit.sequence.mirrored & ~twice)
-    return proven(orbit.pair, sequence, jnp.where(there[..., None], knots, 0.0))
+    from_first = np.clip(from_first, 0, width - 1)
+    side = np.take_along_axis(host.sequence.side, from_first, axis=1)
+    side = np.where(again & host.sequence.mirrored[:, None], -side, side)
+    knots = np.take_along_axis(host.knots, from_first[..., None], axis=1)
+    knots[..., 0] += np.where(again, host.sequence.span[:, None], 0.0)
+    span = np.where(twice, 2 * host.sequence.span, host.sequence.span)
+    sequence = Sequence(jnp.asarray(np.where(there, side, 0)), jnp.asarray(span), host.sequence.mirrored & ~twice)
+    return proven(host.pair, sequence, jnp.asarray(np.where(there[..., None], knots, 0.0)))
 
 
 _compiled_passages = jax.jit(jax.vmap(shooting.passages))
@@ -380,27 +392,27 @@ _compiled_passages = jax.jit(jax.vmap(shooting.passages))
 class Counts(NamedTuple):
     """Label of orbits: impacts on the left, on the right, per forcing periods; n:m/pT."""
 
-    left: Int[Array, "orbit"]
-    right: Int[Array, "orbit"]
-    period: Int[Array, "orbit"]
+    left: Int[np.ndarray, "orbit"]
+    right: Int[np.ndarray, "orbit"]
+    period: Int[np.ndarray, "orbit"]
 
 
 def counts(orbit: Orbit) -> Counts:
     """What is in the label of each orbit, over the smallest whole number of periods after which it recurs."""
-    full = unfolded(orbit)
+    full = jax.tree.map(np.asarray, unfolded(orbit))
     side, number = full.sequence.side, full.count
-    period = jnp.round(0.5 * full.sequence.span).astype(jnp.int32)
-    index = jnp.arange(side.shape[1], dtype=jnp.int32)
-    turns = jnp.ones_like(period)
+    period = np.round(0.5 * full.sequence.span).astype(int)
+    index = np.arange(side.shape[1])
+    turns = np.ones_like(period)
     for parts in range(2, int(period.max(initial=1)) + 1):
-        shift = jnp.where(number % parts == 0, number // parts, 0)[:, None]
-        there = jnp.minimum(index + shift, side.shape[1] - 1)
-        wait = jnp.array([1.0, 0.0, 0.0]) * (full.sequence.span / parts)[:, None, None]
-        moved = jnp.take_along_axis(full.knots, there[..., None], axis=1) - full.knots - wait
-        same = (jnp.abs(moved).max(axis=2) < _SAME) & (jnp.take_along_axis(side, there, axis=1) == side)
+        shift = np.where(number % parts == 0, number // parts, 0)[:, None]
+        there = np.minimum(index + shift, side.shape[1] - 1)
+        wait = np.array([1.0, 0.0, 0.0]) * (full.sequence.span / parts)[:, None, None]
+        moved = np.take_along_axis(full.knots, there[..., None], axis=1) - full.knots - wait
+        same = (np.abs(moved).max(axis=2) < _SAME) & (np.take_along_axis(side, there, axis=1) == side)
         recurs = (period % parts == 0) & (shift[:, 0] > 0) & (same | (index >= number[:, None] - shift)).all(axis=1)
-        turns = jnp.where(recurs, parts, turns)
-    left, right = ((side == wall).sum(axis=1, dtype=jnp.int32) for wall in (-1, 1))
+        turns = np.where(recurs, parts, turns)
+    left, right = ((side == wall).sum(axis=1) for wall in (-1, 1))
     return Counts(left // turns, right // turns, period // turns)
 
 
