@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import flow, lanes, shooting
+from vijax import clearance, flow, lanes, shooting
 from vijax.model import ImpactPair
 from vijax.shooting import Sequence
 
@@ -21,8 +21,6 @@ ALONG = ("d", "kappa", "r", "gamma", "omega")
 CLOSE = 1e-11  # size of the last correction
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
 _ROUNDS = 6  # Newton corrections of a step, at most
-_SAMPLES = 48  # of a flight or contact, to find its extrema
-_NOTHING = 1.0  # clearance where there is nothing to clear
 
 
 class Tests(NamedTuple):
@@ -105,74 +103,20 @@ def _correct(arc: Arc, guess, former) -> _Arrival:
     return lax.while_loop(going, once, _Arrival(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
 
 
-def _turning_points(position, velocity, acceleration, length):
-    """Positions at the zeros of the velocity inside a stretch, and its sign before each; NaN where there is none."""
-    s = jnp.linspace(0.0, 1.0, _SAMPLES + 1) * length
-    v = velocity(s)
-    low, high, before, after = s[:-1], s[1:], v[:-1], v[1:]
-    turns = before * after < 0
-    at = low + (high - low) * before / jnp.where(turns, before - after, 1.0)
-    for _ in range(2):
-        at = jnp.clip(at - velocity(at) / acceleration(at), low, high)
-    return jnp.where(turns, position(at), jnp.nan), before
-
-
-def _flight_room(pair: ImpactPair, passage: shooting.Passage):
-    """Least distance from a wall at a turning point of the flight that follows each contact."""
-
-    def one(side, speed, t, next_t):
-        place = lambda s: 0.5 * side * pair.d + flow.flight(pair.gamma, t, -side * speed, s)[0]  # noqa: E731
-        velocity = lambda s: flow.flight(pair.gamma, t, -side * speed, s)[1]  # noqa: E731
-        u, before = _turning_points(place, velocity, lambda s: flow.acceleration(pair.gamma, t + s), next_t - t)
-        room = jnp.where(before > 0, 0.5 * pair.d - u, 0.5 * pair.d + u)
-        return jnp.nanmin(jnp.append(room, _NOTHING))
-
-    return jax.vmap(one)(passage.side, passage.speed, passage.t, passage.next_t)
-
-
-def _contact_room(pair: ImpactPair, passage: shooting.Passage, knots):
-    """Least penetration at a turning point inside each contact where it is a minimum."""
-    if pair.kappa is None:
-        return jnp.full(passage.side.shape, _NOTHING)
-    wall = flow.membrane(pair, rolled=True)
-
-    def one(side, knot):
-        t, speed, stay = knot
-        force = flow.contact_force(pair.gamma, side, t)
-
-        def motion(s):
-            return jax.vmap(lambda s: flow.oscillate(wall, force, jnp.zeros_like(s), speed, s))(s)
-
-        def bend(s):
-            w, rate = motion(s)
-            return jax.vmap(force.at)(s) - wall.mu * rate - wall.kappa * wall.kappa * w
-
-        w, before = _turning_points(lambda s: motion(s)[0], lambda s: motion(s)[1], bend, jnp.maximum(stay, 0.0))
-        return jnp.nanmin(jnp.append(jnp.where(before < 0, w, jnp.nan), _NOTHING))
-
-    return jax.vmap(one)(passage.side, knots)
-
-
 def _tests(arc: Arc, y, tangent) -> Tests:
     knots, x = unpack(arc, y)
-    pair, real = arc.at(x), arc.sequence.real
+    pair = arc.at(x)
     around = shooting.monodromy(pair, arc.sequence, knots)
     trace, determinant = around[0, 0] + around[1, 1], jnp.linalg.det(around)
-    # Padded impacts are given harmless knots.
-    knots = jnp.where(real[:, None], knots, 1.0)
-    passage = shooting.passages(pair, arc.sequence, knots)
-
-    def least(values):
-        return jnp.where(real, values, _NOTHING).min()
-
+    room = clearance.clearance(pair, arc.sequence, knots)
     return Tests(
         fold=tangent[-1],
         plus=1 - trace + determinant,
         minus=1 + trace + determinant,
-        speed=least(knots[:, 1]),
-        flight=least(_flight_room(pair, passage)),
-        contact=least(_contact_room(pair, passage, knots)),
-        exit=jnp.full_like(x, _NOTHING) if pair.kappa is None else least(passage.speed / knots[:, 1]),
+        speed=room.speed,
+        flight=room.flight,
+        contact=room.contact,
+        exit=room.exit,
         low=x - arc.low,
         high=arc.high - x,
     )

@@ -27,6 +27,7 @@ class Status(enum.IntEnum):
     NONFINITE = 6  # the state left the finite numbers
     NO_ORBIT = 7  # no periodic orbit was found from the guess
     VIRTUAL = 8  # the equations of an orbit hold, but the ball would meet a wall in between
+    UNSTABLE = 9  # the orbit repels, or is at a bifurcation
 
 
 class State(eqx.Module):

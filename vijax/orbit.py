@@ -19,6 +19,7 @@ from vijax import flow, lanes, shooting
 from vijax.curve import pieces
 from vijax.energy import harvested_energy
 from vijax.impact_map import Next, next_impacts
+from vijax.label import label
 from vijax.method import whole
 from vijax.model import Harvester, Impact, ImpactPair, Status, check
 from vijax.shooting import Sequence
@@ -414,6 +415,12 @@ def counts(orbit: Orbit) -> Counts:
         turns = np.where(recurs, parts, turns)
     left, right = ((side == wall).sum(axis=1) for wall in (-1, 1))
     return Counts(left // turns, right // turns, period // turns)
+
+
+def labels(orbit: Orbit) -> np.ndarray:
+    """Names n:m/pT of orbits."""
+    found = counts(orbit)
+    return label(found.period, found.left, found.right)
 
 
 def impacts(orbit: Orbit) -> Impact:

@@ -1,0 +1,201 @@
+"""Ascent to a local maximum under bounds and inequality constraints, many starts at once; knows no physics.
+
+An interior-point method: L-BFGS of optax climbs the value plus a logarithmic barrier, whose weight falls as it
+converges. A trial is taken only if it is a point at all, satisfies every constraint and lies higher; else the step is
+halved. So from the first admissible point on, every point is admissible.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+_MEMORY = 8  # pairs of points that L-BFGS keeps
+_FIRST, _LAST = 0.03, 1e-9  # weight of the barrier
+_FALL = 0.1  # of the weight, at a step
+_NEAR = 0.95  # share of the way to a constraint that one step may go
+_ARRIVED = 1e-8  # a step this short is the last
+_STUCK = 1e-9  # so is a trial refused this near
+
+
+class Look(NamedTuple):
+    """What is seen at a point of every start.
+
+    Attributes:
+        value: To be raised.
+        gradient: Of the value.
+        margins: Constraints, each satisfied where it is not negative.
+        slopes: Of the margins.
+        there: Whether the point exists; nothing else is read where it does not.
+        memory: What a look near here starts from; any arrays with a leading axis.
+    """
+
+    value: Float[Array, "start"]
+    gradient: Float[Array, "start variable"]
+    margins: Float[Array, "start constraint"]
+    slopes: Float[Array, "start constraint variable"]
+    there: Bool[Array, "start"]
+    memory: Any
+
+
+class Box(NamedTuple):
+    """Bounds of the variables, and how far one step may go."""
+
+    low: Float[Array, "start variable"]
+    high: Float[Array, "start variable"]
+    radius: float
+
+
+class Climb(eqx.Module):
+    """The ascent of every start; also the loop's state.
+
+    Attributes:
+        z, seen: Where each is, and what is seen there.
+        weight: Of the barrier.
+        step, pace: The full step to try from there, the share of it to try.
+        going: Which are on the way.
+        lost: Which had their last trial refused as it was no point, not for its height or the constraints.
+        looks: Evaluations of each start.
+        path, heights: Variables and values after every evaluation; NaN where the trial was refused.
+        trip: Evaluations of the batch.
+        state: Of optax.
+    """
+
+    z: Float[Array, "start variable"]
+    seen: Look
+    weight: Float[Array, "start"]
+    step: Float[Array, "start variable"]
+    pace: Float[Array, "start"]
+    going: Bool[Array, "start"]
+    lost: Bool[Array, "start"]
+    looks: Int[Array, "start"]
+    path: Float[Array, "look start variable"]
+    heights: Float[Array, "look start"]
+    trip: Int[Array, ""]
+    state: Any
+
+
+def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory: Any, box: Box, looks: int) -> Climb:
+    """Climb from every start, under jit.
+
+    Args:
+        look: (points, the points whose memory is given, that memory) -> what is seen, bounds aside.
+        z: Starts, within the bounds.
+        memory: Of the starts.
+        looks: Evaluations that a start may take, the first one included.
+    """
+    import optax  # here, as importing vijax must not load it
+
+    update = optax.scale_by_lbfgs(_MEMORY)
+
+    def view(z, near, memory) -> Look:
+        """With the bounds among the constraints."""
+        seen = look(z, near, memory)
+        eye = jnp.broadcast_to(jnp.eye(z.shape[1], dtype=z.dtype), (*z.shape, z.shape[1]))
+        return seen._replace(
+            margins=jnp.concatenate([seen.margins, z - box.low, box.high - z], axis=1),
+            slopes=jnp.concatenate([seen.slopes, eye, -eye], axis=1),
+        )
+
+    def aim(z, seen: Look, weight, state):
+        """The next step, and the state of optax after it; afresh where its curvature points down."""
+        ahead = _gradient(seen, weight)
+        step, after = jax.vmap(update.update)(-ahead, state, z)
+        straight, again = jax.vmap(update.update)(-ahead, jax.vmap(update.init)(z), z)
+        sound = (step * ahead).sum(axis=1) < 0
+        step, after = jax.tree.map(lambda a, b: _choose(sound, a, b), (step, after), (straight, again))
+        return _shortened(-step, seen, box.radius), after
+
+    def advance(c: Climb) -> Climb:
+        trial = c.z + c.pace[:, None] * c.step
+        seen = view(trial, c.z, c.seen.memory)
+        better = c.going & seen.there & _higher(c, seen)
+        # Converged for this weight when the step promised less than the barrier weighs.
+        promised = (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
+        inside = _inside(c.seen)
+        falls = better & inside & (c.pace == 1) & (promised < c.weight)
+        weight = jnp.where(falls, jnp.maximum(_FALL * c.weight, _LAST), c.weight)
+        # Curvature compares gradients of one function: that before, under the new weight; none across the border.
+        state = c.state._replace(updates=-_gradient(c.seen, weight))
+        crossed = better & ~inside & _inside(seen)
+        state = jax.tree.map(lambda a, b: _choose(crossed, a, b), jax.vmap(update.init)(c.z), state)
+        z, now = jax.tree.map(lambda a, b: _choose(better, a, b), (trial, seen), (c.z, c.seen))
+        step, state = jax.tree.map(lambda a, b: _choose(better, a, b), aim(z, now, weight, state), (c.step, c.state))
+        length = jnp.abs(step).max(axis=1)
+        settled = better & (length <= _ARRIVED) & (weight <= _LAST)
+        pace = jnp.where(better, jnp.minimum(2 * c.pace, 1.0), 0.5 * c.pace)
+        count = c.looks + c.going.astype(jnp.int32)
+        return Climb(
+            z=z,
+            seen=now,
+            weight=weight,
+            step=step,
+            pace=jnp.where(c.going, pace, c.pace),
+            going=c.going & ~settled & (pace * length > _STUCK) & (count < looks),
+            lost=jnp.where(c.going, ~seen.there, c.lost),
+            looks=count,
+            path=c.path.at[c.trip].set(jnp.where(better[:, None], trial, jnp.nan)),
+            heights=c.heights.at[c.trip].set(jnp.where(better, seen.value, jnp.nan)),
+            trip=c.trip + 1,
+            state=state,
+        )
+
+    starts = z.shape[0]
+    seen = view(z, z, memory)
+    weight = jnp.full(starts, _FIRST, z.dtype)
+    step, state = aim(z, seen, weight, jax.vmap(update.init)(z))
+    blank = jnp.full((looks, *z.shape), jnp.nan, z.dtype)
+    start = Climb(
+        z=z,
+        seen=seen,
+        weight=weight,
+        step=step,
+        pace=jnp.ones(starts, z.dtype),
+        going=seen.there,
+        lost=~seen.there,
+        looks=jnp.ones(starts, jnp.int32),
+        path=blank.at[0].set(jnp.where(seen.there[:, None], z, jnp.nan)),
+        heights=blank[..., 0].at[0].set(jnp.where(seen.there, seen.value, jnp.nan)),
+        trip=jnp.int32(1),
+        state=state,
+    )
+    return lax.while_loop(lambda c: c.going.any() & (c.trip < looks), advance, start)
+
+
+def _choose(which: Bool[Array, "start"], a: Array, b: Array) -> Array:
+    return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+
+def _inside(seen: Look) -> Bool[Array, "start"]:
+    return seen.margins.min(axis=1) > 0
+
+
+def _gradient(seen: Look, weight: Float[Array, "start"]) -> Float[Array, "start variable"]:
+    """Of value and barrier; where a constraint is violated, of the margin that lacks most."""
+    safe = jnp.where(seen.margins > 0, seen.margins, 1.0)
+    barrier = weight[:, None] * (seen.slopes / safe[..., None]).sum(axis=1)
+    worst = seen.margins.argmin(axis=1)[:, None, None]
+    least = jnp.take_along_axis(seen.slopes, worst, axis=1)[:, 0]
+    return jnp.nan_to_num(_choose(_inside(seen), seen.gradient + barrier, least))
+
+
+def _higher(c: Climb, trial: Look) -> Bool[Array, "start"]:
+    """Whether a trial is better: admissible and higher, or nearer to admissible where none is yet."""
+    before, after = (seen.margins.min(axis=1) for seen in (c.seen, trial))
+    gain = trial.value - c.seen.value
+    ratio = jnp.where((c.seen.margins > 0) & (trial.margins > 0), trial.margins / c.seen.margins, 1.0)
+    gain = gain + c.weight * jnp.log(ratio).sum(axis=1)
+    return jnp.where(before > 0, (after > 0) & (gain > 0), after > before)
+
+
+def _shortened(step, seen: Look, radius: float) -> Float[Array, "start variable"]:
+    """As far along a step as the trust region and the linearised constraints allow."""
+    closing = -(seen.slopes * step[:, None]).sum(axis=2)
+    limited = (seen.margins > 0) & (closing > 0)
+    share = jnp.where(limited, _NEAR * seen.margins / jnp.where(limited, closing, 1.0), 1.0)
+    share = jnp.minimum(share.min(axis=1), radius / jnp.maximum(jnp.abs(step).max(axis=1), radius))
+    return jnp.minimum(share, 1.0)[:, None] * step

@@ -1,0 +1,388 @@
+"""The best membrane: designs climb, by exact gradients, from the attractors of a coarse survey to admissible optima.
+
+`optimise` is the line: survey of attractors -> starts -> one jitted ascent of all of them -> distinct optima, verified.
+Where a trial leaves its branch, loses stability or breaks a constraint, it is cut back (`ascent`).
+"""
+
+import itertools
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vijax import lanes
+from vijax import objective as aims
+from vijax import orbit as orbits
+from vijax.ascent import Box, Climb, ascend
+from vijax.axes import START
+from vijax.energy import harvested_energy
+from vijax.method import whole
+from vijax.model import Harvester, ImpactPair, Status
+from vijax.objective import OBJECTIVES, Batch, Scene
+from vijax.orbit import Orbit
+from vijax.shooting import Sequence
+from vijax.steady import Steady, steady
+from vijax.survey import LINKS, survey
+from vijax.tolerance import Tolerance, check_tolerances, nodes
+from vijax.tuning import check_names, limits, moving, tuned, values, variables
+
+_RADIUS = 0.2  # of a step, in the logarithm of a quantity
+_WIDTHS = (2, 8)  # impacts that orbits are padded to
+_TILE = 64  # starts of one compiled call
+_SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
+_ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
+_STARTS = (START, (0.0, 0.25))  # displacement and velocity of the survey's chains, the first in parts of no gap
+_REACH = 0.49  # of the gap that a start's displacement may take
+_LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
+_HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """A design at which an ascent ended, verified.
+
+    Attributes:
+        values: The tuned quantities by name.
+        device: The device that has them.
+        orbit: Its orbit, along a leading axis of one; multipliers are its own.
+        label: n:m/pT of the orbit.
+        height: The objective.
+        state: Energies, depths, margins' parts, condition and clearance of the nominal device; see `Steady`.
+        gradient: Derivative of the objective's logarithm in the logarithm of each quantity (in an inclination itself).
+        active: What holds it there: constraints at which impact, bounds of which quantity.
+        stopped: "maximum"; "supremum", where the objective rises up to the end of the orbit, which no orbit attains;
+            or "looks", when these were spent.
+        looks: Evaluations of objective with gradient that it took.
+        path: Accepted points [look, quantity], the start first, and the objective there.
+        heights: See `path`.
+    """
+
+    values: dict[str, float]
+    device: Harvester
+    orbit: Orbit
+    label: str
+    height: float
+    state: Steady
+    gradient: dict[str, float]
+    active: tuple[str, ...]
+    stopped: str
+    looks: int
+    path: np.ndarray
+    heights: np.ndarray
+
+
+@dataclass(frozen=True)
+class Design:
+    """What was found for one device: the distinct optima, the best first (none if no admissible orbit was found).
+
+    Attributes:
+        optima: See there.
+        tune, bounds: What was tuned, between which values.
+        objective: Of `OBJECTIVES`.
+        tolerances: Of the objective.
+        attractors: Periodic orbits that the survey found.
+        starts: How many of them climbed.
+    """
+
+    optima: tuple[Optimum, ...]
+    tune: tuple[str, ...]
+    bounds: dict[str, tuple[float, float]]
+    objective: str
+    tolerances: tuple[Tolerance, ...]
+    attractors: int
+    starts: int
+
+    @property
+    def best(self) -> Optimum | None:
+        """The highest optimum."""
+        return self.optima[0] if self.optima else None
+
+
+def optimise(device: Harvester | None = None, **settings: Any) -> Design:
+    """The admissible design that harvests most; see `optimise_all`, which takes many devices at once."""
+    return optimise_all([Harvester() if device is None else device], **settings)[0]
+
+
+def optimise_all(
+    devices: Iterable[Harvester],
+    *,
+    tune: Iterable[str] = ("omega0",),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    objective: str = "P",
+    tolerances: Iterable[Tolerance] = (),
+    samples: int | None = None,
+    looks: int = 60,
+    periods: int = 400,
+) -> list[Design]:
+    """The admissible designs that harvest most, each device's tuned quantities between bounds.
+
+    Attractors of a coarse survey, up and down the first quantity, are the starts. All of them climb in one jitted call
+    along exact gradients; an optimum is admissible in every impact (E_j <= W_j, penetration within the device's limit),
+    attracting, and verified by the exact impact map.
+
+    Args:
+        devices: Where quantities that are not tuned are taken from; scalars.
+        tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's.
+        bounds: Of tuned quantities; see `tuning.tuning` for the others.
+        objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P.
+        tolerances: How constants scatter, for "mean" and "worst".
+        samples: Random devices for these, in place of a quadrature.
+        looks: Evaluations of objective with gradient that a start may take.
+        periods: Forcing periods that the survey looks for an attractor in a cell.
+
+    Returns:
+        One `Design` a device.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
+    """
+    devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
+    looks, periods = whole("looks", looks, 2), whole("periods", periods, 1)
+    check_names(tune)
+    _check(devices, objective, scatter)
+    box = np.array([variables(tune, limits(tune, bounds or {}, device)) for device in devices])
+    cloud = nodes(scatter, samples)
+    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
+    met = _survey(devices, tune, box, periods)
+    starts = met.some(_promising(met, objective))
+    ends = _climbed(scene, starts, box, looks)
+    optima = _optima(scene, starts, ends, devices, looks)
+    return [
+        Design(
+            optima=tuple(optima[owner]),
+            tune=tune,
+            bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, box[owner])).T.tolist()), strict=True)),
+            objective=objective,
+            tolerances=scatter,
+            attractors=int((met.owner == owner).sum()),
+            starts=int((starts.owner == owner).sum()),
+        )
+        for owner in range(len(devices))
+    ]
+
+
+def _check(devices: list[Harvester], objective: str, tolerances: tuple[Tolerance, ...]) -> None:
+    if not devices:
+        raise ValueError("devices must hold at least one; got none")
+    if objective not in OBJECTIVES:
+        raise ValueError(f"objective must be among {', '.join(OBJECTIVES)}; got {objective!r}")
+    for device in devices:
+        shapes = {np.shape(x) for x in jax.tree.leaves(device)}
+        if shapes != {()}:
+            raise ValueError(f"device must hold numbers; got shapes {shapes}; give many devices as a list")
+        if not float(device.V):
+            raise ValueError("V must not be zero for a design to harvest; got 0")
+    over = objective in ("mean", "worst")
+    if over != bool(tolerances):
+        need = "come with objective mean or worst" if tolerances else "be given with objective mean or worst"
+        raise ValueError(f"tolerances must {need}; got {len(tolerances)} with objective {objective!r}")
+    check_tolerances(tolerances, bounded=objective == "worst")
+
+
+class _Met(NamedTuple):
+    """Attractors on the way: the orbit, its device with what was tuned there, the variables; where they were met.
+
+    Attributes:
+        owner: Which of the devices given.
+        chain, link: Of the survey.
+        device: Leaves [orbit].
+    """
+
+    orbit: Orbit
+    device: Harvester
+    z: np.ndarray
+    owner: np.ndarray
+    chain: np.ndarray
+    link: np.ndarray
+
+    def some(self, index: np.ndarray) -> "_Met":
+        """Those with the given indices."""
+        return jax.tree.map(lambda x: x[index], self)
+
+
+def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, periods: int) -> _Met:
+    """The attractors of every device, up and down the first quantity that moves the ball, at levels of the others."""
+    first = next((i for i, name in enumerate(tune) if moving(name)), None)
+    ladder = np.linspace(0.0, 1.0, 1 if first is None else LINKS)
+    levels = [(0.5,) if i == first or not moving(name) else _LEVELS for i, name in enumerate(tune)]
+    ways = (ladder, ladder[::-1]) if first is not None else (ladder,)
+    rows: list[np.ndarray] = []
+    mine: list[int] = []
+    begun: list[tuple[float, float]] = []
+    for index, (low, high) in enumerate(box):
+        for place, way, start in itertools.product(itertools.product(*levels), ways, _STARTS):
+            parts = np.tile(np.array(place), (ladder.size, 1))
+            if first is not None:
+                parts[:, first] = way
+            rows.append(low + parts * (high - low))
+            mine.append(index)
+            begun.append(start)
+    z, owner, (u0, v0) = np.array(rows), np.array(mine), np.array(begun).T
+    given = jax.tree.map(lambda *x: np.array(x, float), *devices)
+    wide = jax.tree.map(lambda x: np.repeat(x[owner], ladder.size), given)
+    every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(wide, z.reshape(-1, len(tune)))
+    pair = jax.tree.map(lambda x: np.asarray(x).reshape(owner.size, -1), jax.vmap(lambda d: d.pair())(every))
+    room = _REACH * pair.d[:, 0]
+    found = survey(pair, np.clip(u0, -room, room), v0, periods=periods)
+    cell = found.chain * ladder.size + found.link
+    own = jax.tree.map(lambda x: np.asarray(x)[cell], every)
+    return _Met(found.orbit, own, z.reshape(-1, len(tune))[cell], owner[found.chain], found.chain, found.link)
+
+
+def _promising(met: _Met, objective: str) -> np.ndarray:
+    """Indices of the attractors to climb from: along its chain no neighbour of the same impacts is better."""
+    device, orbit = met.device, met.orbit
+    deep = np.asarray(orbit.depth) * np.asarray(device.length_unit)[:, None]
+    gained = np.asarray(jax.vmap(harvested_energy)(device, jnp.asarray(deep)))
+    given = np.asarray(orbit.work) * np.asarray(device.m_b * device.speed_unit**2)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lacks = np.minimum(np.log(given / gained), np.log(np.asarray(device.depth_limit)[:, None] / deep))
+    lacks = np.nanmin(lacks, axis=1, initial=0.0)
+    value = np.nansum(gained, axis=1) / np.asarray(orbit.sequence.span)
+    if objective == "speed":
+        value = np.nanmax(np.asarray(orbit.knots)[..., 1], axis=1)
+    score = np.where(lacks < 0, _HOPELESS + lacks, np.log(value))
+    side = np.asarray(orbit.sequence.side)
+    alike = (np.diff(met.chain) == 0) & (np.diff(met.link) == 1)
+    alike &= (side[1:] == side[:-1]).all(axis=1) & (np.diff(np.asarray(orbit.sequence.span)) == 0)
+    behind = np.append(False, alike & (score[:-1] > score[1:]))
+    ahead = np.append(alike & (score[1:] > score[:-1]), False)
+    return np.flatnonzero(~behind & ~ahead)
+
+
+@lru_cache(maxsize=8)
+def _compiled(looks: int):
+    def climb(scene: Scene, batch: Batch) -> Climb:
+        box = Box(batch.low, batch.high, _RADIUS)
+        return ascend(partial(aims.look, scene, batch), batch.z, aims.begin(scene, batch), box, looks)
+
+    return jax.jit(climb, compiler_options=lanes.compiler_options())
+
+
+class _End(NamedTuple):
+    """Where a start ended; arrays without the leading axis of starts."""
+
+    z: np.ndarray
+    height: float
+    gradient: np.ndarray
+    margins: np.ndarray  # of the nominal device and all nodes, [node, two an impact]; then lower and upper bounds
+    knots: np.ndarray
+    lost: bool
+    looks: int
+    path: np.ndarray
+    heights: np.ndarray
+
+
+def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_End]:
+    """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
+    count, work = np.asarray(starts.orbit.count), _compiled(looks)
+    given = jax.tree.map(lambda x: np.asarray(x), starts.device)
+    ends: list[_End | None] = [None] * count.size
+
+    def part(some: np.ndarray, width: int, tile: lanes.Tile) -> None:
+        rows = some[tile.rows]
+        orbit, (low, high) = starts.orbit[rows], box[starts.owner[rows]].swapaxes(0, 1)
+        side, knots = orbit.sequence.side[:, :width], jnp.nan_to_num(orbit.knots[:, :width])
+        sequence = Sequence(side, orbit.sequence.span, orbit.sequence.mirrored)
+        device = jax.tree.map(lambda x: jnp.asarray(x[rows]), given)
+        end = work(scene, Batch(device, sequence, knots, *(jnp.asarray(x) for x in (starts.z[rows], low, high))))
+        seen, lost, taken = (jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, end.looks))
+        path, heights, z = np.asarray(end.path), np.asarray(end.heights), np.asarray(end.z)
+        for row, index in enumerate(rows[: tile.real]):
+            ends[index] = _End(
+                z[row],
+                float(np.exp(seen.value[row])) if seen.there[row] else np.nan,
+                seen.gradient[row],
+                seen.margins[row],
+                seen.memory.knots[row, 0],
+                bool(lost[row]),
+                int(taken[row]),
+                path[:, row],
+                heights[:, row],
+            )
+
+    jobs = []
+    for few, width in itertools.pairwise((0, *_WIDTHS)):
+        some = np.flatnonzero((count > few) & (count <= width))
+        jobs += [(some, width, tile) for tile in lanes.tiles(some.size, (_TILE,))]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        list(pool.map(lambda job: part(*job), jobs))
+    return [end for end in ends if end is not None]
+
+
+def _optima(scene: Scene, starts: _Met, ends: list[_End], devices: list[Harvester], looks: int) -> list[list[Optimum]]:
+    """What was reached for every device: admissible, verified, each optimum once, the best first."""
+    owner = starts.owner
+    good = [i for i, end in enumerate(ends) if end.margins.min() >= 0 and np.isfinite(end.height)]
+    good = [i for rows in _apart(good, ends, owner) for i in rows]
+    if not good:
+        return [[] for _ in devices]
+    own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
+    many = jax.tree.map(lambda *x: jnp.array(x), *own)
+    found = _at(starts.orbit[np.array(good)], jax.vmap(lambda d: d.pair())(many), [ends[i].knots for i in good])
+    states = _compiled_states()(many, found)
+    attracts = (np.asarray(found.status) == Status.OK) & (np.asarray(states.status) == Status.OK)
+    names = orbits.labels(found)
+    optima: list[list[Optimum]] = [[] for _ in devices]
+    for row in np.flatnonzero(attracts):
+        end = ends[good[row]]
+        there = np.isfinite(end.heights)
+        optima[owner[good[row]]].append(
+            Optimum(
+                values=dict(zip(scene.names, np.asarray(values(scene.names, end.z)).tolist(), strict=True)),
+                device=own[row],
+                orbit=found[row : row + 1],
+                label=str(names[row]),
+                height=end.height,
+                state=jax.tree.map(lambda x, row=row: np.asarray(x)[row], states),
+                gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
+                active=_active(scene, end, found.sequence.side[row]),
+                stopped="supremum" if end.lost else "looks" if end.looks >= looks else "maximum",
+                looks=end.looks,
+                path=np.asarray(values(scene.names, end.path[there])),
+                heights=np.exp(end.heights[there]),
+            )
+        )
+    return optima
+
+
+def _apart(good: list[int], ends: list[_End], owner: np.ndarray) -> Iterator[list[int]]:
+    """Ends that differ, of every owner, the highest first."""
+    for own in np.unique(owner[good]):
+        kept: list[int] = []
+        for i in sorted((i for i in good if owner[i] == own), key=lambda i: -ends[i].height):
+            if all(np.abs(ends[i].z - ends[k].z).max() > _SAME for k in kept):
+                kept.append(i)
+        yield kept
+
+
+def _at(orbit: Orbit, pair: ImpactPair, knots: list[np.ndarray]) -> Orbit:
+    """The orbits with other parameters and knots, verified."""
+    width = orbit.knots.shape[1]
+    wide = np.stack([np.pad(row, ((0, width - row.shape[0]), (0, 0))) for row in knots])
+    return orbits.solve(pair, orbit.sequence, jnp.asarray(wide))
+
+
+@lru_cache(maxsize=1)
+def _compiled_states():
+    return jax.jit(jax.vmap(steady), compiler_options=lanes.compiler_options())
+
+
+def _active(scene: Scene, end: _End, side: Any) -> tuple[str, ...]:
+    """What holds an end where it is."""
+    count, width = len(scene.names), end.knots.shape[0]
+    margins, low, high = np.split(end.margins, [end.margins.size - 2 * count, end.margins.size - count])
+    words = []
+    for node, kind, impact in np.argwhere(margins.reshape(-1, 2, width) < _ACTIVE):
+        what = ("penetration limit", "energy given to the membrane")[kind]
+        wall = "left" if side[impact] < 0 else "right"
+        words.append(f"{what} at the {wall} wall" + (" at an end of the tolerance" if node else ""))
+    words += [f"lower bound of {name}" for name, room in zip(scene.names, low, strict=True) if room < _ACTIVE]
+    words += [f"upper bound of {name}" for name, room in zip(scene.names, high, strict=True) if room < _ACTIVE]
+    return tuple(dict.fromkeys(words))

@@ -1,0 +1,190 @@
+"""The steady state that an attracting orbit keeps up, as a differentiable function of the device or of the pair.
+
+The orbit follows its parameters by the implicit function theorem on the shooting equations, (I - DP) dx = dP/dp
+with every impact's own unknowns kept. Where that derivative means nothing, values and derivatives are NaN.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vijax import energy, flow, shooting
+from vijax.clearance import Clearance, clearance, contact_turns
+from vijax.exact import implicit_root
+from vijax.model import Harvester, ImpactPair, Status
+from vijax.shooting import Knots, Sequence
+
+_CONVERGED = 1e-10  # residual of an orbit's equations
+# Nearer than this to |multiplier| = 1 an orbit is at its bifurcation, and derivatives have lost half of their digits.
+_MARGIN = 1e-7
+
+
+class Steady(eqx.Module):
+    """What an attracting periodic orbit yields, impact by impact, and how far that can be trusted.
+
+    Values are NaN, as are their derivatives, unless `status` is OK. Padded impacts hold 0 (`work`: inf).
+
+    Attributes:
+        P: Energy harvested per half forcing period [J].
+        power: P omega/pi [W].
+        speed: Largest speed into a wall [m/s].
+        depth, energy, work: Largest penetration [m], harvested energy [J], and energy given to the membrane [J] of each
+            impact.
+        multiplier: Largest modulus of the Floquet multipliers of the full orbit.
+        condition: Condition number of I - DP, Frobenius.
+        clearance: How far the orbit is from grazing.
+        residual: Largest violation of the equations.
+        status: OK; UNSTABLE: it repels, or is at a bifurcation; VIRTUAL: the ball would meet a wall in between;
+            NO_ORBIT: Newton found none.
+        knots: The orbit; see `shooting`.
+    """
+
+    P: Float[Array, ""]
+    power: Float[Array, ""]
+    speed: Float[Array, ""]
+    depth: Float[Array, "impact"]
+    energy: Float[Array, "impact"]
+    work: Float[Array, "impact"]
+    multiplier: Float[Array, ""]
+    condition: Float[Array, ""]
+    clearance: Clearance
+    residual: Float[Array, ""]
+    status: Int[Array, ""]
+    knots: Knots
+
+
+@jax.custom_jvp
+def _follows(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Knots:
+    """`knots` as a function of the pair by the orbit's equations: value unchanged, derivatives of every order right."""
+    return knots
+
+
+@_follows.defjvp
+def _follows_jvp(primals, tangents):
+    pair, sequence, knots = primals
+    # The rule calls itself on the knots, so that second derivatives see them move too.
+    knots = _follows(pair, sequence, knots)
+    # Not the last column of `linearise`: reverse mode cannot tell it from the matrix.
+    _, moved = jax.jvp(lambda pair: shooting.gap(pair, sequence, knots), (pair,), (tangents[0],))
+    slope = shooting.linearise(pair, sequence, knots).slope
+    return knots, -jnp.linalg.solve(slope, moved[:, None])[:, 0].reshape(knots.shape)
+
+
+def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> Steady:
+    """The steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
+
+    Args:
+        device: Constants, scalars; those under differentiation traced.
+        orbit: One element of an `orbit.Orbit` (`found[0]`) of the device or of a near one: its walls, and where Newton
+            begins. Values come from `device`, not from `orbit.pair`.
+        pair: d, kappa, r, gamma to move directly; those of the device unless given. Its wall is the orbit's.
+
+    Returns:
+        The record; NaN with a `status` where there is no attracting orbit.
+    """
+    rigid = orbit.pair.kappa is None
+    pair = device.pair("rigid" if rigid else "soft") if pair is None else pair
+    pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), pair)
+    sequence = orbit.sequence
+    guess = jnp.where(sequence.real[:, None], orbit.knots, 0.0)
+    return response(device, pair, sequence, *find(pair, sequence, guess))
+
+
+def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Float[Array, ""]]:
+    """Knots of the orbit near a guess and their residual, constants of differentiation."""
+    batch = jax.tree.map(lambda x: lax.stop_gradient(x)[None], (pair, sequence, guess))
+    knots, residual = shooting.newton(*batch)
+    return lax.stop_gradient(knots[0]), lax.stop_gradient(residual[0])
+
+
+def response(
+    device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]
+) -> Steady:
+    """What the orbit with the given knots yields; the knots follow device and pair under differentiation."""
+    frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
+    status, multiplier, condition, room = _validity(*frozen)
+    # Harmless numbers where there is no orbit: what is computed from them is thrown away.
+    absent = (status == Status.NO_ORBIT) | ~sequence.real
+    knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)
+    knots = _follows(pair, sequence, knots)
+    valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
+    depth, harvested, work = (valid * x for x in _impacts(device, pair, sequence, knots))
+    P = jnp.where(sequence.real, harvested, 0.0).sum() / sequence.span
+    return Steady(
+        P=P,
+        power=P * device.omega / flow.PI,
+        speed=valid * jnp.where(sequence.real, knots[:, 1], 0.0).max() * device.speed_unit,
+        depth=depth,
+        energy=harvested,
+        work=work,
+        multiplier=multiplier,
+        condition=condition,
+        clearance=room,
+        residual=residual,
+        status=status,
+        knots=knots,
+    )
+
+
+_HARMLESS = (0.0, 1.0, 0.5)  # a knot
+
+
+def _validity(pair: ImpactPair, sequence: Sequence, knots: Knots, residual):
+    around = shooting.monodromy(pair, sequence, knots)
+    determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
+    half = 0.5 * (around[0, 0] + around[1, 1])
+    spread = half * half - determinant
+    modulus = jnp.where(spread >= 0, jnp.abs(half) + jnp.sqrt(jnp.abs(spread)), jnp.sqrt(jnp.abs(determinant)))
+    multiplier = jnp.where(sequence.mirrored, modulus * modulus, modulus)
+    away = jnp.eye(2, dtype=knots.dtype) - around
+    condition = (away * away).sum() / jnp.abs(away[0, 0] * away[1, 1] - away[0, 1] * away[1, 0])
+    room = clearance(pair, sequence, knots)
+    found = residual < _CONVERGED
+    real = jnp.stack(room).min() > 0
+    attracts = multiplier < 1 - _MARGIN
+    status = jnp.where(attracts, Status.OK, Status.UNSTABLE)
+    status = jnp.where(real, status, Status.VIRTUAL)
+    status = jnp.where(found, status, Status.NO_ORBIT).astype(jnp.int32)
+    return status, multiplier, condition, room
+
+
+def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots):
+    """Depth [m], harvested energy [J] and energy given to the membrane [J] of every impact."""
+    real = sequence.real
+    t, speed, stay = knots.T
+    if pair.kappa is None:
+        kappa = device.omega0 * flow.PI / device.omega
+        depth = speed * energy.rigid_penetration(pair.r) / kappa
+        work = energy.membrane_work_rigid(speed, pair.r)
+    else:
+        passage = shooting.passages(pair, sequence, knots)
+        depth = _depths(pair, passage.side, knots)
+        signed = passage.side * speed, -passage.side * passage.speed
+        work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, passage.side, t, stay, *signed)
+    depth = jnp.where(real, depth, 0.0) * device.length_unit
+    work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
+    return depth, energy.harvested_energy(device, depth), work
+
+
+def _depths(pair: ImpactPair, side, knots: Knots) -> Float[Array, "impact"]:
+    """Largest penetration of each contact on a soft wall: that of its deepest turning point, which moves along."""
+    frozen = jax.tree.map(lax.stop_gradient, (pair, side, knots))
+    turns = contact_turns(*frozen)
+    crest = jnp.where(jnp.isnan(turns.s), -jnp.inf, turns.position).argmax(axis=1)
+    when = jnp.nan_to_num(jnp.take_along_axis(turns.s, crest[:, None], axis=1)[:, 0])
+    wall = flow.membrane(pair, rolled=True)
+
+    def one(side, knot, when):
+        t, speed, _ = knot
+        args = wall, flow.contact_force(pair.gamma, side, t), jnp.zeros_like(t), speed
+        return flow.oscillate(*args, implicit_root(_rate, when, args))[0]
+
+    return jax.vmap(one)(side, knots, when)
+
+
+def _rate(s, args):
+    return flow.oscillate(*args, s)[1]

@@ -1,0 +1,97 @@
+"""Which periodic orbits attract along chains of cells: where designs set out from."""
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vijax import simulate
+from vijax.model import Harvester, ImpactPair, State, Status
+from vijax.orbit import Orbit, solve
+from vijax.record import record
+from vijax.shooting import Sequence
+
+LINKS = 64  # of a call: one compiled program for chains of every length
+_FEWEST_LANES, _MOST_LANES = 8, 512
+
+
+class Survey(NamedTuple):
+    """Attractors found: verified orbits, and the cell of each, in the order of chain and link."""
+
+    orbit: Orbit
+    chain: np.ndarray
+    link: np.ndarray
+
+
+def survey(
+    pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int = 4, impacts: int = 8, periods: int = 400
+) -> Survey:
+    """The periodic attractors along chains of cells, each cell starting in the state in which the last one ended.
+
+    Args:
+        pair: Cells [chain, link], 64 links at most.
+        u0, v0: Starts of the chains.
+        longest, impacts: Most forcing periods, and most impacts, of an orbit that is wanted.
+        periods: Forcing periods that the search for an attractor may take in a cell.
+
+    Returns:
+        The orbits; aperiodic and silent cells, and longer orbits, have none.
+    """
+    pair = jax.tree.map(np.asarray, pair)
+    chains, links = pair.d.shape
+    workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
+    lanes = min(max(1 << (math.ceil(chains / workers) - 1).bit_length(), _FEWEST_LANES), _MOST_LANES)
+
+    def work(first: int) -> tuple[np.ndarray, ...]:
+        some = np.arange(first, min(first + lanes, chains))
+        padded = np.resize(some, lanes)
+        wide = jax.tree.map(lambda x: np.pad(x[padded], ((0, 0), (0, LINKS - links)), mode="edge"), pair)
+        return _attractors(wide, (u0[padded], v0[padded]), (some.size, links), (longest, impacts, periods))
+
+    firsts = range(0, chains, lanes)
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(work, firsts))
+    chain = np.concatenate([first + part[0] for first, part in zip(firsts, parts, strict=True)])
+    link, side, span, knots = (np.concatenate([part[i] for part in parts]) for i in range(1, 5))
+    own = jax.tree.map(lambda x: jnp.asarray(x[chain, link]), pair)
+    sequence = Sequence(jnp.asarray(side), jnp.asarray(span), jnp.zeros(chain.size, bool))
+    orbits = solve(own, sequence, jnp.asarray(knots))
+    good = np.flatnonzero(np.asarray(orbits.status) == Status.OK)
+    return Survey(orbits[good], chain[good], link[good])
+
+
+def _attractors(pair: ImpactPair, start: tuple, real: tuple[int, int], limits: tuple[int, int, int]):
+    """Chain, link, walls, span and knots of every periodic attractor of a tile of chains."""
+    longest, impacts, periods = limits
+    chains, links = real
+    one = jnp.ones_like(jnp.asarray(pair.d))
+    summary = simulate.follow(
+        jax.tree.map(jnp.asarray, pair),
+        simulate.Starts(*(jnp.asarray(x) for x in (*start, np.zeros_like(start[0])))),
+        simulate.Growth(one, one),
+        one,
+        one,
+        Harvester(),
+        periods=periods,
+        keep=longest,
+        count=chains,
+        links=links,
+    )
+    found = jax.tree.map(lambda x: np.asarray(x)[:chains, :links], summary)
+    count = found.impacts_left + found.impacts_right
+    fine = np.isin(found.status, (Status.OK, Status.STICKING)) & (found.period > 0) & (found.period <= longest)
+    chain, link = np.nonzero(fine & (count > 0) & (count <= impacts))
+    mark = jax.tree.map(lambda x: x[chain, link], (found.handover.mark, found.handover.held))
+    u, v, t, n, held = jax.tree.leaves(mark)
+    whole = (x.astype(np.int32) for x in (n, held))
+    own = jax.tree.map(lambda x: x[chain, link], pair)
+    flown = record(own, State(u, v, t, *whole), longest, np.ones(chain.size, bool)).impacts
+    table = {name: np.pad(x, ((0, 0), (0, impacts)))[:, :impacts] for name, x in flown.items()}
+    real_ones = np.arange(impacts) < count[chain, link][:, None]
+    knots = np.stack([2 * table["n"] + table["t"], np.abs(table["v_in"]), table["duration"]], axis=-1)
+    side = np.where(real_ones, table["side"], 0).astype(np.int32)
+    return chain, link, side, 2.0 * found.period[chain, link], np.where(real_ones[..., None], knots, 0.0)
