@@ -69,6 +69,7 @@ ROOMS: dict[str, set[str]] = {
     "store": set(),
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
+    "surroundings": {"method", "orbit", "branch", "attractor", "design"},
     "compare": {"model", "dataset", "label", "grid"},
     "design": {
         "model",
