@@ -10,7 +10,7 @@ import pytest
 import vijax
 from vijax import design
 from vijax.model import Harvester, Status
-from vijax.surroundings import surroundings
+from vijax.surroundings import surroundings, weighted
 from vijax.tolerance import Tolerance
 
 FAST = Harvester(A=3.0, omega=10 * math.pi, V=1700.0)
@@ -142,3 +142,15 @@ def test_devices_that_cannot_be_designed_are_told():
         design.optimise(dataclasses.replace(FAST, V=0.0))
     with pytest.raises(ValueError, match="give many devices as a list"):
         design.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
+
+
+def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
+    nominal = found[0].best
+    best = weighted(found[0], starts=32)
+    around = surroundings(nominal, starts=32)
+    assert best.height >= float(nominal.state.P) * around.share
+    assert best.height <= float(best.state.P) * (1 + 1e-9)
+    assert int(best.orbit.status[0]) == Status.OK
+    assert best.label == nominal.label
+    low, high = found[0].bounds["omega0"]
+    assert low <= best.values["omega0"] <= high
