@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import clearance, flow, lanes, shooting
+from vijax import clearance, elimination, flow, lanes, shooting
 from vijax.model import ImpactPair
 from vijax.shooting import Sequence
 
@@ -94,7 +94,7 @@ def _correct(arc: Arc, guess, former) -> _Arrival:
         gap, slope = _equations(arc, at.y)
         slope = jnp.concatenate([slope, former[None]])
         miss = jnp.append(gap, former @ (at.y - guess))
-        step, tangent = jnp.linalg.solve(slope, jnp.stack([miss, ahead], axis=1)).T
+        step, tangent = jax.vmap(elimination.solve, in_axes=(None, 0))(slope, jnp.stack([miss, ahead]))
         return _Arrival(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.trips + 1)
 
     def going(at: _Arrival):
@@ -107,7 +107,8 @@ def _tests(arc: Arc, y, tangent) -> Tests:
     knots, x = unpack(arc, y)
     pair = arc.at(x)
     around = shooting.monodromy(pair, arc.sequence, knots)
-    trace, determinant = around[0, 0] + around[1, 1], jnp.linalg.det(around)
+    trace = around[0, 0] + around[1, 1]
+    determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
     room = clearance.clearance(pair, arc.sequence, knots)
     return Tests(
         fold=tangent[-1],

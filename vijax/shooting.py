@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax import flow
+from vijax import elimination, flow
 from vijax.model import ImpactPair
 
 Knots = Float[Array, "impact 3"]
@@ -24,7 +24,6 @@ _TRIPS = 80  # evaluations that a damped search may take; a neighbour's orbit ne
 _LAST_STEP = 1e-9  # a Newton step this small is the last: the next one would be its square
 _FLOOR = 1e-12  # residual at which rounding may keep a search from improving
 _LEAST_PACE = 1e-4  # share of Newton's step below which the search has stalled
-_ELIMINATED = 3  # unknowns up to which elimination is written out: with more it compiles longer than it saves
 
 
 class Sequence(eqx.Module):
@@ -198,29 +197,6 @@ def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, 
     return ((speed > 0) & touches & (next_t - t - stay > 0)).all()
 
 
-def _eliminate(rows: list[Float[Array, "unknown+1 orbit"]]) -> list[Float[Array, "orbit"]]:
-    """Gaussian elimination with pivoting of many small systems at once; each row ends with its right-hand side."""
-    if not rows:
-        return []
-    top, others = rows[0], []
-    for row in rows[1:]:
-        swap = jnp.abs(row[0]) > jnp.abs(top[0])
-        others.append(jnp.where(swap, top, row))
-        top = jnp.where(swap, row, top)
-    pivot, top = top[0], top[1:]
-    below = _eliminate(flow.share([row[1:] - row[0] / pivot * top for row in others]))
-    known = sum(a * x for a, x in zip(top, below, strict=False))
-    return [(top[-1] - known) / pivot, *below]
-
-
-def newton_step(linear: Linear) -> Float[Array, "orbit 3*impact"]:
-    """Solution of slope step = gap. A call of LAPACK costs an orbit of one impact more than its equations do."""
-    if linear.gap.shape[1] > _ELIMINATED:
-        return jnp.linalg.solve(linear.slope, linear.gap[..., None])[..., 0]
-    wide = jnp.concatenate([linear.slope, linear.gap[..., None]], axis=2)
-    return jnp.stack(_eliminate(list(jnp.moveaxis(wide, 0, 2))), axis=1)
-
-
 class _Descent(eqx.Module):
     """Newton's search of a batch: knots, the full step from there, how much is missing, the share to try."""
 
@@ -243,7 +219,7 @@ def newton(
 
     def look(knots):
         linear = jax.vmap(linearise)(pair, sequence, knots)
-        step = newton_step(linear).reshape(knots.shape)
+        step = jax.vmap(elimination.solve)(linear.slope, linear.gap).reshape(knots.shape)
         return step, jnp.abs(linear.gap).max(axis=1)
 
     def size(step):

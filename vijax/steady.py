@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import energy, flow, shooting
+from vijax import elimination, energy, flow, shooting
 from vijax.clearance import Clearance, clearance, contact_crests
 from vijax.exact import implicit_root
 from vijax.model import Harvester, ImpactPair, Status
@@ -75,7 +75,7 @@ def _follows_jvp(primals, tangents):
     # Not the last column of `linearise`: reverse mode cannot tell it from the matrix.
     _, moved = jax.jvp(lambda pair: shooting.gap(pair, sequence, knots), (pair,), (tangents[0],))
     slope = shooting.linearise(pair, sequence, knots).slope
-    return knots, -jnp.linalg.solve(slope, moved[:, None])[:, 0].reshape(knots.shape)
+    return knots, -elimination.solve(slope, moved).reshape(knots.shape)
 
 
 def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> Steady:
