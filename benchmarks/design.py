@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,7 +53,7 @@ STEPS = (1e-3, 3e-4, 1e-4)  # relative, of differences; that with the smallest e
 
 def harvested(orbit: Orbit, gamma: Any, x: Any) -> Any:
     """P of the paper's device as a function of d, kappa, r."""
-    return steady(Harvester(), orbit, pair=ImpactPair(*x, gamma)).P
+    return steady(Harvester(), orbit, pair=ImpactPair(x[0], x[1], x[2], gamma)).P
 
 
 def reference_orbits() -> list[tuple[dict, Orbit]]:
@@ -74,8 +75,8 @@ def random_cells() -> Orbit:
     shape = (CHAINS, LINKS)
     tilt = np.where(np.arange(CHAINS)[:, None] % 2 == 0, 0.0, draw.uniform(-0.05, 0.05, shape))
     kappa = np.exp(draw.uniform(math.log(3), math.log(400), shape))
-    pair = ImpactPair(draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt)
-    return survey(pair, np.zeros(CHAINS), np.full(CHAINS, 0.25)).orbit
+    columns = draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt
+    return survey(ImpactPair(*map(jnp.asarray, columns)), np.zeros(CHAINS), np.full(CHAINS, 0.25)).orbit
 
 
 def differences(function: Callable[[Any], Any], x: np.ndarray, axis: int) -> np.ndarray:
@@ -103,43 +104,51 @@ def gradients() -> None:
     """Against 50 digits, and against differences."""
     worst = {"forward": 0.0, "reverse": 0.0}
     for row, orbit in reference_orbits():
-        x, gamma = jnp.array([float(row[name]) for name in NAMES]), float(row["gamma"])
+        point, gamma = jnp.array([float(row[name]) for name in NAMES]), float(row["gamma"])
         for name, slope in (("forward", jax.jacfwd), ("reverse", jax.grad)):
-            found = jax.jit(slope(lambda x, o=orbit, g=gamma: harvested(o, g, x)))(x)[1]
+            found = jax.jit(slope(lambda x, o=orbit, g=gamma: harvested(o, g, x)))(point)[1]
             worst[name] = max(worst[name], abs(float(found) / float(row["dP_dkappa"]) - 1))
-    for name, off in worst.items():
-        say(f"gradients: dP/dkappa of four orbits of 50 digits, {name}: largest error", f"{off:.1e}")
+    for name, most in worst.items():
+        say(f"gradients: dP/dkappa of four orbits of 50 digits, {name}: largest error", f"{most:.1e}")
     every = random_cells()
-    state = jax.jit(jax.vmap(lambda o: steady(Harvester(), o, pair=o.pair)))(every)
-    clear = np.min([np.asarray(x) for x in state.clearance], axis=0)
-    regular = (np.asarray(state.status) == Status.OK) & (np.asarray(state.condition) < MOST_CONDITION)
-    regular &= (np.asarray(state.multiplier) < MOST_MULTIPLIER) & (clear > LEAST_CLEARANCE)
-    some = every[np.flatnonzero(regular)[:CELLS]]
-    say(
-        "gradients: periodic attractors of random cells; regular; looked at",
-        f"{len(every)}; {regular.sum()}; {len(some)}",
-    )
+    some = every[np.flatnonzero(regular(every))[:CELLS]]
+    say("gradients: attractors of random cells; regular ones looked at", f"{len(every)}; {len(some)}")
+    by_differences(some)
+
+
+def room(orbit: Orbit) -> tuple[np.ndarray, ...]:
+    """Status, condition, multiplier and least clearance of every orbit."""
+    state = jax.jit(jax.vmap(lambda o: steady(Harvester(), o, pair=o.pair)))(orbit)
+    parts = state.status, state.condition, state.multiplier, jnp.stack(state.clearance).min(axis=0)
+    return tuple(map(np.asarray, parts))
+
+
+def regular(orbit: Orbit) -> np.ndarray:
+    """Which orbits are far from every bifurcation."""
+    status, condition, multiplier, clear = room(orbit)
+    calm = (condition < MOST_CONDITION) & (multiplier < MOST_MULTIPLIER)
+    return (status == Status.OK) & calm & (clear > LEAST_CLEARANCE)
+
+
+def by_differences(some: Orbit) -> None:
+    """First and second derivatives of every cell against differences of values and of first derivatives."""
     x = np.stack([np.asarray(getattr(some.pair, name)) for name in NAMES], axis=1)
-    gamma = some.pair.gamma
-    value = jax.jit(jax.vmap(harvested))
-    slope = jax.jit(jax.vmap(jax.grad(harvested, argnums=2)))
-    exact = np.asarray(slope(some, gamma, jnp.asarray(x)))
+    value = partial(jax.jit(jax.vmap(harvested)), some, some.pair.gamma)
+    slope = partial(jax.jit(jax.vmap(jax.grad(harvested, argnums=2))), some, some.pair.gamma)
+    curve = jax.jit(jax.vmap(jax.jacfwd(jax.grad(harvested, argnums=2), argnums=2)))
+    exact, bent = np.asarray(slope(x)), np.asarray(curve(some, some.pair.gamma, x))
     for axis, name in enumerate(NAMES):
-        off = error(exact[:, axis], differences(lambda x: value(some, gamma, x), x, axis))
-        say(
-            f"gradients: dP/d{name} of random cells: median, largest error; above 1e-6",
-            f"{np.median(off):.1e}, {off.max():.1e}; {(off > 1e-6).sum()}",
-        )
-    bent = np.asarray(
-        jax.jit(jax.vmap(jax.jacfwd(jax.grad(harvested, argnums=2), argnums=2)))(some, gamma, jnp.asarray(x))
-    )
-    along = differences(lambda x: slope(some, gamma, x), x, 1)
-    for axis, name in ((1, "d2P/dkappa2"), (2, "d2P/dkappa dr")):
-        off = error(bent[:, axis, 1], along[..., axis])
-        say(
-            f"gradients: {name} of random cells: median, largest error; above 1e-5",
-            f"{np.median(off):.1e}, {off.max():.1e}; {(off > 1e-5).sum()}",
-        )
+        compared(f"dP/d{name}", exact[:, axis], differences(value, x, axis), 1e-6)
+    along = differences(slope, x, 1)
+    compared("d2P/dkappa2", bent[:, 1, 1], along[..., 1], 1e-5)
+    compared("d2P/dkappa dr", bent[:, 2, 1], along[..., 2], 1e-5)
+
+
+def compared(name: str, exact: np.ndarray, by_difference: np.ndarray, asked: float) -> None:
+    """Errors of one derivative."""
+    off = error(exact, by_difference)
+    value = f"{np.median(off):.1e}, {off.max():.1e}; {(off > asked).sum()}"
+    say(f"gradients: {name}: median, largest error against differences; above {asked:.0e}", value)
 
 
 # --- the issue's reference ----------------------------------------------------------------------------------------
@@ -177,14 +186,14 @@ def speed_mp(d: float, kappa: Any, near: tuple[float, float, float]) -> Any:
 def reference() -> None:
     """The small fast device, for P and for speed."""
     settings = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
-    best = design.optimise(small_and_fast(), **settings).best
+    best = design.optimise(small_and_fast(), **settings).optima[0]
     say("reference: small fast device, kappa (4.00713)", f"{best.values['kappa']:.5f}")
     say("reference: P, microjoule (57.75761)", f"{1e6 * best.height:.5f}")
     say("reference: penetration, mm (6.026)", f"{1e3 * best.state.depth.max():.4f}")
     say("reference: largest multiplier (0.533)", f"{best.state.multiplier:.4f}")
     for d, kappa, speed in ((0.2, "4.0182", "-"), (0.16, "3.7820", "0.92524")):
         device = small_and_fast(d)
-        best = design.optimise(device, objective="speed", **settings).best
+        best = design.optimise(device, objective="speed", **settings).optima[0]
         say(f"reference: speed, d {d}: kappa ({kappa})", f"{best.values['kappa']:.6f}")
         say(
             f"reference: speed, d {d}: in units of A pi/omega ({speed})",
@@ -418,15 +427,12 @@ def cliffs() -> None:
                 flush=True,
             )
     every = random_cells()
-    state = jax.jit(jax.vmap(lambda o: steady(Harvester(), o, pair=o.pair)))(every)
-    room = np.min([np.asarray(x) for x in state.clearance], axis=0)
-    grazing = every.pair
+    *_, clear = room(every)
+    d, kappa, r, gamma = (np.asarray(x) for x in jax.tree.leaves(every.pair))
     designs = []
-    for i in np.flatnonzero((room < GRAZES) & (np.asarray(grazing.gamma) == 0)):
-        device = Harvester(s=float(grazing.d[i]), r=float(grazing.r[i]))
-        kappa = float(grazing.kappa[i])
-        bounds = {"kappa": (kappa * (1 - BESIDE), kappa * (1 + BESIDE))}
-        designs.append(design.optimise(device, tune=("kappa",), bounds=bounds))
+    for i in np.flatnonzero((clear < GRAZES) & (gamma == 0)):
+        bounds = {"kappa": (kappa[i] * (1 - BESIDE), kappa[i] * (1 + BESIDE))}
+        designs.append(design.optimise(Harvester(s=d[i], r=r[i]), tune=("kappa",), bounds=bounds))
     told(f"cliffs: beside {len(designs)} orbits that nearly graze", designs)
 
 
