@@ -1,7 +1,17 @@
 """Are designs the best there are? Against a dense scan, exact gradients, the clock, and cliffs.
 
-python benchmarks/design.py                # all figures
-python benchmarks/design.py --only scan    # one part
+    python benchmarks/design.py                # all figures
+    python benchmarks/design.py --only scan    # one part
+
+One line a figure, what is asked in brackets; every miss of the scan has a line of its own, which makes the device
+again. Typical printout:
+
+    reference: small fast device, kappa (4.00713)                            4.00713
+    reference: P, microjoule (57.75761)                                      57.75761
+    reference: penetration, mm (6.026)                                       6.0266
+    reference: largest multiplier (0.533)                                    0.5335
+
+(the start of the second part)
 """
 
 import argparse
