@@ -178,7 +178,7 @@ def speed_mp(d: float, kappa: Any, near: tuple[float, float, float]) -> Any:
     gain = 1 / (square - mp.pi**2 + 2 * zeta * mp.pi * 1j)
 
     def equations(t, v, stay):
-        steady_part = lambda s: gain * mp.expjpi(t + s)  # noqa: E731
+        steady_part = lambda s: gain * mp.mpc(mp.cospi(t + s), mp.sinpi(t + s))  # noqa: E731
         begin, rate = -mp.re(steady_part(0)), v - mp.re(1j * mp.pi * steady_part(0))
         cos, sin, decay = mp.cos(omega1 * stay), mp.sin(omega1 * stay), mp.exp(-zeta * stay)
         other = (rate + zeta * begin) / omega1
