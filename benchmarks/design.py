@@ -193,6 +193,15 @@ def speed_mp(d: float, kappa: Any, near: tuple[float, float, float]) -> Any:
     return mp.findroot(equations, near, tol=mp.mpf(10) ** (-2 * mp.mp.dps + 10))[1]
 
 
+AROUND, APART = 1e-4, 1e-12  # in kappa: ends of the search for a maximum, and points whose speeds are compared
+
+
+def rise_mp(d: float, near: tuple[float, float, float], kappa: Any) -> Any:
+    """Slope of the speed in kappa, in mpmath's precision."""
+    ahead, behind = (speed_mp(d, kappa + step, near) for step in (APART, -APART))
+    return (ahead - behind) / (2 * mp.mpf(APART))
+
+
 def reference() -> None:
     """The small fast device, for P and for speed."""
     settings = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
@@ -211,9 +220,8 @@ def reference() -> None:
         )
         with mp.workdps(40):
             near = tuple(np.asarray(best.orbit.knots)[0, int(np.asarray(best.orbit.sequence.side)[0, 0] < 0)].tolist())
-            peak = mp.findroot(
-                lambda k, d=d, near=near: mp.diff(lambda k: speed_mp(d, k, near), k), best.values["kappa"]
-            )
+            start = mp.mpf(best.values["kappa"])
+            peak = mp.findroot(partial(rise_mp, d, near), (start - AROUND, start + AROUND), tol=mp.mpf(10) ** -40)
             high = speed_mp(d, peak, near)
             off = [(speed_mp(d, mp.mpf(k), near) / high - 1) for k in (kappa, repr(best.values["kappa"]))]
         say(
