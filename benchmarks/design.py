@@ -6,12 +6,14 @@
 One line a figure, what is asked in brackets; every miss of the scan has a line of its own, which makes the device
 again. Typical printout:
 
+    gradients: dP/dkappa of four orbits of 50 digits, forward: largest error 1.8e-15
+    gradients: dP/dkappa of four orbits of 50 digits, reverse: largest error 1.0e-15
     reference: small fast device, kappa (4.00713)                            4.00713
     reference: P, microjoule (57.75761)                                      57.75761
     reference: penetration, mm (6.026)                                       6.0266
     reference: largest multiplier (0.533)                                    0.5335
 
-(the start of the second part)
+(the start of the first two parts)
 """
 
 import argparse
