@@ -1,0 +1,485 @@
+"""Are designs the best there are? Against a dense scan, exact gradients, the clock, and cliffs.
+
+    python benchmarks/design.py                # all figures
+    python benchmarks/design.py --only scan    # one part
+
+One line a figure, what is asked in brackets; every miss of the scan has a line of its own, which makes the device
+again. Typical printout:
+
+    gradients: dP/dkappa of four orbits of 50 digits, forward: largest error 1.8e-15
+    gradients: dP/dkappa of four orbits of 50 digits, reverse: largest error 1.0e-15
+    reference: small fast device, kappa (4.00713)                            4.00713
+    reference: P, microjoule (57.75761)                                      57.75761
+    reference: penetration, mm (6.026)                                       6.0266
+    reference: largest multiplier (0.533)                                    0.5335
+
+(the start of the first two parts)
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+
+import vijax
+from vijax import design
+from vijax import orbit as orbits
+from vijax.design import Design, Optimum
+from vijax.energy import harvested_energy
+from vijax.model import Harvester, ImpactPair, Status, impact_pair
+from vijax.orbit import Orbit
+from vijax.shooting import Sequence
+from vijax.steady import steady
+from vijax.survey import survey
+
+DATA = Path(__file__).parent.parent / "tests" / "data"
+SEED = 5
+KAPPA = (2.0, 400.0)
+
+
+def say(what: str, value: str) -> None:
+    """Print one figure."""
+    print(f"{what:<72} {value}", flush=True)
+
+
+# --- gradients ----------------------------------------------------------------------------------------------------
+
+CELLS = 1000
+CHAINS, LINKS = 64, 40  # of random cells, to find as many regular ones
+# A cell is regular if differences can be trusted there: well-conditioned, contracting, no impact about to come or go.
+MOST_CONDITION, MOST_MULTIPLIER, LEAST_CLEARANCE = 1e3, 0.9, 0.02
+NAMES = ("d", "kappa", "r")
+STEPS = (1e-3, 3e-4, 1e-4)  # relative, of differences; that with the smallest error counts
+
+
+def harvested(orbit: Orbit, gamma: Any, x: Any) -> Any:
+    """P of the paper's device as a function of d, kappa, r."""
+    return steady(Harvester(), orbit, pair=ImpactPair(x[0], x[1], x[2], gamma)).P
+
+
+def reference_orbits() -> list[tuple[dict, Orbit]]:
+    """The rows of 50 digits, and the orbit of each."""
+    rows = []
+    for row in json.loads((DATA / "gradients.json").read_text())["orbits"]:
+        t, v, stay = (np.array([float(x) for x in row[name]]) for name in ("t_in", "v_in", "contact"))
+        order = np.argsort(t)
+        pair = impact_pair(*([float(row[name])] for name in ("d", "kappa", "r", "gamma")))
+        side = jnp.asarray(np.sign(v[order])[None], jnp.int32)
+        knots = jnp.asarray(np.stack([t, np.abs(v), stay], axis=1)[order])[None]
+        rows.append((row, orbits.solve(pair, Sequence(side, jnp.full(1, 2.0), jnp.zeros(1, bool)), knots)[0]))
+    return rows
+
+
+def random_cells() -> Orbit:
+    """Periodic attractors of random cells, half of them tilted."""
+    draw = np.random.default_rng(SEED)
+    shape = (CHAINS, LINKS)
+    tilt = np.where(np.arange(CHAINS)[:, None] % 2 == 0, 0.0, draw.uniform(-0.05, 0.05, shape))
+    kappa = np.exp(draw.uniform(math.log(3), math.log(400), shape))
+    columns = draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt
+    return survey(ImpactPair(*map(jnp.asarray, columns)), np.zeros(CHAINS), np.full(CHAINS, 0.25)).orbit
+
+
+def differences(function: Callable[[Any], Any], x: np.ndarray, axis: int) -> np.ndarray:
+    """Central differences of fourth order in a column of x, by each of the steps, [step, ...]."""
+
+    def one(step: float) -> np.ndarray:
+        length = step * x[:, axis]
+
+        def at(times: int) -> np.ndarray:
+            moved = x.copy()
+            moved[:, axis] += times * length
+            return np.asarray(function(jnp.asarray(moved)))
+
+        return ((8 * (at(1) - at(-1)) - (at(2) - at(-2))).T / (12 * length)).T
+
+    return np.stack([one(step) for step in STEPS])
+
+
+def error(exact: np.ndarray, by_difference: np.ndarray) -> np.ndarray:
+    """Relative error of each cell, for the best of the steps."""
+    return np.nanmin(np.abs(by_difference / exact - 1), axis=0)
+
+
+def gradients() -> None:
+    """Against 50 digits, and against differences."""
+    worst = {"forward": 0.0, "reverse": 0.0}
+    for row, orbit in reference_orbits():
+        point, gamma = jnp.array([float(row[name]) for name in NAMES]), float(row["gamma"])
+        for name, slope in (("forward", jax.jacfwd), ("reverse", jax.grad)):
+            found = jax.jit(slope(lambda x, o=orbit, g=gamma: harvested(o, g, x)))(point)[1]
+            worst[name] = max(worst[name], abs(float(found) / float(row["dP_dkappa"]) - 1))
+    for name, most in worst.items():
+        say(f"gradients: dP/dkappa of four orbits of 50 digits, {name}: largest error", f"{most:.1e}")
+    every = random_cells()
+    some = every[np.flatnonzero(regular(every))[:CELLS]]
+    say("gradients: attractors of random cells; regular ones looked at", f"{len(every)}; {len(some)}")
+    by_differences(some)
+
+
+def room(orbit: Orbit) -> tuple[np.ndarray, ...]:
+    """Status, condition, multiplier and least clearance of every orbit."""
+    state = jax.jit(jax.vmap(lambda o: steady(Harvester(), o, pair=o.pair)))(orbit)
+    parts = state.status, state.condition, state.multiplier, jnp.stack(state.clearance).min(axis=0)
+    return tuple(map(np.asarray, parts))
+
+
+def regular(orbit: Orbit) -> np.ndarray:
+    """Which orbits are far from every bifurcation."""
+    status, condition, multiplier, clear = room(orbit)
+    calm = (condition < MOST_CONDITION) & (multiplier < MOST_MULTIPLIER)
+    return (status == Status.OK) & calm & (clear > LEAST_CLEARANCE)
+
+
+def by_differences(some: Orbit) -> None:
+    """First and second derivatives of every cell against differences of values and of first derivatives."""
+    x = np.stack([np.asarray(getattr(some.pair, name)) for name in NAMES], axis=1)
+    value = partial(jax.jit(jax.vmap(harvested)), some, some.pair.gamma)
+    slope = partial(jax.jit(jax.vmap(jax.grad(harvested, argnums=2))), some, some.pair.gamma)
+    curve = jax.jit(jax.vmap(jax.jacfwd(jax.grad(harvested, argnums=2), argnums=2)))
+    exact, bent = np.asarray(slope(x)), np.asarray(curve(some, some.pair.gamma, x))
+    for axis, name in enumerate(NAMES):
+        compared(f"dP/d{name}", exact[:, axis], differences(value, x, axis), 1e-6)
+    along = differences(slope, x, 1)
+    compared("d2P/dkappa2", bent[:, 1, 1], along[..., 1], 1e-5)
+    compared("d2P/dkappa dr", bent[:, 2, 1], along[..., 2], 1e-5)
+
+
+def compared(name: str, exact: np.ndarray, by_difference: np.ndarray, asked: float) -> None:
+    """Errors of one derivative."""
+    off = error(exact, by_difference)
+    value = f"{np.median(off):.1e}, {off.max():.1e}; {(off > asked).sum()}"
+    say(f"gradients: {name}: median, largest error against differences; above {asked:.0e}", value)
+
+
+# --- the issue's reference ----------------------------------------------------------------------------------------
+
+
+def small_and_fast(d: float = 0.2) -> Harvester:
+    """The example whose optimum is interior, beside a cliff."""
+    A, omega = 3.0, 10 * math.pi
+    return Harvester(s=d * A * (math.pi / omega) ** 2, r=0.5, A=A, omega=omega, V=1700.0)
+
+
+def speed_mp(d: float, kappa: Any, near: tuple[float, float, float]) -> Any:
+    """Speed of impacts of the symmetric 1:1 orbit at r = 1/2 in mpmath's precision, from (onset, speed, contact)."""
+    half, square = mp.mpf(str(d)) / 2, mp.mpf(kappa) ** 2
+    zeta = -mp.mpf(kappa) * mp.log(0.5) / mp.sqrt(mp.pi**2 + mp.log(0.5) ** 2)
+    omega1 = mp.sqrt(square - zeta**2)
+    gain = 1 / (square - mp.pi**2 + 2 * zeta * mp.pi * 1j)
+
+    def equations(t, v, stay):
+        steady_part = lambda s: gain * mp.mpc(mp.cospi(t + s), mp.sinpi(t + s))  # noqa: E731
+        begin, rate = -mp.re(steady_part(0)), v - mp.re(1j * mp.pi * steady_part(0))
+        cos, sin, decay = mp.cos(omega1 * stay), mp.sin(omega1 * stay), mp.exp(-zeta * stay)
+        other = (rate + zeta * begin) / omega1
+        w = decay * (begin * cos + other * sin) + mp.re(steady_part(stay))
+        slope = decay * ((other * omega1 - zeta * begin) * cos - (begin * omega1 + zeta * other) * sin)
+        out = slope + mp.re(1j * mp.pi * steady_part(stay))
+        leave, fly = t + stay, 1 - stay
+        lift = out - mp.sinpi(leave) / mp.pi
+        place = half + lift * fly + (mp.cospi(leave) - mp.cospi(leave + fly)) / mp.pi**2
+        return w / stay, place + half, lift + mp.sinpi(leave + fly) / mp.pi + v
+
+    return mp.findroot(equations, near, tol=mp.mpf(10) ** (-2 * mp.mp.dps + 10))[1]
+
+
+AROUND, APART = 1e-4, 1e-12  # in kappa: ends of the search for a maximum, and points whose speeds are compared
+
+
+def rise_mp(d: float, near: tuple[float, float, float], kappa: Any) -> Any:
+    """Slope of the speed in kappa, in mpmath's precision."""
+    ahead, behind = (speed_mp(d, kappa + step, near) for step in (APART, -APART))
+    return (ahead - behind) / (2 * mp.mpf(APART))
+
+
+def reference() -> None:
+    """The small fast device, for P and for speed."""
+    settings = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
+    best = design.optimise(small_and_fast(), **settings).optima[0]
+    say("reference: small fast device, kappa (4.00713)", f"{best.values['kappa']:.5f}")
+    say("reference: P, microjoule (57.75761)", f"{1e6 * best.height:.5f}")
+    say("reference: penetration, mm (6.026)", f"{1e3 * best.state.depth.max():.4f}")
+    say("reference: largest multiplier (0.533)", f"{best.state.multiplier:.4f}")
+    for d, kappa, speed in ((0.2, "4.0182", "-"), (0.16, "3.7820", "0.92524")):
+        device = small_and_fast(d)
+        best = design.optimise(device, objective="speed", **settings).optima[0]
+        say(f"reference: speed, d {d}: kappa ({kappa})", f"{best.values['kappa']:.6f}")
+        say(
+            f"reference: speed, d {d}: in units of A pi/omega ({speed})",
+            f"{best.height / float(device.speed_unit):.6f}",
+        )
+        with mp.workdps(40):
+            near = tuple(np.asarray(best.orbit.knots)[0, int(np.asarray(best.orbit.sequence.side)[0, 0] < 0)].tolist())
+            start = mp.mpf(best.values["kappa"])
+            peak = mp.findroot(partial(rise_mp, d, near), (start - AROUND, start + AROUND), tol=mp.mpf(10) ** -40)
+            high = speed_mp(d, peak, near)
+            off = [(speed_mp(d, mp.mpf(k), near) / high - 1) for k in (kappa, repr(best.values["kappa"]))]
+        say(
+            f"reference: speed, d {d}: kappa and speed of the maximum, 40 digits",
+            f"{mp.nstr(peak, 10)}; {mp.nstr(high, 10)}",
+        )
+        say(
+            "reference: relative loss of speed at the issue's kappa; at ours",
+            f"{mp.nstr(-off[0], 2)}; {mp.nstr(-off[1], 2)}",
+        )
+
+
+# --- against a dense scan -----------------------------------------------------------------------------------------
+
+ANYWHERE = {"d": (0.05, 0.3), "r": (0.2, 0.9), "A": (1.0, 5.0), "omega": (math.pi, 12 * math.pi)}
+SMALL_AND_FAST = {"d": (0.12, 0.3), "r": (0.2, 0.9), "A": (2.0, 4.0), "omega": (10 * math.pi, 12 * math.pi)}
+STARTS = ((0.0, 0.45), (-0.48, 0.25))  # displacements in parts of the gap and velocities, all pairs
+ENOUGH = 0.999  # of the scan's best
+FREE = 0.99  # of a constraint: the best point of a scan that uses less of both is no limited one
+
+
+class Best(NamedTuple):
+    """The best admissible point of a device's scan."""
+
+    P: float
+    kappa: float
+    period: int
+    impacts: str
+    free: bool  # clear of both constraints
+
+
+def drawn(draw: np.random.Generator, within: dict, count: int) -> list[Harvester]:
+    """Random devices: Tables I and II but for the gap, r, A and omega."""
+    rows = [{name: draw.uniform(*ends) for name, ends in within.items()} for _ in range(count)]
+    return [
+        Harvester(s=x["d"] * x["A"] * (math.pi / x["omega"]) ** 2, r=x["r"], A=x["A"], omega=x["omega"]) for x in rows
+    ]
+
+
+def scanned(device: Harvester, points: int) -> Best | None:
+    """By the exact engine from several starts at each of many kappa; None where nothing is admissible."""
+    d, (parts, speeds) = float(device.pair().d), STARTS
+    found = vijax.sweep(
+        kappa=np.geomspace(*KAPPA, points),
+        u0=d * np.array(parts),
+        v0=np.array(speeds),
+        device=device,
+        outputs=("P", "admissible", "period", "impacts_left", "impacts_right", "max_penetration", "energy_ratio"),
+    )
+    P = found["P"].where(found["admissible"] & (found["status"] == 0))
+    if not bool((P > 0).any()):
+        return None
+    best = found.isel(P.argmax(...))
+    left, right, period = (int(best[name]) for name in ("impacts_left", "impacts_right", "period"))
+    used = max(float(best["max_penetration"]) / float(device.depth_limit), float(best["energy_ratio"]))
+    return Best(float(best["P"]), float(best["kappa"]), period, f"{left}:{right}/{period}T", used < FREE)
+
+
+class Case(NamedTuple):
+    """A device, the best of its scan, and its design."""
+
+    device: Harvester
+    best: Best
+    found: Design
+
+
+def cases(draw: np.random.Generator, within: dict, count: int, points: int, free: bool) -> tuple[list[Case], int]:
+    """So many devices whose best admissible point in the scan is periodic, and how many others were left out.
+
+    Args:
+        free: Whether that point must be clear of the constraints, too.
+    """
+    devices: list[Harvester] = []
+    bests: list[Best] = []
+    left_out = 0
+    while len(devices) < count:
+        (device,) = drawn(draw, within, 1)
+        best = scanned(device, points)
+        if best is None or best.period < 1 or (free and not best.free):
+            left_out += 1
+            continue
+        devices.append(device)
+        bests.append(best)
+    designs = design.optimise_all(devices, tune=("kappa",), bounds={"kappa": KAPPA}) if devices else []
+    return [Case(*case) for case in zip(devices, bests, designs, strict=True)], left_out
+
+
+def interior(case: Case) -> bool:
+    """Whether nothing but the objective holds the optimum where it is."""
+    best = case.found.best
+    return best is not None and not best.active and best.stopped == "maximum"
+
+
+def ratio(case: Case) -> float:
+    """Of the optimum to the scan's best."""
+    return 0.0 if case.found.best is None else case.found.best.height / case.best.P
+
+
+def excess(optimum: Optimum) -> float:
+    """How far the worst impact is beyond its constraint, relative, by the exact impact map."""
+    device, orbit = optimum.device, optimum.orbit
+    deep = np.asarray(orbit.depth) * float(device.length_unit)
+    given = np.asarray(orbit.work) * float(device.m_b * device.speed_unit**2)
+    gained = np.asarray(harvested_energy(device, deep))
+    return float(max(np.nanmax(deep) / float(device.depth_limit), np.nanmax(gained / given)) - 1)
+
+
+def scan(devices: int, points: int) -> None:
+    """Random devices, then small and fast ones until half of the scans' best points are clear of the constraints."""
+    draw = np.random.default_rng(SEED)
+    every, left_out = cases(draw, ANYWHERE, devices, points, free=False)
+    say("scan: devices from the whole box; left out, their best being aperiodic", f"{len(every)}; {left_out}")
+    lack = len(every) - 2 * sum(case.best.free for case in every)
+    if lack > 0:
+        more, others = cases(draw, SMALL_AND_FAST, lack, points, free=True)
+        every += more
+        say("scan: small and fast devices added, to have half of them interior; left out", f"{len(more)}; {others}")
+    report(every)
+
+
+def report(every: list[Case]) -> None:
+    """What came of the designs, and every miss."""
+    ratios = np.array([ratio(case) for case in every])
+    bests = [case.found.best for case in every if case.found.best is not None]
+    kinds = Counter("interior" if not one.active else one.active[0].split(" at")[0] for one in bests)
+    say(
+        "scan: best points of the scans clear of constraints",
+        f"{sum(case.best.free for case in every)} of {len(every)}",
+    )
+    say("scan: interior optima of all", f"{sum(map(interior, every))} of {len(every)}")
+    say("scan: what holds the optima", ", ".join(f"{kind} {count}" for kind, count in kinds.most_common()))
+    say(
+        "scan: why the ascents stopped", ", ".join(f"{k} {n}" for k, n in Counter(one.stopped for one in bests).items())
+    )
+    say("scan: largest excess over a constraint, relative", f"{max(map(excess, bests)):.1e}")
+    say(
+        "scan: most evaluations of a start that won; median",
+        f"{max(b.looks for b in bests)}; {np.median([b.looks for b in bests]):.0f}",
+    )
+    say(
+        "scan: optimum over the scan's best: least, median, largest",
+        ", ".join(f"{f(ratios):.5f}" for f in (np.min, np.median, np.max)),
+    )
+    misses = [case for case in every if ratio(case) < ENOUGH]
+    say(f"scan: misses, below {ENOUGH}", f"{len(misses)} of {len(every)}")
+    for case in sorted(misses, key=ratio):
+        pair, best = case.device.pair(), case.found.best
+        what = f"d {float(pair.d):.6f} r {case.device.r:.6f} A {case.device.A:.6f} omega {case.device.omega:.6f}"
+        theirs = f"scan {case.best.P:.5e} at kappa {case.best.kappa:.5f}, {case.best.impacts}"
+        ours = (
+            "none" if best is None else f"{best.height:.5e} at {best.values['kappa']:.5f}, {best.label}, {best.stopped}"
+        )
+        print(f"    {ratio(case):.5f}  {what}; {theirs}; design {ours}", flush=True)
+
+
+# --- the clock ----------------------------------------------------------------------------------------------------
+
+RUNS = 5
+AWAY = 1.01  # of kappa: Newton sets out from the orbit of a neighbour
+
+
+def speed(designs: int) -> None:
+    """Seconds of many designs, and the price of a gradient."""
+    devices = drawn(np.random.default_rng(SEED), ANYWHERE, designs)
+    seconds = []
+    for _ in range(2):
+        begun = time.perf_counter()
+        found = design.optimise_all(devices)
+        seconds.append(time.perf_counter() - begun)
+    starts = sum(one.starts for one in found)
+    looks = [optimum.looks for one in found for optimum in one.optima]
+    say("speed: parameters; starts", f"{len(devices)}; {starts}")
+    say("speed: seconds, first (with compilation or its cache); again", f"{seconds[0]:.1f}; {seconds[1]:.1f}")
+    say(
+        "speed: seconds a 1,000 parameters; a 1,000 starts",
+        f"{1e3 * seconds[1] / designs:.1f}; {1e3 * seconds[1] / starts:.1f}",
+    )
+    say("speed: evaluations of the starts that became optima: median, most", f"{np.median(looks):.0f}, {max(looks)}")
+    row = random_cells()
+    row = row[np.flatnonzero(np.asarray(row.count) <= 2)]
+    row = jax.tree.map(lambda leaf: leaf[:, :2] if leaf.ndim > 1 and leaf.shape[1] > 2 else leaf, row)
+    x = jnp.stack([row.pair.d, AWAY * row.pair.kappa, row.pair.r], axis=1)
+    plain = median_seconds(jax.jit(jax.vmap(harvested)), row, row.pair.gamma, x)
+    say("speed: microseconds of P alone, from a neighbour's orbit", f"{1e6 * plain / len(row):.2f} ({len(row)} orbits)")
+    unit = jnp.array([0.0, 1.0, 0.0])
+    along = lambda o, g, x: jax.jvp(lambda x: harvested(o, g, x), (x,), (unit,))  # noqa: E731
+    for name, work in (
+        ("dP/dkappa, forward", along),
+        ("dP/d(d, kappa, r), reverse", jax.value_and_grad(harvested, argnums=2)),
+    ):
+        both = median_seconds(jax.jit(jax.vmap(work)), row, row.pair.gamma, x)
+        say(f"speed: P with {name}, over P alone", f"{both / plain:.2f}")
+
+
+def median_seconds(work: Callable[..., Any], *args: Any) -> float:
+    """Of some runs, compiled."""
+    jax.block_until_ready(work(*args))
+    seconds = []
+    for _ in range(RUNS):
+        begun = time.perf_counter()
+        jax.block_until_ready(work(*args))
+        seconds.append(time.perf_counter() - begun)
+    return float(np.median(seconds))
+
+
+# --- cliffs -------------------------------------------------------------------------------------------------------
+
+FOLDS = ((3.685, 3.70), (3.69, 3.72), (3.60, 3.695), (3.5, 4.5))
+GRAZES = 1e-3  # clearance of an orbit that nearly does
+BESIDE = 0.02  # relative, of kappa's bounds about it
+
+
+def cliffs() -> None:
+    """Designs in small ranges about the fold at kappa 3.69 and about grazing."""
+    for low, high in FOLDS:
+        found = design.optimise(small_and_fast(), tune=("kappa",), bounds={"kappa": (low, high)})
+        told(f"cliffs: small fast device, kappa {low} to {high}", [found])
+        for one in found.optima:
+            print(
+                f"    {one.values['kappa']:.6f} {1e6 * one.height:.5f} {one.label} {one.stopped} {one.active}",
+                flush=True,
+            )
+    every = random_cells()
+    *_, clear = room(every)
+    d, kappa, r, gamma = (np.asarray(x) for x in jax.tree.leaves(every.pair))
+    designs = []
+    for i in np.flatnonzero((clear < GRAZES) & (gamma == 0)):
+        bounds = {"kappa": (kappa[i] * (1 - BESIDE), kappa[i] * (1 + BESIDE))}
+        designs.append(design.optimise(Harvester(s=d[i], r=r[i]), tune=("kappa",), bounds=bounds))
+    told(f"cliffs: beside {len(designs)} orbits that nearly graze", designs)
+
+
+def told(what: str, designs: list[Design]) -> None:
+    """How many optima are reported, and how many of them should not be."""
+    every = [one for found in designs for one in found.optima]
+    numbers = [np.array([*one.values.values(), one.height, *one.gradient.values(), *one.heights]) for one in every]
+    nans = sum(not np.isfinite(x).all() for x in numbers)
+    lost = sum(int(one.orbit.status[0]) != Status.OK or not one.state.multiplier < 1 for one in every)
+    say(f"{what}: optima; with a NaN; with no attracting orbit", f"{len(every)}; {nans}; {lost}")
+
+
+def main() -> int:
+    """Print the figures."""
+    parts = {part.__name__: part for part in (gradients, reference, scan, speed, cliffs)}
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", choices=list(parts), help="one part")
+    parser.add_argument("--devices", type=int, default=200, help="of the scan")
+    parser.add_argument("--points", type=int, default=10_000, help="kappa of each device's scan")
+    parser.add_argument("--designs", type=int, default=1000, help="devices that are timed")
+    given = parser.parse_args()
+    options = {"scan": (given.devices, given.points), "speed": (given.designs,)}
+    for name, part in parts.items():
+        if given.only in (None, name):
+            part(*options.get(name, ()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
