@@ -1,9 +1,11 @@
 """How far an orbit is from grazing: what makes the solution of its equations a real motion, as smooth functions."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from vijax import flow, shooting
@@ -11,6 +13,7 @@ from vijax.model import ImpactPair
 from vijax.shooting import Knots, Sequence
 
 _SAMPLES = 48  # of a flight or contact, to find its extrema
+_POLISH = 3  # of Newton's steps from there
 _NOTHING = 1.0  # clearance where there is nothing to clear
 
 
@@ -23,41 +26,59 @@ class Clearance(NamedTuple):
     exit: Float[Array, ""]  # least speed away from a wall, over that into it: the ball stays
 
 
-class Turns(NamedTuple):
-    """Turning points inside a stretch, one a sample; NaN where there is none."""
+class _Stretch(NamedTuple):
+    """Samples of a flight or contact, and the motion that they are of: elapsed time -> position, velocity."""
 
     s: Float[Array, "sample"]
     position: Float[Array, "sample"]
-    before: Float[Array, "sample"]  # velocity before it
+    velocity: Float[Array, "sample"]
+    motion: Callable
+    acceleration: Callable
 
 
-def _turning_points(position, velocity, acceleration, length) -> Turns:
-    """Where the velocity passes zero inside a stretch."""
+def _sampled(motion: Callable, acceleration: Callable, length) -> _Stretch:
     s = jnp.linspace(0.0, 1.0, _SAMPLES + 1) * length
-    v = velocity(s)
-    low, high, before, after = s[:-1], s[1:], v[:-1], v[1:]
-    turns = before * after < 0
-    at = low + (high - low) * before / jnp.where(turns, before - after, 1.0)
-    for _ in range(2):
-        at = jnp.clip(at - velocity(at) / acceleration(at), low, high)
-    return Turns(jnp.where(turns, at, jnp.nan), jnp.where(turns, position(at), jnp.nan), before)
+    position, velocity = jax.vmap(motion)(s)
+    return _Stretch(s, position, velocity, motion, acceleration)
+
+
+def _crest(stretch: _Stretch, way: float):
+    """When a stretch is highest (way 1) or lowest (-1) at a turning point inside it, and its position; NaN for none.
+
+    The samples choose the turning point; Newton follows that one alone.
+    """
+    s, x, v = stretch.s, way * stretch.position, way * stretch.velocity
+    turns = (v[:-1] > 0) & (v[1:] <= 0)
+    index = jnp.where(turns, jnp.maximum(x[:-1], x[1:]), -jnp.inf).argmax()
+    low, high, before, after = s[index], s[index + 1], v[index], v[index + 1]
+
+    def polish(_, at):
+        step = stretch.motion(at)[1] / stretch.acceleration(at)
+        return jnp.clip(at - jnp.nan_to_num(step), low, high)
+
+    at = low + (high - low) * before / jnp.where(before > after, before - after, 1.0)
+    at = lax.fori_loop(0, _POLISH, polish, at)
+    found = turns.any()
+    return jnp.where(found, at, jnp.nan), jnp.where(found, stretch.motion(at)[0], jnp.nan)
 
 
 def _flight_room(pair: ImpactPair, passage: shooting.Passage):
     """Least distance from a wall at a turning point of the flight that follows each contact."""
 
     def one(side, speed, t, next_t):
-        place = lambda s: 0.5 * side * pair.d + flow.flight(pair.gamma, t, -side * speed, s)[0]  # noqa: E731
-        velocity = lambda s: flow.flight(pair.gamma, t, -side * speed, s)[1]  # noqa: E731
-        turns = _turning_points(place, velocity, lambda s: flow.acceleration(pair.gamma, t + s), next_t - t)
-        room = 0.5 * pair.d - jnp.where(turns.before > 0, 1, -1).astype(t.dtype) * turns.position
-        return jnp.nanmin(jnp.append(room, _NOTHING))
+        def motion(s):
+            rise, v = flow.flight(pair.gamma, t, -side * speed, s)
+            return 0.5 * side * pair.d + rise, v
+
+        stretch = _sampled(motion, lambda s: flow.acceleration(pair.gamma, t + s), next_t - t)
+        rooms = [0.5 * pair.d - way * _crest(stretch, way)[1] for way in (1.0, -1.0)]
+        return jnp.nanmin(jnp.stack([*rooms, jnp.full_like(t, _NOTHING)]))
 
     return jax.vmap(one)(passage.side, passage.speed, passage.t, passage.next_t)
 
 
-def contact_turns(pair: ImpactPair, side, knots: Knots) -> Turns:
-    """Turning points of the penetration inside each contact on a soft wall, [impact, sample]."""
+def contact_crests(pair: ImpactPair, side, knots: Knots, way: float):
+    """When each contact on a soft wall is deepest (way 1) or shallowest (-1) inside, and the penetration; or NaN."""
     wall = flow.membrane(pair, rolled=True)
 
     def one(side, knot):
@@ -65,13 +86,13 @@ def contact_turns(pair: ImpactPair, side, knots: Knots) -> Turns:
         force = flow.contact_force(pair.gamma, side, t)
 
         def motion(s):
-            return jax.vmap(lambda s: flow.oscillate(wall, force, jnp.zeros_like(s), speed, s))(s)
+            return flow.oscillate(wall, force, jnp.zeros_like(s), speed, s)
 
         def bend(s):
             w, rate = motion(s)
-            return jax.vmap(force.at)(s) - wall.mu * rate - wall.kappa * wall.kappa * w
+            return force.at(s) - wall.mu * rate - wall.kappa * wall.kappa * w
 
-        return _turning_points(lambda s: motion(s)[0], lambda s: motion(s)[1], bend, jnp.maximum(stay, 0.0))
+        return _crest(_sampled(motion, bend, jnp.maximum(stay, 0.0)), way)
 
     return jax.vmap(one)(side, knots)
 
@@ -80,9 +101,8 @@ def _contact_room(pair: ImpactPair, side, knots: Knots):
     """Least penetration at a turning point inside each contact where it is a minimum."""
     if pair.kappa is None:
         return jnp.full(side.shape, _NOTHING)
-    turns = contact_turns(pair, side, knots)
-    room = jnp.where(turns.before < 0, turns.position, jnp.nan)
-    return jax.vmap(lambda row: jnp.nanmin(jnp.append(row, _NOTHING)))(room)
+    _, low = contact_crests(pair, side, knots, -1.0)
+    return jnp.where(jnp.isnan(low), _NOTHING, low)
 
 
 def clearance(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Clearance:

@@ -167,6 +167,41 @@ def optimise_all(
     ]
 
 
+class Spread(NamedTuple):
+    """P of a design over tolerances, each device on its own orbit, followed from the nominal one.
+
+    Attributes:
+        mean: A device whose orbit is lost, or inadmissible, counting nothing [J].
+        worst: The least; 0 if the orbit of one is lost [J].
+        lost, inadmissible: Shares of devices.
+    """
+
+    mean: float
+    worst: float
+    lost: float
+    inadmissible: float
+
+
+def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None = None) -> Spread:
+    """What becomes of a design when constants scatter.
+
+    Args:
+        tolerances: How they do.
+        samples: Random devices, in place of a quadrature.
+
+    Raises:
+        ValueError: A tolerance that cannot be.
+    """
+    scatter = tuple(tolerances)
+    check_tolerances(scatter, bounded=False)
+    cloud, none = nodes(scatter, samples), jnp.zeros((1, 0))
+    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), (), cloud.names, "P")
+    device = jax.tree.map(lambda x: jnp.array([x], float), optimum.device)
+    orbit = optimum.orbit
+    batch = Batch(device, orbit.sequence, jnp.nan_to_num(orbit.knots), none, none, none)
+    return Spread(*(float(x[0]) for x in aims.spread(scene, batch)))
+
+
 def _check(devices: list[Harvester], objective: str, tolerances: tuple[Tolerance, ...]) -> None:
     if not devices:
         raise ValueError("devices must hold at least one; got none")

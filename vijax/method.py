@@ -2,11 +2,14 @@
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from vijax.membrane import HuntCrossley, Law, Linear
@@ -18,6 +21,29 @@ _DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
 _STEPS = 1000
 _FEWEST_STEPS = 8
 _FINEST = 8  # roundings: no error estimate is worth anything below
+
+
+_DECISION = "decision"
+
+
+def decided(choice: Any) -> Any:
+    """Marks what a step decides (which branch it takes, how long the next one is) to be taken once; see `repeated`."""
+    return jax.tree.map(partial(checkpoint_name, name=_DECISION), choice)
+
+
+def repeated(run: Callable[..., Any]) -> Callable[..., Any]:
+    """A run of steps that a derivative in reverse does again, with the decisions of the first time.
+
+    The compiler may round the repetition in another way. To the motion that is rounding, but the error estimate of a
+    step is itself close to it: lengths came out different in the sixth digit, steps were refused that had been
+    accepted, and the derivatives that arrived were those of another place of the motion.
+    """
+    return jax.checkpoint(run, policy=_is_decision)
+
+
+def _is_decision(primitive: Any, /, *_: Any, **params: Any) -> bool:
+    # Not jax.checkpoint_policies.save_only_these_names: a primitive of equinox has a parameter of the name "prim" too.
+    return primitive.name == "name" and params["name"] == _DECISION
 
 
 class Passage(eqx.Module):

@@ -107,30 +107,26 @@ def begin(scene: Scene, batch: Batch) -> Known:
     return Known(knots, jnp.zeros((*knots.shape, batch.z.shape[1]), knots.dtype), jnp.ones((starts, count), bool))
 
 
-class _All(NamedTuple):
-    """What is seen of every start and node, how that changes with the variables, and each orbit's status."""
-
-    seen: _Seen
-    slopes: _Seen
-    status: Array
-
-
-def _measure_all(scene: Scene, batch: Batch, z, near, known: Known) -> _All:
-    """The orbits that follow from those near, and what they yield."""
+def _orbits(scene: Scene, batch: Batch, z, near, known: Known):
+    """Knots and residuals [start, node] of the orbits that follow from those near."""
     guess = known.knots + (known.slopes * (z - near)[:, None, None, None]).sum(axis=-1)
     # A device whose orbit was lost may have the nominal one again.
     guess = jnp.where(known.there[..., None, None], guess, guess[:, :1])
     factors = jnp.broadcast_to(scene.factors, (z.shape[0], *scene.factors.shape))
-    knots, residual = _settled(scene, batch, z, factors, guess)
-    slope = jax.jacfwd(partial(_measure, scene), argnums=5, has_aux=True)
-    each = jax.vmap(jax.vmap(slope, in_axes=(None, None, 0, 0, 0, None)), in_axes=(0, 0, None, 0, 0, 0))
-    slopes, (seen, status) = each(batch.device, batch.sequence, scene.factors, knots, residual, z)
-    return _All(seen, slopes, status)
+    return _settled(scene, batch, z, factors, guess)
+
+
+def _over_all(function):
+    """A function of (device, sequence, factors, knots, residual, z), over starts and nodes."""
+    over_nodes = jax.vmap(function, in_axes=(None, None, 0, 0, 0, None))
+    return jax.vmap(over_nodes, in_axes=(0, 0, None, 0, 0, 0))
 
 
 def look(scene: Scene, batch: Batch, z, near, known: Known) -> Look:
     """The objective of every start with its derivatives, for `ascent.ascend`."""
-    seen, slopes, status = _measure_all(scene, batch, z, near, known)
+    knots, residual = _orbits(scene, batch, z, near, known)
+    slope = jax.jacfwd(partial(_measure, scene), argnums=5, has_aux=True)
+    slopes, (seen, status) = _over_all(slope)(batch.device, batch.sequence, scene.factors, knots, residual, z)
     fine, counts = status == Status.OK, scene.weights > 0
     if scene.objective == "worst":
         value = jnp.where(counts, seen.value, jnp.inf).min(axis=1)
@@ -153,33 +149,19 @@ def look(scene: Scene, batch: Batch, z, near, known: Known) -> Look:
     )
 
 
-class Spread(NamedTuple):
-    """An objective over tolerances.
-
-    Attributes:
-        mean: A device whose orbit is lost, or inadmissible, counting nothing.
-        worst: The least of all devices; 0 if one is lost.
-        lost: Share of the devices whose orbit is lost.
-        inadmissible: Share of those that break a constraint.
-    """
-
-    mean: Float[Array, "start"]
-    worst: Float[Array, "start"]
-    lost: Float[Array, "start"]
-    inadmissible: Float[Array, "start"]
-
-
 @jax.jit
-def spread(scene: Scene, batch: Batch) -> Spread:
-    """What becomes of designs over tolerances: their own orbits, followed from the nominal ones."""
-    seen, _, status = _measure_all(scene, batch, batch.z, batch.z, begin(scene, batch))
+def spread(scene: Scene, batch: Batch) -> tuple[Array, ...]:
+    """Mean and worst value of designs over tolerances, shares of devices lost and inadmissible; see `design.Spread`."""
+    knots, residual = _orbits(scene, batch, batch.z, batch.z, begin(scene, batch))
+    measure = _over_all(partial(_measure, scene))
+    _, (seen, status) = measure(batch.device, batch.sequence, scene.factors, knots, residual, batch.z)
     fine = status == Status.OK
     kept = fine & (seen.margins.min(axis=-1) >= 0)
     value = jnp.where(kept, jnp.exp(seen.value), 0.0)
     counts = scene.weights > 0
-    return Spread(
-        mean=(scene.weights * value).sum(axis=1),
-        worst=jnp.where(counts, jnp.where(fine, jnp.exp(seen.value), 0.0), jnp.inf).min(axis=1),
-        lost=(scene.weights * ~fine).sum(axis=1),
-        inadmissible=(scene.weights * (fine & ~kept)).sum(axis=1),
+    return (
+        (scene.weights * value).sum(axis=1),
+        jnp.where(counts, jnp.where(fine, jnp.exp(seen.value), 0.0), jnp.inf).min(axis=1),
+        (scene.weights * ~fine).sum(axis=1),
+        (scene.weights * (fine & ~kept)).sum(axis=1),
     )

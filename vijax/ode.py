@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.flow import PI, share
 from vijax.membrane import Wall
-from vijax.method import Ode, Passage
+from vijax.method import Ode, Passage, decided
 from vijax.model import Impact, ImpactPair, MembranePair, State
 
 Scalar = Float[Array, ""]
@@ -257,8 +257,8 @@ def _try(engine: Ode, solver: Solver, m: Motion, spell: Spell, recorded: bool) -
     t = m.t + h
     if recorded:
         room = lax.stop_gradient(2 - m.t)
-        t = jnp.where(h >= room, 2.0, t)
-        h = jnp.minimum(h, room)
+        ends = decided(h >= room)
+        t, h = jnp.where(ends, 2.0, t), jnp.where(ends, room, h)
     no = jnp.zeros_like(m.cut)
     f0 = _field(m.t, m.y, spell)
     fsal = solver.tableau.fsal
@@ -337,7 +337,7 @@ def _land(m: Motion, half: Scalar, trial: _Trial) -> _Landing:
     tops = (aim == _CREST) & (push < 0)
     delay = jnp.where(tops, -z / jnp.where(tops, push, -1.0), -2 * gap / jnp.where(both > 0, both, jnp.inf))
     near = trial.passes & ((jnp.abs(delay) <= _CLOSED * trial.h) | (m.attempts >= _ATTEMPTS))
-    met, crest = near & real & (jnp.abs(aim) == 1), near & tops
+    met, crest = decided((near & real & (jnp.abs(aim) == 1), near & tops))
     return _Landing(met & ~held, met & held, crest, jnp.where(met | crest, delay, 0.0), root)
 
 
@@ -387,12 +387,12 @@ def step(
     landing, sight = share((landing, sight))
     shut = landing.onset | landing.exits
     seen = trial.passes & sight.seen & ~shut & ~landing.crest
-    moved = trial.passes & ~seen
+    seen, moved = decided((seen, trial.passes & ~seen))
     side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
     y = _meet(m, half, side, wall, trial, landing)
 
     t = trial.t + landing.delay
-    over = t >= 2
+    over = decided(t >= 2)
     t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
     n = m.n + (moved & over).astype(m.n.dtype)
     passage = _passage(m, half, side, y, t, n, landing.speed)
@@ -403,7 +403,7 @@ def step(
         unit = (1.0, 0.0, 0.0, 1.0)
         fresh = tuple(jnp.where(landing.exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
         y = eqx.tree_at(lambda y: y.tangent, y, fresh)
-    h, full, other = _lengths(engine, m, trial, sight, seen, moved, shut)
+    h, full, other = decided(_lengths(engine, m, trial, sight, seen, moved, shut))
     depth = jnp.where(landing.crest, jnp.maximum(m.depth, y.x), m.depth)
     new = Motion(
         y=jax.tree.map(lambda new, old: jnp.where(moved, new, old), y, m.y),
@@ -414,7 +414,7 @@ def step(
         full=full,
         other=other,
         cut=seen,
-        aim=lax.stop_gradient(jnp.where(seen, sight.aim, 0.0)),
+        aim=decided(lax.stop_gradient(jnp.where(seen, sight.aim, 0.0))),
         attempts=jnp.where(seen, m.attempts + 1, 0),
         onset_t=jnp.where(landing.onset, t, m.onset_t),
         onset_n=jnp.where(landing.onset, n, m.onset_n),

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.flow import PI, share
 from vijax.membrane import Wall
-from vijax.method import Passage, Rk4
+from vijax.method import Passage, Rk4, decided
 from vijax.model import Impact, ImpactPair, State
 
 Scalar = Float[Array, ""]
@@ -127,7 +127,7 @@ def step(
     k, n = jnp.where(over, 0.0, k), m.n + over.astype(m.n.dtype)
     t = m.offset + k * h
     w = jnp.abs(u) - 0.5 * pair.d
-    mode = jnp.where(w >= 0, jnp.where(u < 0, -1, 1), 0).astype(m.mode.dtype)
+    mode = decided(jnp.where(w >= 0, jnp.where(u < 0, -1, 1), 0).astype(m.mode.dtype))
     leaves, onset = (m.mode != 0) & (mode != m.mode), (mode != 0) & (mode != m.mode)
     ends = leaves & m.entered
 

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vijax import energy, flow, shooting
-from vijax.clearance import Clearance, clearance, contact_turns
+from vijax.clearance import Clearance, clearance, contact_crests
 from vijax.exact import implicit_root
 from vijax.model import Harvester, ImpactPair, Status
 from vijax.shooting import Knots, Sequence
@@ -172,10 +172,8 @@ def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Kno
 
 def _depths(pair: ImpactPair, side, knots: Knots) -> Float[Array, "impact"]:
     """Largest penetration of each contact on a soft wall: that of its deepest turning point, which moves along."""
-    frozen = jax.tree.map(lax.stop_gradient, (pair, side, knots))
-    turns = contact_turns(*frozen)
-    crest = jnp.where(jnp.isnan(turns.s), -jnp.inf, turns.position).argmax(axis=1)
-    when = jnp.nan_to_num(jnp.take_along_axis(turns.s, crest[:, None], axis=1)[:, 0])
+    held, wall_of, at = jax.tree.map(lax.stop_gradient, (pair, side, knots))
+    when = jnp.nan_to_num(contact_crests(held, wall_of, at, 1.0)[0])
     wall = flow.membrane(pair, rolled=True)
 
     def one(side, knot, when):

@@ -14,10 +14,10 @@ from jaxtyping import Array, Float, Int
 
 from vijax import exact, flow
 from vijax.membrane import HuntCrossley, Law
-from vijax.method import Method, Rk4, choose
+from vijax.method import Method, Rk4, choose, repeated
 from vijax.model import Impact, ImpactPair, State, Status, check, is_concrete
 
-_CHUNK = 64  # steps that a differentiated run computes twice, to remember only where each chunk began
+_CHUNK = 64  # steps that a differentiated run computes twice, to remember only where a chunk began and what it decided
 _STEPS = 256  # steps of an adaptive solver per impact and period, before a run is stopped
 _HELD = 8  # a contact that outlasts the last period by so many is for ever
 
@@ -181,7 +181,7 @@ def _stepped(room: str, steps: int, periods: int, max_impacts: int, method: Meth
         def go(r):
             return lax.scan(lambda r, _: (advance(r), None), r, None, length=_CHUNK)[0]
 
-        return lax.cond(runs(r).any(), jax.checkpoint(go), lambda r: r, r), None
+        return lax.cond(runs(r).any(), repeated(go), lambda r: r, r), None
 
     end, _ = lax.scan(chunk, start, None, length=-(-steps // _CHUNK))
     m = end.carry
