@@ -5,8 +5,8 @@
     python scripts/design.py --d 0.2 --tune omega0,r --bounds r=0.3:0.8 --tolerance omega0=5%,s=1% --objective worst
     python scripts/design.py --over d=0.05:0.3:64 --out designs.json --plot designs.png
 
-Tuned are omega0 (or k, or kappa), s or d, r, A, omega, beta or gamma, and the constants of the membrane. With --over the
-best design is found for every value of an axis.
+Tuned are omega0 (or k, or kappa), s or d, r, A, omega, beta or gamma, and the constants of the membrane. With --over
+the best design is found for every value of an axis.
 """
 
 import sys
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from vijax.tolerance import Tolerance
 
 _DEFAULT_FILES = ("design.json", "design.png")
-_POINTS = 400  # of the picture
+_POINTS, _NEAR = 320, 160  # of the picture, and of its close view
 _OVER_TOLERANCES = ("mean", "worst")
 _STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the last
 
@@ -84,15 +84,15 @@ def design(
         names = tuple(name.strip() for name in tune.split(","))
         along, devices = _devices(over, command.take_axes(given, {}), command.device(constants), names)
         scatter = _tolerances(tolerance)
-        settings = {"tune": names, "bounds": _bounds(bounds), "objective": objective}
-        settings["tolerances"] = scatter if objective in _OVER_TOLERANCES else ()
-        designs.check(devices, **settings)
+        within = _bounds(bounds)
+        weighed = scatter if objective in _OVER_TOLERANCES else ()
+        designs.check(devices, names, within, objective, weighed)
     command.keep_compiled()
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
         show(0, stages)
         began = time.perf_counter()
-        found = designs.optimise_all(devices, **settings)
+        found = designs.optimise_all(devices, tune=names, bounds=within, objective=objective, tolerances=weighed)
         seconds = time.perf_counter() - began
         show(1, stages)
         diagram = None
@@ -167,8 +167,9 @@ def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
 
 
 def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
-    """P up and down along the first tuned axis, all else as at the best design."""
+    """P up and down along the first tuned axis, closer by about the best design, all else as there."""
     from vijax.axes import AXES
+    from vijax.blueprint import close_view
     from vijax.diagram import orbit_diagram
     from vijax.tuning import LINEAR, limits
 
@@ -176,6 +177,9 @@ def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
     device = found.best.device if found.best else device
     low, high = limits((along,), {along: found.bounds[along]} if along in found.bounds else {}, device)[:, 0]
     values = (np.linspace if along in LINEAR else np.geomspace)(low, high, _POINTS)
+    if found.best is not None and along in found.best.values:
+        near = np.linspace(*np.clip(close_view(along, found.best.values[along]), low, high), _NEAR)
+        values = np.unique(np.concatenate([values, near]))
     return orbit_diagram(along=along, values=values, direction="both", device=device)
 
 

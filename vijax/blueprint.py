@@ -32,6 +32,8 @@ _NAIVE: dict[str, Any] = {"marker": "X", "markersize": 8, "color": "#d62728", "l
 _EDGE: dict[str, Any] = {"color": "black", "linestyle": ":", "linewidth": 0.9}
 _WIDE = 4.0  # ratio of the bounds from which on an axis is logarithmic
 _DECADES = 5  # of P below the largest
+_NEAR, _TILT = 0.25, 0.05  # the close view, to either side: in parts of the optimum; of an inclination
+_HEADROOM = 1.25
 _JOULES = ("P", "mean", "worst")
 
 
@@ -49,31 +51,50 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
     if path is not None:
         check_format(path)
     along, best = str(diagram.attrs["along"]), report["best"]
-    x = diagram[along].values
+    near = None if best is None else close_view(along, _here(best, along))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 4.4), layout="constrained")
-        axes = figure.subplots()
-        for low, high in _ranges(x, ~diagram["admissible"].values.any(axis=0)):
-            axes.axvspan(low, high, **_VEIL)
-        axes.fill([], [], **_VEIL, label="inadmissible")
-        _curves(axes, diagram, x)
-        _unconstrained(axes, report)
-        if best is not None:
-            _mark(axes, report, along)
-        most = float(diagram["P"].max())
-        axes.set(
-            yscale="log", xlim=(x.min(), x.max()), xlabel=axis_label(diagram[along]), ylabel="$P$ [J per half period]"
-        )
-        least = float(diagram["P"].where(diagram["P"] > 0).min())
-        axes.set_ylim(max(least / 2, most / 10**_DECADES), 3 * most)
-        if x.min() > 0 and x.max() > _WIDE * x.min():
-            axes.set_xscale("log")
-        axes.set_title(_title(diagram, report), fontsize="medium")
-        figure.legend(loc="outside lower center", ncols=4, frameon=False, handlelength=1.4)
+        figure = Figure(figsize=(6.4, 4.2 if near is None else 6.6), layout="constrained")
+        panels = figure.subplots(1 if near is None else 2, squeeze=False)[:, 0]
+        for axes in panels:
+            _draw(axes, diagram, report)
+        _whole(panels[0], diagram)
+        panels[0].set_title(_title(diagram, report), fontsize="medium")
+        if near is not None:
+            panels[1].set(xlim=near, ylim=(0, _HEADROOM * best["P"]), ylabel="$P$ [J per half period]")
+        panels[-1].set_xlabel(axis_label(diagram[along]))
+        handles, texts = panels[0].get_legend_handles_labels()
+        figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
         if path is not None:
             with replacing(Path(path)) as part:
                 figure.savefig(part)
     return figure
+
+
+def close_view(along: str, here: float) -> tuple[float, float]:
+    """Ends of the part of an axis about an optimum that a picture shows closer by."""
+    return (here - _TILT, here + _TILT) if along in LINEAR else (here * (1 - _NEAR), here * (1 + _NEAR))
+
+
+def _draw(axes: Axes, diagram: "xr.Dataset", report: dict[str, Any]) -> None:
+    along = str(diagram.attrs["along"])
+    ranges = _ranges(diagram[along].values, ~diagram["admissible"].values.any(axis=0))
+    for index, (low, high) in enumerate(ranges):
+        axes.axvspan(low, high, label=None if index else "inadmissible", **_VEIL)
+    _curves(axes, diagram, diagram[along].values)
+    _unconstrained(axes, report)
+    if report["best"] is not None:
+        _mark(axes, report, along)
+
+
+def _whole(axes: Axes, diagram: "xr.Dataset") -> None:
+    """Limits and scales that show all of a diagram."""
+    x, power = diagram[diagram.attrs["along"]].values, diagram["P"]
+    most, least = float(power.max()), float(power.where(power > 0).min())
+    axes.set(yscale="log", xlim=(x.min(), x.max()), ylabel="$P$ [J per half period]")
+    if most > 0:
+        axes.set_ylim(max(least / 2, most / 10**_DECADES), 3 * most)
+    if x.min() > 0 and x.max() > _WIDE * x.min():
+        axes.set_xscale("log")
 
 
 def _ranges(x: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
@@ -107,8 +128,7 @@ def _mark(axes: Axes, report: dict[str, Any], along: str) -> None:
     here = _here(best, along)
     band = factors(along, report["tolerances"])
     if band is not None:
-        axes.axvspan(here * band[0], here * band[1], **_BAND)
-        axes.fill([], [], **_BAND, label="tolerance")
+        axes.axvspan(here * band[0], here * band[1], label="tolerance", **_BAND)
     if report["surroundings"]:
         _edges(axes, report["surroundings"], best["omega0"], here, along)
     if along in report["tune"] and report["objective"] in _JOULES:

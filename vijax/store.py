@@ -97,7 +97,7 @@ def load(path: str | Path) -> "xr.Dataset":
 
 
 def write_json(report: Any, path: Path) -> None:
-    """Write nested dicts, sequences, arrays and numbers as strict JSON, whole or not at all; null is what is not finite."""
+    """Write nested dicts, sequences, arrays and numbers as strict JSON, whole or not at all; not finite is null."""
     text = json.dumps(_plain(report), indent=1, allow_nan=False)
     with replacing(path) as part:
         part.write_text(text + "\n", encoding="utf-8")
