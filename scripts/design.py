@@ -108,10 +108,9 @@ def design(
         blueprint.design(diagram, whole, picture)
     elif picture is not None:
         blueprint.design_map(whole, picture)
+    climbed = f"{sum(one.starts for one in found):,} ascents in {seconds:.1f} s"
     lines = report.lines(whole) if along is None else report.table(whole)
-    command.close(
-        "\n".join([command.pace(sum(one.starts for one in found), seconds, "ascents"), *lines]), written, picture
-    )
+    command.close("\n".join([climbed, *lines]), written, picture)
 
 
 def _devices(
@@ -178,7 +177,8 @@ def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
     low, high = limits((along,), {along: found.bounds[along]} if along in found.bounds else {}, device)[:, 0]
     values = (np.linspace if along in LINEAR else np.geomspace)(low, high, _POINTS)
     if found.best is not None and along in found.best.values:
-        near = np.linspace(*np.clip(close_view(along, found.best.values[along]), low, high), _NEAR)
+        first, last = close_view(along, found.best.values[along])
+        near = np.linspace(max(first, low), min(last, high), _NEAR)
         values = np.unique(np.concatenate([values, near]))
     return orbit_diagram(along=along, values=values, direction="both", device=device)
 

@@ -69,7 +69,6 @@ ROOMS: dict[str, set[str]] = {
     "store": set(),
     "grid": {"model", "membrane", "method", "axes", "dataset", "store", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
-    "surroundings": {"method", "orbit", "branch", "attractor", "design"},
     "compare": {"model", "dataset", "label", "grid"},
     "design": {
         "model",
@@ -86,6 +85,7 @@ ROOMS: dict[str, set[str]] = {
         "survey",
         "axes",
     },
+    "surroundings": {"method", "orbit", "branch", "attractor", "design"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
     "style": set(),
     "paper": set(),

@@ -16,8 +16,8 @@ from vijax.tuning import LINEAR, constant
 if TYPE_CHECKING:
     import xarray as xr
 
-_WAYS = {"down": ("#1f77b4", 3.4, "falling"), "up": ("#ff7f0e", 1.7, "rising")}
-_FAINT = 0.3  # of points that are not admissible
+# Colours of points that are admissible and that are not, and their size: the rising ones lie over the falling ones.
+_WAYS = {"down": ("#1f77b4", "#aec7e8", 3.4, "falling"), "up": ("#ff7f0e", "#ffbb78", 1.7, "rising")}
 _VEIL: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "0.75", "hatch": "////", "linewidth": 0, "zorder": 0}
 _BAND: dict[str, Any] = {"color": "#2ca02c", "alpha": 0.25, "linewidth": 0, "zorder": 1}
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 13, "color": "#2ca02c", "markeredgecolor": "black", "mew": 0.6}
@@ -61,6 +61,7 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
         panels[0].set_title(_title(diagram, report), fontsize="medium")
         if near is not None:
             panels[1].set(xlim=near, ylim=(0, _HEADROOM * best["P"]), ylabel="$P$ [J per half period]")
+            panels[1].ticklabel_format(axis="y", scilimits=(0, 0))
         panels[-1].set_xlabel(axis_label(diagram[along]))
         handles, texts = panels[0].get_legend_handles_labels()
         figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
@@ -77,7 +78,9 @@ def close_view(along: str, here: float) -> tuple[float, float]:
 
 def _draw(axes: Axes, diagram: "xr.Dataset", report: dict[str, Any]) -> None:
     along = str(diagram.attrs["along"])
-    ranges = _ranges(diagram[along].values, ~diagram["admissible"].values.any(axis=0))
+    yields, good = diagram["P"] > 0, diagram["admissible"]
+    bad = (yields & ~good).any("direction") & ~(yields & good).any("direction")
+    ranges = _ranges(diagram[along].values, bad.values)
     for index, (low, high) in enumerate(ranges):
         axes.axvspan(low, high, label=None if index else "inadmissible", **_VEIL)
     _curves(axes, diagram, diagram[along].values)
@@ -107,12 +110,12 @@ def _ranges(x: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
 
 
 def _curves(axes: Axes, diagram: "xr.Dataset", x: np.ndarray) -> None:
-    for way, (colour, size, name) in _WAYS.items():
+    for way, (colour, pale, size, name) in _WAYS.items():
         one = diagram.sel(direction=way)
         power, good = one["P"].values, one["admissible"].values
-        style: Any = {"linestyle": "none", "marker": ".", "mew": 0, "markersize": 2 * size, "color": colour}
-        axes.plot(x[good], power[good], label=f"{name} {symbol(diagram[one.attrs['along']])}", **style)
-        axes.plot(x[~good], power[~good], alpha=_FAINT, **style)
+        style: Any = {"linestyle": "none", "marker": ".", "mew": 0, "markersize": 2 * size}
+        axes.plot(x[~good], power[~good], color=pale, **style)
+        axes.plot(x[good], power[good], color=colour, label=f"{name} {symbol(diagram[one.attrs['along']])}", **style)
 
 
 def _unconstrained(axes: Axes, report: dict[str, Any]) -> None:
