@@ -96,7 +96,7 @@ def test_without_an_optimum_the_curves_remain():
 
 
 def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
-    held = [report(), report(best=None), report(spread={"worst": 0.2e-6})]
+    held = [report(spread={"worst": 0.2e-6}), report(best=None), report(spread={"worst": 0.2e-6})]
     held[0]["best"]["active"] = ["penetration limit at the right wall"]
     found = {"over": {"name": "d", "values": [0.1, 0.2, 0.3]}, "designs": held}
     figure = blueprint.design_map(found, tmp_path / "map.png")

@@ -165,14 +165,14 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
     if best is None:
         yield "no admissible attracting orbit was found; widen the bounds or the penetration limit"
     else:
-        yield from _best(best)
+        yield from _best(best, report["objective"])
         yield from _around(best, report["surroundings"])
-        yield from _others(best, report["others"])
+        yield from _others(best, report["others"], report["objective"])
         yield from _off(report)
     yield from _unconstrained(report)
 
 
-def _best(best: dict[str, Any]) -> Iterator[str]:
+def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
     tuned = ", ".join(quantity(name, value) for name, value in best["values"].items())
     pair = best["pair"]
     yield f"best: {tuned}   ({', '.join(f'{name} {value:.6g}' for name, value in pair.items())})"
@@ -180,6 +180,8 @@ def _best(best: dict[str, Any]) -> Iterator[str]:
         f"  orbit {best['label']}: P {amount(best['P'], 'J')} per half period, {amount(best['power'], 'W')}, "
         f"largest speed into a wall {best['speed']:.6g} m/s"
     )
+    if objective in ("mean", "worst"):
+        yield f"  objective: {_height(best, objective)}"
     deepest, limit = 1e3 * max(best["penetration"]), 1e3 * best["penetration_limit"]
     yield (
         f"  penetration {deepest:.6g} mm of {limit:.6g} allowed; "
@@ -197,7 +199,8 @@ def _best(best: dict[str, Any]) -> Iterator[str]:
     why = {"supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains"}
     yield f"  stopped after {best['looks']} evaluations: {why.get(best['stopped'], best['stopped'])}"
     yield f"  held by: {held}"
-    yield f"  log-gradient at the end: {gradient}"
+    smooth = ", of a smoothed minimum" if objective == "worst" else ""
+    yield f"  log-gradient at the end{smooth}: {gradient}"
 
 
 def _around(best: dict[str, Any], around: dict[str, Any] | None) -> Iterator[str]:
@@ -219,12 +222,17 @@ def _edge(edge: dict[str, Any]) -> str:
     return f"{edge['kind']} {abs(edge['percent']):.3g} % off at {edge['omega0']:.6g} rad/s"
 
 
-def _others(best: dict[str, Any], others: list[dict[str, Any]]) -> Iterator[str]:
+def _height(one: dict[str, Any], objective: str) -> str:
+    """The objective there: worst 51.78932 uJ."""
+    return f"{objective} {amount(one['height'], {'power': 'W', 'speed': 'm/s'}.get(objective, 'J'))}"
+
+
+def _others(best: dict[str, Any], others: list[dict[str, Any]], objective: str) -> Iterator[str]:
     yield f"other local optima: {len(others) or 'none'}"
     for one in others[:_MOST_ROWS]:
         tuned = ", ".join(quantity(name, value) for name, value in one["values"].items())
         tie = "  an exact tie" if abs(one["height"] / best["height"] - 1) < _TIE else ""
-        yield f"  {tuned}: {one['label']}, P {amount(one['P'], 'J')}, {_held(one)}{tie}"
+        yield f"  {tuned}: {one['label']}, {_height(one, objective)}, {_held(one)}{tie}"
 
 
 def _off(report: dict[str, Any]) -> Iterator[str]:
