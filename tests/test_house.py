@@ -85,7 +85,7 @@ ROOMS: dict[str, set[str]] = {
         "survey",
         "axes",
     },
-    "surroundings": {"method", "orbit", "branch", "attractor", "design"},
+    "surroundings": {"model", "method", "orbit", "steady", "branch", "attractor", "tuning", "design"},
     "diagram": {"model", "energy", "method", "simulate", "record", "axes", "dataset", "grid"},
     "style": set(),
     "paper": set(),

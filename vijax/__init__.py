@@ -9,12 +9,14 @@ jax.config.update("jax_enable_x64", True)
 
 from vijax.attractor import basin_fractions, basins, lyapunov, survival
 from vijax.compare import compare
+from vijax.design import optimise
 from vijax.diagram import orbit_diagram
 from vijax.energy import harvested_energy
 from vijax.grid import load, save, sweep
 from vijax.membrane import HuntCrossley
 from vijax.model import Harvester, Impact, ImpactPair, State, Status, impact_pair
 from vijax.simulate import summarise
+from vijax.steady import steady
 from vijax.trajectory import trajectory
 
 __all__ = [
@@ -30,9 +32,11 @@ __all__ = [
     "harvested_energy",
     "impact_pair",
     "load",
+    "optimise",
     "lyapunov",
     "orbit_diagram",
     "save",
+    "steady",
     "summarise",
     "survival",
     "sweep",

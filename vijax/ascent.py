@@ -90,7 +90,12 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
     """
     import optax  # here, as importing vijax must not load it
 
-    update = optax.scale_by_lbfgs(_MEMORY)
+    lbfgs = optax.scale_by_lbfgs(_MEMORY)
+
+    def update(descent, state, z):
+        # Optax mixes whole numbers and truths, which callers may have forbidden.
+        with jax.numpy_dtype_promotion("standard"):
+            return jax.vmap(lbfgs.update)(descent, state, z)
 
     def view(z, near, memory) -> Look:
         """With the bounds among the constraints."""
@@ -104,8 +109,8 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
     def aim(z, seen: Look, weight, state):
         """The next step, and the state of optax after it; afresh where its curvature points down."""
         ahead = _gradient(seen, weight)
-        step, after = jax.vmap(update.update)(-ahead, state, z)
-        straight, again = jax.vmap(update.update)(-ahead, jax.vmap(update.init)(z), z)
+        step, after = update(-ahead, state, z)
+        straight, again = update(-ahead, jax.vmap(lbfgs.init)(z), z)
         sound = (step * ahead).sum(axis=1) < 0
         step, after = jax.tree.map(lambda a, b: _choose(sound, a, b), (step, after), (straight, again))
         return _shortened(-step, seen, box.radius), after
@@ -122,7 +127,7 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
         # Curvature compares gradients of one function: that before, under the new weight; none across the border.
         state = c.state._replace(updates=-_gradient(c.seen, weight))
         crossed = better & ~inside & _inside(seen)
-        state = jax.tree.map(lambda a, b: _choose(crossed, a, b), jax.vmap(update.init)(c.z), state)
+        state = jax.tree.map(lambda a, b: _choose(crossed, a, b), jax.vmap(lbfgs.init)(c.z), state)
         z, now = jax.tree.map(lambda a, b: _choose(better, a, b), (trial, seen), (c.z, c.seen))
         step, state = jax.tree.map(lambda a, b: _choose(better, a, b), aim(z, now, weight, state), (c.step, c.state))
         length = jnp.abs(step).max(axis=1)
@@ -147,7 +152,7 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
     starts = z.shape[0]
     seen = view(z, z, memory)
     weight = jnp.full(starts, _FIRST, z.dtype)
-    step, state = aim(z, seen, weight, jax.vmap(update.init)(z))
+    step, state = aim(z, seen, weight, jax.vmap(lbfgs.init)(z))
     blank = jnp.full((looks, *z.shape), jnp.nan, z.dtype)
     start = Climb(
         z=z,

@@ -162,6 +162,6 @@ def spread(scene: Scene, batch: Batch) -> tuple[Array, ...]:
     return (
         (scene.weights * value).sum(axis=1),
         jnp.where(counts, jnp.where(fine, jnp.exp(seen.value), 0.0), jnp.inf).min(axis=1),
-        (scene.weights * ~fine).sum(axis=1),
-        (scene.weights * (fine & ~kept)).sum(axis=1),
+        jnp.where(fine, 0.0, scene.weights).sum(axis=1),
+        jnp.where(fine & ~kept, scene.weights, 0.0).sum(axis=1),
     )

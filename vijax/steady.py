@@ -40,6 +40,7 @@ class Steady(eqx.Module):
         residual: Largest violation of the equations.
         status: OK; UNSTABLE: it repels, or is at a bifurcation; VIRTUAL: the ball would meet a wall in between;
             NO_ORBIT: Newton found none.
+        left, right, period: Label of the orbit: impacts on either wall, in so many forcing periods.
         knots: The orbit; see `shooting`.
     """
 
@@ -54,6 +55,9 @@ class Steady(eqx.Module):
     clearance: Clearance
     residual: Float[Array, ""]
     status: Int[Array, ""]
+    left: Int[Array, ""]
+    right: Int[Array, ""]
+    period: Int[Array, ""]
     knots: Knots
 
 
@@ -114,6 +118,9 @@ def response(
     valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
     depth, harvested, work = (valid * x for x in _impacts(device, pair, sequence, knots))
     P = jnp.where(sequence.real, harvested, 0.0).sum() / sequence.span
+    left, right = ((sequence.side == wall).sum(dtype=jnp.int32) for wall in (-1, 1))
+    # Closed half way, the mirror image of the orbit is the rest of it.
+    left, right = (jnp.where(sequence.mirrored, left + right, side) for side in (left, right))
     return Steady(
         P=P,
         power=P * device.omega / flow.PI,
@@ -126,6 +133,9 @@ def response(
         clearance=room,
         residual=residual,
         status=status,
+        left=left,
+        right=right,
+        period=jnp.round(sequence.span * jnp.where(sequence.mirrored, 1.0, 0.5)).astype(jnp.int32),
         knots=knots,
     )
 

@@ -1,18 +1,26 @@
-"""What lies around an optimum: the attractors that coexist with it, and the bifurcations on either side."""
+"""What lies around an optimum: coexisting attractors, bifurcations on either side, and designs that weigh basins."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vijax import branch
 from vijax import orbit as orbits
 from vijax.attractor import basin_fractions
-from vijax.design import Optimum
+from vijax.design import Design, Optimum
 from vijax.method import whole
+from vijax.model import Harvester, Status
+from vijax.orbit import Orbit
+from vijax.steady import steady
+from vijax.tuning import tuned, values, variables
 
 _SAME = 1e-6  # relative difference of P within which an attractor is the optimum's own orbit
+_POINTS = 17  # of a line search, coarse and then fine
+_STEPS = 8  # in which an orbit follows its device
 
 
 class Neighbour(NamedTuple):
@@ -67,27 +75,97 @@ def surroundings(optimum: Optimum, *, starts: int = 2000, reach: float = 0.5, se
     """
     if not 0 < reach < 1:
         raise ValueError(f"reach must lie between 0 and 1; got {reach}")
-    attractors = _attractors(optimum, whole("starts", starts, 1), seed)
+    attractors = _attractors(optimum.device, whole("starts", starts, 1), seed)
     own = float(orbits.power(optimum.orbit, optimum.device)[0])
     share = sum(one.share for one in attractors if math.isclose(one.P, own, rel_tol=_SAME))
-    kappa = float(optimum.device.omega0 * math.pi / optimum.device.omega)
-    edges = [_edge(optimum, kappa, way, reach) for way in ("down", "up")]
-    return Surroundings(share, attractors, *edges)
+    return Surroundings(share, attractors, *(_edge(optimum, way, reach) for way in ("down", "up")))
 
 
-def _attractors(optimum: Optimum, starts: int, seed: int | None) -> tuple[Neighbour, ...]:
-    d, kappa, r, gamma = (float(x[0]) for x in jax.tree.leaves(optimum.orbit.pair))
+def _attractors(device: Harvester, starts: int, seed: int | None) -> tuple[Neighbour, ...]:
+    """What attracts the balls of a device, mirror images as one, the largest share first."""
+    d, kappa, r, gamma = (float(x) for x in jax.tree.leaves(device.pair()))
     found = basin_fractions(
-        d=d, kappa=kappa, r=r, gamma=gamma, starts=starts, seed=seed, device=optimum.device, merge_mirrors=gamma == 0
-    ).squeeze()
-    columns = [np.atleast_1d(found[name].values) for name in ("label", "P", "fraction", "admissible")]
+        d=d, kappa=kappa, r=r, gamma=gamma, starts=starts, seed=seed, device=device, merge_mirrors=gamma == 0
+    )
+    columns = [found[name].values.ravel() for name in ("label", "P", "fraction", "admissible")]
     rows = [Neighbour(str(a), float(b), float(c), bool(e)) for a, b, c, e in zip(*columns, strict=True) if c > 0]
     return tuple(sorted(rows, key=lambda one: -one.share))
 
 
-def _edge(optimum: Optimum, kappa: float, way: str, reach: float) -> Edge:
+def _edge(optimum: Optimum, way: str, reach: float) -> Edge:
+    device = optimum.device
+    kappa = float(device.omega0) * math.pi / float(device.omega)
     within = ((1 - reach) * kappa, (1 + reach) * kappa)
     (followed,) = branch.follow(optimum.orbit, "kappa", within, direction=way)
     kind, at = followed.points[0][:2] if followed.points else ("none", within[way == "up"])
-    omega0 = float(optimum.device.omega0) * at / kappa
-    return Edge(kind, omega0, 100 * (at / kappa - 1))
+    return Edge(kind, float(device.omega0) * at / kappa, 100 * (at / kappa - 1))
+
+
+def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int | None = None) -> Optimum | None:
+    """The design of most P times basin share, by line searches from the optima along one tuned quantity after another.
+
+    Shares come from simulated starts: they have no gradient.
+
+    Args:
+        design: Whose optima are set out from, those that P alone cannot put ahead left out.
+        starts: Of balls at every point.
+        reach: How far a search goes, in parts of the quantity.
+        seed: Of starts drawn at random.
+
+    Returns:
+        The optimum, its `height` P times share [J], without a gradient; None if the design has none.
+    """
+    starts, best = whole("starts", starts, 1), None
+    for one in design.optima:
+        if best is None or float(one.state.P) > best.height:
+            found = _searched(design, one, starts, reach, seed)
+            best = found if best is None or found.height > best.height else best
+    return best
+
+
+def _searched(design: Design, optimum: Optimum, starts: int, reach: float, seed: int | None) -> Optimum:
+    names = design.tune
+    low, high = (variables(names, [design.bounds[name][side] for name in names]) for side in (0, 1))
+    z = variables(names, [optimum.values[name] for name in names])
+
+    def score(z: np.ndarray) -> float:
+        rows = _attractors(_device(optimum, names, z), starts, seed)
+        return sum(one.P * one.share for one in rows if one.label == optimum.label and one.admissible)
+
+    height = score(z)
+    for index in range(len(names)):
+        for span in (reach, 2 * reach / (_POINTS - 1)):
+            line = np.tile(z, (_POINTS, 1))
+            line[:, index] += span * np.linspace(-1, 1, _POINTS)
+            line = np.unique(np.clip(line, low, high), axis=0)
+            scores = [score(point) for point in line]
+            if max(scores) > height:
+                z, height = line[int(np.argmax(scores))], max(scores)
+    device = _device(optimum, names, z)
+    orbit = _followed(optimum, device)
+    return dataclasses.replace(
+        optimum,
+        values=dict(zip(names, np.asarray(values(names, z)).tolist(), strict=True)),
+        device=device,
+        orbit=orbit,
+        height=height,
+        state=jax.tree.map(np.asarray, steady(device, orbit[0])),
+        gradient={},
+        active=(),
+        stopped="weighted",
+    )
+
+
+def _device(optimum: Optimum, names: tuple[str, ...], z: np.ndarray) -> Harvester:
+    return jax.tree.map(float, tuned(optimum.device, names, z))
+
+
+def _followed(optimum: Optimum, device: Harvester) -> Orbit:
+    """The optimum's orbit as its device becomes another one, in small steps."""
+    begin, end, orbit = optimum.device.pair(), device.pair(), optimum.orbit
+    for step in range(1, _STEPS + 1):
+        pair = jax.tree.map(lambda a, b, part=step / _STEPS: jnp.array([a + part * (b - a)]), begin, end)
+        orbit = orbits.solve(pair, orbit.sequence, jnp.nan_to_num(orbit.knots))
+    if int(orbit.status[0]) != Status.OK:
+        raise RuntimeError(f"the orbit was lost between two devices that both have it; got {orbit.status}")
+    return orbit

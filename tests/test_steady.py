@@ -1,0 +1,118 @@
+"""Steady states: values and gradients of 50-digit orbits, second derivatives, and NaN where none can be meant."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import reference_orbits, reference_rows
+
+from vijax import orbit as orbits
+from vijax.model import Harvester, ImpactPair, Status, impact_pair
+from vijax.shooting import Sequence
+from vijax.steady import steady
+
+DEVICE = Harvester()
+
+
+def known(references, twist=1.0):
+    """Orbits as they are written down, knots off by a factor."""
+    pair = jax.tree.map(lambda *x: jnp.stack(x), *(one.pair for one in references))
+    count = len(references)
+    side = jnp.asarray([one.side for one in references], jnp.int32)
+    sequence = Sequence(side, jnp.full(count, 2.0), jnp.zeros(count, bool))
+    blank = jnp.full(side.shape, jnp.nan)
+    knots = jnp.asarray([one.knots for one in references]) * twist
+    return orbits.Orbit(
+        pair, sequence, knots, blank, blank, jnp.zeros((count, 2), complex), blank[:, 0], jnp.zeros(count, jnp.int32)
+    )
+
+
+def of_pair(pair, orbit):
+    """What the tests differentiate: energy per half period, largest speed."""
+    found = steady(DEVICE, orbit, pair=pair)
+    return jnp.stack([found.P, found.speed]), found
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Steady states of the references and their derivatives, forward, from guesses 1 % off."""
+    guess = known(reference_orbits(), 1 + 0.01 * np.array([1, -1, 1]))
+    slope = jax.jit(jax.vmap(jax.jacfwd(of_pair, has_aux=True)))
+    return guess, slope, *slope(guess.pair, guess)
+
+
+def test_values_are_those_of_50_digits(found):
+    _, _, _, state = found
+    np.testing.assert_array_equal(state.status, Status.OK)
+    for index, (row, reference) in enumerate(zip(reference_rows(), reference_orbits(), strict=True)):
+        assert float(state.P[index]) == pytest.approx(float(row["P_J"]), rel=1e-13)
+        np.testing.assert_allclose(state.depth[index], reference.depth, rtol=1e-12)
+        assert float(state.multiplier[index]) == pytest.approx(np.abs(reference.multipliers).max(), rel=1e-10)
+
+
+def test_derivatives_in_kappa_are_those_of_50_digits(found):
+    _, _, slopes, _ = found
+    wanted = [float(row["dP_dkappa"]) for row in reference_rows()]
+    np.testing.assert_allclose(slopes.kappa[:, 0], wanted, rtol=1e-12)
+
+
+def test_derivatives_in_every_parameter_are_those_of_differences(found):
+    guess, slope, slopes, _ = found
+    for name in ("d", "kappa", "r", "gamma"):
+        step = 1e-3 * np.maximum(np.abs(getattr(guess.pair, name)), 0.05)
+
+        def at(times, name=name, step=step):
+            pair = dataclasses.replace(guess.pair, **{name: getattr(guess.pair, name) + times * step})
+            state = slope(pair, guess)[1]
+            return np.stack([state.P, state.speed], axis=1)
+
+        difference = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step[:, None])
+        np.testing.assert_allclose(getattr(slopes, name), difference, rtol=2e-6, atol=1e-9, err_msg=name)
+
+
+def test_reverse_is_forward_and_second_derivatives_are_differences_of_first(found):
+    guess, slope, slopes, _ = found
+    one, pair = guess[1], jax.tree.map(lambda x: x[1], guess.pair)
+
+    def P(kappa):
+        return of_pair(dataclasses.replace(pair, kappa=kappa), one)[0][0]
+
+    value, second = jax.jit(lambda kappa: (jax.grad(P)(kappa), jax.jacfwd(jax.grad(P))(kappa)))(pair.kappa)
+    assert float(value) == pytest.approx(float(slopes.kappa[1, 0]), rel=1e-12)
+    step = 1e-2
+
+    def first(times):
+        moved = dataclasses.replace(guess.pair, kappa=guess.pair.kappa + times * step)
+        return slope(moved, guess)[0].kappa[1, 0]
+
+    difference = (8 * (first(1) - first(-1)) - (first(2) - first(-2))) / (12 * step)
+    assert float(second) == pytest.approx(float(difference), rel=1e-7)
+
+
+def test_where_no_orbit_attracts_nothing_is_said(found):
+    guess, slope, _, _ = found
+    every = orbits.search(impact_pair(0.2, 25.0, 0.5), "RL", guesses=64)
+    repels = every[np.flatnonzero(np.abs(every.multipliers[:, 0]) > 1.01)[[0, 0, 0, 0]]]
+    nonsense = dataclasses.replace(guess, knots=guess.knots * jnp.array([1.0, 1.0, -1.0]))
+    for orbit, wanted in ((repels, Status.UNSTABLE), (nonsense, Status.NO_ORBIT)):
+        slopes, state = slope(orbit.pair, orbit)
+        np.testing.assert_array_equal(state.status, wanted)
+        for leaf in (state.P, state.power, state.speed, *jax.tree.leaves(slopes)):
+            assert np.isnan(leaf).all()
+
+
+def test_a_rigid_wall_yields_by_the_depth_it_is_lent():
+    start = orbits.search(impact_pair(0.3, None, 0.5), "RL", guesses=64)
+    index = int(np.abs(start.multipliers[:, 0]).argmin())
+    one = start[index]
+
+    def P(r):
+        pair = ImpactPair(one.pair.d, None, r, one.pair.gamma)
+        return steady(DEVICE, one, pair=pair).P
+
+    assert float(P(0.5)) == pytest.approx(float(orbits.power(start, DEVICE)[index]), rel=1e-12)
+    value = jax.jit(P)
+    difference = (8 * (value(0.501) - value(0.499)) - (value(0.502) - value(0.498))) / 0.012
+    assert float(jax.jit(jax.jacfwd(P))(0.5)) == pytest.approx(float(difference), rel=1e-7)

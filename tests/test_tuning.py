@@ -1,0 +1,66 @@
+"""Tuned quantities reach the device by whatever name; names and bounds that cannot be are refused."""
+
+import math
+
+import jax
+import numpy as np
+import pytest
+
+from vijax import tuning
+from vijax.model import Harvester
+
+DEVICE = Harvester(A=3.0, omega=10 * math.pi, s=0.006)
+
+
+@pytest.mark.parametrize("name", [name for name in tuning.NAMES if name not in ("beta", "gamma")])
+def test_a_device_has_what_was_tuned(name):
+    wanted = 1.1 * float(tuning.value_of(DEVICE, name))
+    device = tuning.tuned(DEVICE, (name,), np.array([math.log(wanted)]))
+    assert float(tuning.value_of(device, name)) == pytest.approx(wanted, rel=1e-14)
+    changed = [float(a) != float(b) for a, b in zip(jax.tree.leaves(device), jax.tree.leaves(DEVICE), strict=True)]
+    assert sum(changed) == 1
+
+
+@pytest.mark.parametrize("name", ["beta", "gamma"])
+def test_inclinations_may_be_negative(name):
+    device = tuning.tuned(DEVICE, (name,), np.array([-0.02]))
+    assert float(tuning.value_of(device, name)) == pytest.approx(-0.02, rel=1e-13)
+
+
+def test_a_dimensionless_name_follows_what_is_tuned_beside_it():
+    names = ("kappa", "omega")
+    device = tuning.tuned(DEVICE, names, np.log([5.0, 20.0]))
+    assert float(device.omega0) == pytest.approx(5 * 20 / math.pi, rel=1e-14)
+
+
+def test_values_and_variables_are_inverse():
+    names, x = ("omega0", "beta", "r"), np.array([[30.0, -0.05, 0.5], [40.0, 0.0, 0.9]])
+    np.testing.assert_allclose(tuning.values(names, tuning.variables(names, x)), x, rtol=1e-14)
+
+
+def test_bounds_stand_unless_given():
+    low, high = tuning.limits(("omega0", "r", "V"), {"r": (0.2, 0.4)}, DEVICE)
+    np.testing.assert_allclose([low, high], [[20.0, 0.2, 1000.0], [4000.0, 0.4, 4000.0]])
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [((), "at least one"), (("mass",), "must be among"), (("omega0", "kappa"), "once; got omega0 and kappa")],
+)
+def test_names_that_cannot_be_are_told(names, words):
+    with pytest.raises(ValueError, match=words):
+        tuning.check_names(names)
+
+
+@pytest.mark.parametrize(
+    ("names", "bounds", "words"),
+    [
+        (("omega0",), {"r": (0.1, 0.2)}, "not among omega0"),
+        (("omega0",), {"omega0": (40.0, 20.0)}, "the lower first"),
+        (("r",), {"r": (0.5, 1.2)}, "r must lie in"),
+        (("gamma",), {"gamma": (-1.0, 9.0)}, r"g/A, g/A\], here \+-3.26"),
+    ],
+)
+def test_bounds_that_cannot_be_are_told(names, bounds, words):
+    with pytest.raises(ValueError, match=words):
+        tuning.limits(names, bounds, DEVICE)
