@@ -4,7 +4,10 @@ import json
 
 import command
 import design as script
+import numpy as np
 import pytest
+
+from vijax.store import write_json
 
 SMALL = ["--d", "0.2", "--r", "0.5", "--A", "3", "--omega", "10pi", "--set", "V=1700"]
 # Of the issue's reference.
@@ -59,6 +62,16 @@ def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, say):
 def strict(path):
     """A report; what is no strict JSON raises."""
     return json.loads(path.read_text(encoding="utf-8"), parse_constant=pytest.fail)
+
+
+def test_a_report_is_strict_json_whole_or_not_at_all(folder):
+    write_json(
+        {"a": np.array([1.0, np.nan]), "b": (np.float64(np.inf), np.bool_(True), None, "c")}, folder / "one.json"
+    )
+    assert strict(folder / "one.json") == {"a": [1.0, None], "b": [None, True, None, "c"]}
+    with pytest.raises(TypeError):
+        write_json({"a": object()}, folder / "two.json")
+    assert [path.name for path in folder.iterdir()] == ["one.json"]
 
 
 def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys, monkeypatch):
