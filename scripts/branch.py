@@ -7,7 +7,6 @@
 The orbits start at the parameters given, with the impacts asked for: walls in order, such as RLL, or a label n:m/pT.
 """
 
-import math
 import sys
 import time
 from collections import Counter
@@ -18,7 +17,6 @@ import command
 
 if TYPE_CHECKING:
     from vijax.branch import Branch
-    from vijax.model import Harvester, ImpactPair
 
 _DEFAULT_FILES = ("branch.zarr", "branch.png")
 _START = {"d": "0.2", "kappa": "400"}
@@ -66,7 +64,7 @@ def branch(
 
     with command.door():
         store, picture = command.targets(out, plot, _DEFAULT_FILES, overwrite)
-        pair, device = _start(command.take_axes(given, _START), command.device(constants), wall)
+        pair, device = command.at_one_point(command.take_axes(given, _START), command.device(constants), wall)
         name, within = _bounds(along)
         if guesses < 1 or generations < 0:
             raise ValueError(f"guesses must be at least 1 and generations at least 0; got {guesses}, {generations}")
@@ -91,23 +89,6 @@ def branch(
         chart.branches(dataset, path, quantity)
 
     command.finish(dataset, _summary(followed, seconds), store, picture, draw, overwrite)
-
-
-def _start(axes: dict[str, Any], device: "Harvester", wall: str) -> "tuple[ImpactPair, Harvester]":
-    """The pair that the orbits start at, and the device that has it."""
-    from vijax.axes import cells
-    from vijax.model import impact_pair, with_constants, with_pair
-
-    for name, values in axes.items():
-        if values.size != 1:
-            raise ValueError(f"{name} must be one number where orbits start; got {values.size} of them")
-    if wall not in ("soft", "rigid"):
-        raise ValueError(f'wall must be "soft" or "rigid"; got {wall!r}')
-    given = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
-    d, kappa, r, gamma, A, omega = (float(given[name]) for name in ("d", "kappa", "r", "gamma", "A", "omega"))
-    device = with_constants(device, A=A, omega=omega, omega0=kappa * omega / math.pi)
-    pair = impact_pair(d, kappa if wall == "soft" else None, r, gamma)
-    return pair, with_pair(device, pair)
 
 
 def _bounds(along: str) -> tuple[str, tuple[float, float]]:

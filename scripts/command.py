@@ -3,6 +3,7 @@
 A script is a click command whose body is one `door`, one run under `progress`, and one `finish`.
 """
 
+import math
 import os
 import time
 from collections import Counter
@@ -16,7 +17,7 @@ import click
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.model import Harvester
+    from vijax.model import Harvester, ImpactPair
 
 _STARTED = time.perf_counter()
 VALUES = (
@@ -57,10 +58,10 @@ def device_options() -> list[click.Parameter]:
     return [click.Option(["--set", "constants"], multiple=True, metavar="NAME=VALUE", help=text)]
 
 
-def file_options() -> list[click.Parameter]:
-    """The store, the picture, and whether they may replace what is there."""
+def file_options(ending: str = ".zarr", what: str = "store") -> list[click.Parameter]:
+    """The store (or what a script writes in its place), the picture, and whether they may replace what is there."""
     return [
-        click.Option(["--out"], metavar="FILE.zarr", help="store to write"),
+        click.Option(["--out"], metavar=f"FILE{ending}", help=f"{what} to write"),
         click.Option(["--plot"], metavar="FILE.png", help="picture to write"),
         click.Option(["--overwrite"], is_flag=True, help="replace what is there"),
     ]
@@ -101,16 +102,33 @@ def device(constants: Iterable[str]) -> "Harvester":
     return with_constants(Harvester(), **values)
 
 
+def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft") -> "tuple[ImpactPair, Harvester]":
+    """The pair that the axes give, each by one number, and the device that has it."""
+    from vijax.axes import cells
+    from vijax.model import impact_pair, with_constants, with_pair
+
+    for name, values in axes.items():
+        if values.size != 1:
+            raise ValueError(f"{name} must be one number here; got {values.size} of them")
+    if wall not in ("soft", "rigid"):
+        raise ValueError(f'wall must be "soft" or "rigid"; got {wall!r}')
+    given = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
+    d, kappa, r, gamma, A, omega = (float(given[name]) for name in ("d", "kappa", "r", "gamma", "A", "omega"))
+    device = with_constants(device, A=A, omega=omega, omega0=kappa * omega / math.pi)
+    pair = impact_pair(d, kappa if wall == "soft" else None, r, gamma)
+    return pair, with_pair(device, pair)
+
+
 def targets(
-    out: str | None, plot: str | None, defaults: tuple[str, str], overwrite: bool
+    out: str | None, plot: str | None, defaults: tuple[str, str], overwrite: bool, ending: str = ".zarr"
 ) -> tuple[Path | None, Path | None]:
     """Store and picture to write, both defaults where neither was given; raises unless they can be written."""
     from vijax.store import check_output
 
     if out is None and plot is None:
         out, plot = defaults
-    if out is not None and not out.endswith(".zarr"):
-        raise ValueError(f"out must end in .zarr; got {out!r}")
+    if out is not None and not out.endswith(ending):
+        raise ValueError(f"out must end in {ending}; got {out!r}")
     return (
         None if out is None else check_output("out", out, overwrite),
         None if plot is None else check_output("plot", plot, overwrite),
@@ -166,8 +184,13 @@ def finish(
         save(dataset, out, overwrite=overwrite)
     if plot is not None:
         picture(dataset, plot)
+    close(summary, out, plot)
+
+
+def close(summary: str, *written: Path | None) -> None:
+    """Say what the run found, what was written and how long it all took."""
     click.echo(summary)
-    click.echo(f"wrote {', '.join(str(path) for path in (out, plot) if path)}")
+    click.echo(f"wrote {', '.join(str(path) for path in written if path)}")
     click.echo(f"{time.perf_counter() - _STARTED:.1f} s from start to end")
 
 

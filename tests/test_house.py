@@ -95,14 +95,16 @@ ROOMS: dict[str, set[str]] = {
     "figures": {"model", "curve", "orbit", "paper", "portrait", "cached"},
     "evidence": {"model", "orbit", "branch", "attractor", "label", "cached", "paper"},
     "claims": {"model", "branch", "attractor", "diagram", "grid", "cached", "paper", "evidence"},
+    "report": {"model", "energy", "design", "objective", "surroundings", "tolerance", "tuning"},
     "chart": {"store", "style"},
+    "blueprint": {"report", "store", "style", "tuning"},
     "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style"},
 }
 ROOMS["__init__"] = set(ROOMS)
 
 ONLY_IN = {
     "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
-    "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py"},
+    "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py", "vijax/blueprint.py"},
 }
 NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]
 IMPORT_SECONDS = 1.5

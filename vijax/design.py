@@ -144,9 +144,7 @@ def optimise_all(
     """
     devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
     looks, periods = whole("looks", looks, 2), whole("periods", periods, 1)
-    check_names(tune)
-    _check(devices, objective, scatter)
-    box = np.array([variables(tune, limits(tune, bounds or {}, device)) for device in devices])
+    box = check(devices, tune, bounds or {}, objective, scatter)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
     met = _survey(devices, tune, box, periods)
@@ -202,7 +200,15 @@ def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None
     return Spread(*(float(x[0]) for x in aims.spread(scene, batch)))
 
 
-def _check(devices: list[Harvester], objective: str, tolerances: tuple[Tolerance, ...]) -> None:
+def check(
+    devices: list[Harvester],
+    tune: tuple[str, ...],
+    bounds: Mapping[str, tuple[float, float]],
+    objective: str,
+    tolerances: tuple[Tolerance, ...],
+) -> np.ndarray:
+    """Bounds [device, 2, variable] of what `optimise_all` is asked for; raises ValueError as it does, runs nothing."""
+    check_names(tune)
     if not devices:
         raise ValueError("devices must hold at least one; got none")
     if objective not in OBJECTIVES:
@@ -218,6 +224,7 @@ def _check(devices: list[Harvester], objective: str, tolerances: tuple[Tolerance
         need = "come with objective mean or worst" if tolerances else "be given with objective mean or worst"
         raise ValueError(f"tolerances must {need}; got {len(tolerances)} with objective {objective!r}")
     check_tolerances(tolerances, bounded=objective == "worst")
+    return np.array([variables(tune, limits(tune, bounds, device)) for device in devices])
 
 
 class _Met(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike
 
 from vijax import energy, simulate
 from vijax.axes import AXES, cells, check_axis
-from vijax.dataset import Plan, coordinates, flagged, provenance
+from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance
 from vijax.grid import Axes
 from vijax.method import whole
 from vijax.model import Harvester, ImpactPair, State, Status
@@ -38,6 +38,7 @@ _POINTS = {
     "impacts_right": ("1", "right impacts in `period` periods, -1 unless period > 0"),
     "status": ("1", "how the point ended"),
     "filled": ("1", "impacts in the kept periods"),
+    **{name: OUTPUTS[name][:2] for name in ("max_penetration", "energy_ratio", "admissible")},
 }
 _IMPACTS = {
     "phase": ("1", "phase of the onset, in half forcing periods from that of the greatest forcing"),
@@ -100,7 +101,8 @@ def orbit_diagram(
         [0, 2), `period_number`, `side`, `v_in`, `v_out`, `restitution`, `duration`, `depth` [m], `E` [J]. Over
         strobes: `u_strobe`, `v_strobe` at the end of every kept period. Over points: `P` [J per half period] (over
         whole periods of the orbit; of an aperiodic motion over its last three quarters), `period`, `impacts_left`,
-        `impacts_right`, `status`, `filled`.
+        `impacts_right`, `status`, `filled`, and, over the same impacts as P, `max_penetration` [m], `energy_ratio` and
+        `admissible`.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
@@ -268,7 +270,10 @@ def _simulate(
         "u_strobe": flown.u,
         "v_strobe": flown.v,
     }
-    points = {"P": summary.P[..., 0]}
+    points = {"P": summary.P[..., 0], "energy_ratio": summary.energy_ratio[..., 0]}
+    points["max_penetration"] = summary.deepest * table["depth"]
+    within = points["max_penetration"] <= float(planned.device.depth_limit)
+    points["admissible"] = within & (points["energy_ratio"] <= 1)
     points |= {name: getattr(summary, name) for name in ("period", "impacts_left", "impacts_right", "status")}
     return points | {name: values.reshape(shape + values.shape[1:]) for name, values in fields.items()}
 

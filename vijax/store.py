@@ -1,11 +1,15 @@
-"""Maps on disk: zarr stores that are whole or absent, each chunk with a checksum."""
+"""Maps on disk: zarr stores that are whole or absent, each chunk with a checksum; reports as strict JSON."""
 
+import json
+import math
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -90,3 +94,22 @@ def load(path: str | Path) -> "xr.Dataset":
         raise FileNotFoundError(f"path must name a zarr store written by vijax.save; got {path}")
     with xr.open_zarr(path, consolidated=False, chunks=None) as dataset:
         return dataset.load()
+
+
+def write_json(report: Any, path: Path) -> None:
+    """Write nested dicts, sequences, arrays and numbers as strict JSON, whole or not at all; not finite is null."""
+    text = json.dumps(_plain(report), indent=1, allow_nan=False)
+    with replacing(path) as part:
+        part.write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(name): _plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if hasattr(value, "__array__"):
+        return _plain(np.asarray(value).tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,119 @@
+"""Pictures of designs: the optimum, its band, what is not physical and where, from made-up diagrams and reports."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.colors import to_rgba
+
+from vijax import blueprint
+
+GREEN = to_rgba(blueprint._STAR["color"])
+
+
+def diagram(along="omega0", bounds=(20.0, 60.0)) -> xr.Dataset:
+    """P = 1 uJ everywhere, 9 uJ and inadmissible in the fourth point; rising, the last point yields nothing."""
+    x = np.linspace(*bounds, 9)
+    power = np.full((2, 9), 1e-6)
+    power[:, 3], power[1, 8] = 9e-6, 0.0
+    good = np.ones((2, 9), bool)
+    good[:, 3], good[0, 8] = False, False
+    dims = ("direction", along)
+    coords = {along: (along, x, {"units": "1", "symbol": along}), "direction": ["down", "up"], "r": 0.5}
+    return xr.Dataset({"P": (dims, power), "admissible": (dims, good)}, coords, {"along": along})
+
+
+def report(**changed):
+    best = {
+        "values": {"omega0": 50.0},
+        "pair": {"d": 0.2, "kappa": 5.0, "r": 0.5, "gamma": 0.0},
+        "device": {"omega0": 50.0, "m_b": 0.0035},
+        "omega0": 50.0,
+        "P": 1e-6,
+        "label": "1:1",
+        "active": [],
+        "stopped": "maximum",
+        "path": [[58.0], [52.0], [50.0]],
+        "heights": [0.5e-6, 0.9e-6, 1e-6],
+    }
+    edges = {"below": {"kind": "fold", "omega0": 45.0}, "above": {"kind": "none", "omega0": 75.0}}
+    highest = {"along": "omega0", "value": 35.0, "P": 9e-6, "admissible": False, "max_penetration": 0.02}
+    whole = {"best": best, "tune": ["omega0"], "objective": "P", "surroundings": edges, "highest": highest}
+    return whole | {"tolerances": [{"name": "omega0", "spread": 0.05, "kind": "uniform"}], "spread": None} | changed
+
+
+def words(figure) -> list[str]:
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def line(axes, label):
+    (found,) = [one for one in axes.get_lines() if str(one.get_label()).startswith(label)]
+    return found
+
+
+def span(axes, label):
+    (found,) = [one for one in axes.patches if one.get_label() == label]
+    return pytest.approx((found.get_x(), found.get_x() + found.get_width()))
+
+
+def test_the_optimum_its_band_its_edge_and_the_ascent_are_where_the_report_says(tmp_path):
+    figure = blueprint.design(diagram(), report(), tmp_path / "design.png")
+    assert (tmp_path / "design.png").stat().st_size > 0
+    for axes in figure.axes:
+        np.testing.assert_allclose(line(axes, "optimum").get_xydata(), [[50, 1e-6]])
+        np.testing.assert_allclose(line(axes, "ascent").get_xdata(), [58, 52, 50])
+        assert set(line(axes, "fold").get_xdata()) == {45.0}
+        assert span(axes, "tolerance") == (47.5, 52.5)
+    assert figure.axes[1].get_xlim() == pytest.approx(blueprint.close_view("omega0", 50.0))
+
+
+def test_what_an_optimiser_without_constraints_would_report_is_marked_and_its_range_veiled():
+    figure = blueprint.design(diagram(), report())
+    naive = line(figure.axes[0], "what $P$ alone would choose")
+    np.testing.assert_allclose(naive.get_xydata(), [[35, 9e-6]])
+    assert "9 $\\mu$J, 20 mm deep" in naive.get_label()
+    assert span(figure.axes[0], "inadmissible") == (32.5, 37.5)
+    # The last point is veiled too: what is admissible there yields nothing.
+    veils = [one for one in figure.axes[0].patches if one.get_hatch()]
+    assert [one.get_x() for one in veils] == pytest.approx([32.5, 57.5])
+
+
+def test_nothing_unphysical_is_shown_where_the_optimum_is_the_highest():
+    highest = report()["highest"] | {"P": 0.5e-6}
+    assert not [word for word in words(blueprint.design(diagram(), report(highest=highest))) if "alone" in word]
+
+
+def test_the_edge_and_the_band_move_with_the_square_in_k():
+    best = report()["best"] | {"values": {"k": 8.75}, "path": [[9.0], [8.75]], "heights": [0.9e-6, 1e-6]}
+    axes = blueprint.design(diagram("k", (5.0, 12.0)), report(best=best, tune=["k"])).axes[0]
+    assert span(axes, "tolerance") == (8.75 * 0.95**2, 8.75 * 1.05**2)
+    np.testing.assert_allclose(line(axes, "fold").get_xdata(), 8.75 * 0.9**2)
+
+
+def test_without_an_optimum_the_curves_remain():
+    figure = blueprint.design(diagram(), report(best=None))
+    assert len(figure.axes) == 1
+    assert "optimum" not in " ".join(words(figure))
+
+
+def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
+    held = [report(spread={"worst": 0.2e-6}), report(best=None), report(spread={"worst": 0.2e-6})]
+    held[0]["best"]["active"] = ["penetration limit at the right wall"]
+    found = {"over": {"name": "d", "values": [0.1, 0.2, 0.3]}, "designs": held}
+    figure = blueprint.design_map(found, tmp_path / "map.png")
+    assert (tmp_path / "map.png").stat().st_size > 0
+    upper, lower = figure.axes
+    assert words(figure) == ["penetration limit", "nothing: interior", "worst within the tolerances"]
+    assert [one.get_xydata().tolist() for one in upper.get_lines() if one.get_xdata().size] == [
+        [[0.1, 50]],
+        [[0.3, 50]],
+    ]
+    interior = line(lower, "nothing: interior")
+    assert interior.get_xydata().tolist() == [[0.3, 1e-6]]
+    assert to_rgba(interior.get_color()) == GREEN
+
+
+def test_a_picture_of_another_kind_is_refused(tmp_path):
+    for draw in (lambda path: blueprint.design(diagram(), report(), path), lambda path: blueprint.design_map({}, path)):
+        with pytest.raises(ValueError, match="plot must end in"):
+            draw(tmp_path / "picture.txt")
+    assert not list(tmp_path.iterdir())
