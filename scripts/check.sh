@@ -8,5 +8,6 @@ python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 ruff check .
 ruff format --check .
 mypy
+mypy benchmarks
 # A file to a process: the programs that its tests share are compiled once.
 pytest -n 2 --dist loadfile "$@"

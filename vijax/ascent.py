@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 _MEMORY = 8  # pairs of points that L-BFGS keeps
 _FIRST, _LAST = 0.03, 1e-9  # weight of the barrier
+_CONVERGED = 1e-6  # weight at which a maximum is one to six digits
 _FALL = 0.1  # of the weight, at a step
 _NEAR = 0.95  # share of the way to a constraint that one step may go
 _ARRIVED = 1e-8  # a step this short is the last
@@ -169,6 +170,11 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
         state=state,
     )
     return lax.while_loop(lambda c: c.going.any() & (c.trip < looks), advance, start)
+
+
+def converged(c: Climb) -> Bool[Array, "start"]:
+    """Which ended with a barrier that no longer matters; the others stalled, or lost their point."""
+    return c.weight <= _CONVERGED
 
 
 def _choose(which: Bool[Array, "start"], a: Array, b: Array) -> Array:

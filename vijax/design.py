@@ -19,7 +19,7 @@ import numpy as np
 from vijax import lanes
 from vijax import objective as aims
 from vijax import orbit as orbits
-from vijax.ascent import Box, Climb, ascend
+from vijax.ascent import Box, Climb, ascend, converged
 from vijax.axes import START
 from vijax.energy import harvested_energy
 from vijax.method import whole
@@ -57,7 +57,8 @@ class Optimum:
         gradient: Derivative of the objective's logarithm in the logarithm of each quantity (in an inclination itself).
         active: What holds it there: constraints at which impact, bounds of which quantity.
         stopped: "maximum"; "supremum", where the objective rises up to the end of the orbit, which no orbit attains;
-            or "looks", when these were spent.
+            "looks", when these were spent; "stalled", where no step is higher though the gradient is not zero: at a
+            kink, such as a worst case has where two devices are alike; "weighted", of `surroundings.weighted`.
         looks: Evaluations of objective with gradient that it took.
         path: Accepted points [look, quantity], the start first, and the objective there.
         heights: See `path`.
@@ -316,6 +317,7 @@ class _End(NamedTuple):
     margins: np.ndarray  # of the nominal device and all nodes, [node, two an impact]; then lower and upper bounds
     knots: np.ndarray
     lost: bool
+    settled: bool
     looks: int
     path: np.ndarray
     heights: np.ndarray
@@ -334,7 +336,9 @@ def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_E
         sequence = Sequence(side, orbit.sequence.span, orbit.sequence.mirrored)
         device = jax.tree.map(lambda x: jnp.asarray(x[rows]), given)
         end = work(scene, Batch(device, sequence, knots, *(jnp.asarray(x) for x in (starts.z[rows], low, high))))
-        seen, lost, taken = (jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, end.looks))
+        seen, lost, settled, taken = (
+            jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, converged(end), end.looks)
+        )
         path, heights, z = np.asarray(end.path), np.asarray(end.heights), np.asarray(end.z)
         for row, index in enumerate(rows[: tile.real]):
             ends[index] = _End(
@@ -344,6 +348,7 @@ def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_E
                 seen.margins[row],
                 seen.memory.knots[row, 0],
                 bool(lost[row]),
+                bool(settled[row]),
                 int(taken[row]),
                 path[:, row],
                 heights[:, row],
@@ -385,13 +390,21 @@ def _optima(scene: Scene, starts: _Met, ends: list[_End], devices: list[Harveste
                 state=jax.tree.map(lambda x, row=row: np.asarray(x)[row], states),
                 gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
                 active=_active(scene, end, found.sequence.side[row]),
-                stopped="supremum" if end.lost else "looks" if end.looks >= looks else "maximum",
+                stopped=_reason(end, looks),
                 looks=end.looks,
                 path=np.asarray(values(scene.names, end.path[there])),
                 heights=np.exp(end.heights[there]),
             )
         )
     return optima
+
+
+def _reason(end: _End, looks: int) -> str:
+    if end.lost:
+        return "supremum"
+    if end.settled:
+        return "maximum"
+    return "looks" if end.looks >= looks else "stalled"
 
 
 def _apart(good: list[int], ends: list[_End], owner: np.ndarray) -> Iterator[list[int]]:

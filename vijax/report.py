@@ -195,8 +195,12 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
         f"in contact {room['contact']:.4g}, slowest exit over its entry {room['exit']:.4g}"
     )
     gradient = ", ".join(f"{name} {slope:.3g}" for name, slope in best["gradient"].items())
-    held = ", ".join(best["active"]) or "nothing, an interior optimum"
-    why = {"supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains"}
+    interior = best["stopped"] == "maximum"
+    held = ", ".join(best["active"]) or ("nothing, an interior optimum" if interior else "nothing")
+    why = {
+        "supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains",
+        "stalled": "no step is higher though the gradient is not zero: a kink",
+    }
     yield f"  stopped after {best['looks']} evaluations: {why.get(best['stopped'], best['stopped'])}"
     yield f"  held by: {held}"
     smooth = ", of a smoothed minimum" if objective == "worst" else ""
@@ -274,4 +278,4 @@ def table(report: dict[str, Any]) -> Iterator[str]:
 
 
 def _held(best: dict[str, Any]) -> str:
-    return ", ".join(best["active"]) or ("supremum" if best["stopped"] == "supremum" else "interior")
+    return ", ".join(best["active"]) or ("interior" if best["stopped"] == "maximum" else best["stopped"])
