@@ -75,7 +75,9 @@ def test_paths_rise_and_begin_at_an_attractor(found):
         assert one.heights[-1] == one.height
     best = found[0].best
     assert best.heights[-1] > best.heights[0]
-    assert (np.diff(best.heights) > -1e-3 * best.height).all()
+    # What never falls is the height with the barrier, whose weight is 0.03 at first.
+    assert (np.diff(best.heights) > -0.02 * best.height).all()
+    assert best.heights.argmax() >= len(best.heights) - 2
 
 
 def test_a_supremum_is_no_maximum(found):

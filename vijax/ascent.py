@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 _MEMORY = 8  # pairs of points that L-BFGS keeps
 _FIRST, _LAST = 0.03, 1e-9  # weight of the barrier
 _CONVERGED = 1e-6  # weight at which a maximum is one to six digits
-_FALL = 0.1  # of the weight, at a step
+_FALL, _HASTE = 0.1, 1.5  # of the weight: at least by this factor, and to this power, as the path is smoother nearby
 _NEAR = 0.95  # share of the way to a constraint that one step may go
 _ARRIVED = 1e-8  # a step this short is the last
 _STUCK = 1e-9  # so is a trial refused this near
@@ -124,7 +124,8 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
         promised = (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
         inside = _inside(c.seen)
         falls = better & inside & (c.pace == 1) & (promised < c.weight)
-        weight = jnp.where(falls, jnp.maximum(_FALL * c.weight, _LAST), c.weight)
+        lower = jnp.minimum(_FALL * c.weight, c.weight**_HASTE)
+        weight = jnp.where(falls, jnp.maximum(lower, _LAST), c.weight)
         # Curvature compares gradients of one function: that before, under the new weight; none across the border.
         state = c.state._replace(updates=-_gradient(c.seen, weight))
         crossed = better & ~inside & _inside(seen)

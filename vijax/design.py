@@ -35,9 +35,12 @@ from vijax.tuning import check_names, limits, moving, tuned, values, variables
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
 _WIDTHS = (2, 8)  # impacts that orbits are padded to
 _TILE = 64  # starts of one compiled call
+_FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
+_ONE = 1e-6  # starts that agree so closely are one
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
-_STARTS = (START, (0.0, 0.25))  # displacement and velocity of the survey's chains, the first in parts of no gap
+# Displacement and velocity of the chains of a survey; a gap that does not hold one moves it in.
+_STARTS = (START, (0.0, 0.25), (0.0, 1.0), (0.05, -1.5))
 _REACH = 0.49  # of the gap that a start's displacement may take
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
 _HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
@@ -296,7 +299,10 @@ def _promising(met: _Met, objective: str) -> np.ndarray:
     alike &= (side[1:] == side[:-1]).all(axis=1) & (np.diff(np.asarray(orbit.sequence.span)) == 0)
     behind = np.append(False, alike & (score[:-1] > score[1:]))
     ahead = np.append(alike & (score[1:] > score[:-1]), False)
-    return np.flatnonzero(~behind & ~ahead)
+    best = np.flatnonzero(~behind & ~ahead)
+    # Chains meet each other's orbits.
+    place = np.round(np.column_stack([met.owner, met.z, orbits.marks(orbit)])[best] / _ONE)
+    return np.sort(best[np.unique(place, axis=0, return_index=True)[1]])
 
 
 @lru_cache(maxsize=8)
@@ -373,7 +379,7 @@ def _optima(scene: Scene, starts: _Met, ends: list[_End], devices: list[Harveste
     own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
     many = jax.tree.map(lambda *x: jnp.array(x), *own)
     found = _at(starts.orbit[np.array(good)], jax.vmap(lambda d: d.pair())(many), [ends[i].knots for i in good])
-    states = _compiled_states()(many, found)
+    states = _states(many, found)
     attracts = (np.asarray(found.status) == Status.OK) & (np.asarray(states.status) == Status.OK)
     names = orbits.labels(found)
     optima: list[list[Optimum]] = [[] for _ in devices]
@@ -427,6 +433,15 @@ def _at(orbit: Orbit, pair: ImpactPair, knots: list[np.ndarray]) -> Orbit:
 @lru_cache(maxsize=1)
 def _compiled_states():
     return jax.jit(jax.vmap(steady), compiler_options=lanes.compiler_options())
+
+
+def _states(devices: Harvester, orbit: Orbit) -> Steady:
+    """The steady states of devices with known orbits, in padded tiles."""
+    given, parts = jax.tree.map(np.asarray, devices), []
+    for tile in lanes.tiles(len(orbit), _FEW):
+        found = _compiled_states()(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
+        parts.append(jax.tree.map(lambda x, real=tile.real: np.asarray(x)[:real], found))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 def _active(scene: Scene, end: _End, side: Any) -> tuple[str, ...]:

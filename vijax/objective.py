@@ -22,6 +22,7 @@ OBJECTIVES = {
     "worst": "least P over the tolerances [J]",
 }
 _STEPS = 4  # from the nominal orbit to that of a device off by its tolerance
+_TRIPS = 16  # of Newton's search for an orbit near a known one: lost ones take them all
 _SHARP = 300.0  # of the soft minimum whose gradient stands for that of the worst case
 _MOST = 20.0  # logarithms of margins end here: no contact, no voltage
 
@@ -89,7 +90,8 @@ def _settled(scene: Scene, batch: Batch, z, factors, guess):
     starts, count = guess.shape[:2]
     sequence = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), batch.sequence)
     flat = jax.tree.map(lambda x: x.reshape(starts * count, *x.shape[2:]), (pair, guess))
-    return jax.tree.map(lambda x: x.reshape(starts, count, *x.shape[1:]), shooting.newton(flat[0], sequence, flat[1]))
+    found = shooting.newton(flat[0], sequence, flat[1], _TRIPS)
+    return jax.tree.map(lambda x: x.reshape(starts, count, *x.shape[1:]), found)
 
 
 def begin(scene: Scene, batch: Batch) -> Known:

@@ -209,9 +209,12 @@ class _Descent(eqx.Module):
 
 
 def newton(
-    pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]
+    pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"], trips: int = _TRIPS
 ) -> tuple[Float[Array, "orbit impact 3"], Float[Array, "orbit"]]:
     """Damped Newton on a batch of orbits: a step that does not shorten what is missing is halved.
+
+    Args:
+        trips: Evaluations that a search may take; the batch takes as many as its slowest search.
 
     Returns:
         The knots, and the largest residual at each; inf where the search stalled, or left what is possible.
@@ -246,7 +249,7 @@ def newton(
     # The first trial is the guess itself.
     zero, far = jnp.zeros_like(knots), jnp.full(knots.shape[0], jnp.inf)
     start = _Descent(knots, zero, far, jnp.ones_like(far), far > 0, jnp.int32(0))
-    end = lax.while_loop(lambda d: d.going.any() & (d.trip < _TRIPS), advance, start)
+    end = lax.while_loop(lambda d: d.going.any() & (d.trip < trips), advance, start)
     arrived = (end.missing < jnp.inf) & ((size(end.step) <= _LAST_STEP) | (end.missing < _FLOOR))
     knots = jnp.where(arrived[:, None, None], end.knots - end.step, end.knots)
     residual = jnp.abs(jax.vmap(gap)(pair, sequence, knots)).max(axis=1)
