@@ -20,7 +20,7 @@ def found():
     kappa = np.stack([KAPPA, KAPPA[::-1], KAPPA])
     d = np.array([0.2, 0.2, 0.12])[:, None] * np.ones_like(kappa)
     one = np.ones_like(kappa)
-    return survey(ImpactPair(d, kappa, 0.5 * one, 0 * one), np.full(3, 0.05853), np.full(3, -0.47898))
+    return survey(ImpactPair(d, kappa, 0.5 * one, 0 * one), np.full(3, 0.05853), np.full(3, -0.47898), np.ones(3))
 
 
 def test_orbits_are_those_of_a_sweep(found):

@@ -39,8 +39,8 @@ _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
 _ONE = 1e-6  # starts that agree so closely are one
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
-# Displacement and velocity of the chains of a survey; a gap that does not hold one moves it in.
-_STARTS = (START, (0.0, 0.25), (0.0, 1.0), (0.05, -1.5))
+# Factors on the velocity that cells of a survey hand on: one chain follows an attractor, the others leave its basin.
+_KICKS = (1.0, -1.0, 0.3, 2.5)
 _REACH = 0.49  # of the gap that a start's displacement may take
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
 _HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
@@ -122,7 +122,7 @@ def optimise_all(
     tolerances: Iterable[Tolerance] = (),
     samples: int | None = None,
     looks: int = 60,
-    periods: int = 400,
+    periods: int = 200,
 ) -> list[Design]:
     """The admissible designs that harvest most, each device's tuned quantities between bounds.
 
@@ -260,22 +260,22 @@ def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, pe
     ways = (ladder, ladder[::-1]) if first is not None else (ladder,)
     rows: list[np.ndarray] = []
     mine: list[int] = []
-    begun: list[tuple[float, float]] = []
+    kicks: list[float] = []
     for index, (low, high) in enumerate(box):
-        for place, way, start in itertools.product(itertools.product(*levels), ways, _STARTS):
+        for place, way, kick in itertools.product(itertools.product(*levels), ways, _KICKS):
             parts = np.tile(np.array(place), (ladder.size, 1))
             if first is not None:
                 parts[:, first] = way
             rows.append(low + parts * (high - low))
             mine.append(index)
-            begun.append(start)
-    z, owner, (u0, v0) = np.array(rows), np.array(mine), np.array(begun).T
+            kicks.append(kick)
+    z, owner = np.array(rows), np.array(mine)
     given = jax.tree.map(lambda *x: np.array(x, float), *devices)
     wide = jax.tree.map(lambda x: np.repeat(x[owner], ladder.size), given)
     every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(wide, z.reshape(-1, len(tune)))
     pair = jax.tree.map(lambda x: np.asarray(x).reshape(owner.size, -1), jax.vmap(lambda d: d.pair())(every))
-    room = _REACH * pair.d[:, 0]
-    found = survey(pair, np.clip(u0, -room, room), v0, periods=periods)
+    u0, v0 = np.minimum(START[0], _REACH * pair.d[:, 0]), np.full(owner.size, START[1])
+    found = survey(pair, u0, v0, np.array(kicks), periods=periods)
     cell = found.chain * ladder.size + found.link
     own = jax.tree.map(lambda x: np.asarray(x)[cell], every)
     return _Met(found.orbit, own, z.reshape(-1, len(tune))[cell], owner[found.chain], found.chain, found.link)

@@ -28,13 +28,21 @@ class Survey(NamedTuple):
 
 
 def survey(
-    pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int = 4, impacts: int = 8, periods: int = 400
+    pair: ImpactPair,
+    u0: np.ndarray,
+    v0: np.ndarray,
+    kick: np.ndarray,
+    *,
+    longest: int = 4,
+    impacts: int = 8,
+    periods: int = 400,
 ) -> Survey:
     """The periodic attractors along chains of cells, each cell starting in the state in which the last one ended.
 
     Args:
         pair: Cells [chain, link], 64 links at most.
         u0, v0: Starts of the chains.
+        kick: Factor on the velocity that a cell hands on to the next: 1 follows an attractor, others leave its basin.
         longest, impacts: Most forcing periods, and most impacts, of an orbit that is wanted.
         periods: Forcing periods that the search for an attractor may take in a cell.
 
@@ -50,7 +58,9 @@ def survey(
         some = np.arange(first, min(first + lanes, chains))
         padded = np.resize(some, lanes)
         wide = jax.tree.map(lambda x: np.pad(x[padded], ((0, 0), (0, LINKS - links)), mode="edge"), pair)
-        return _attractors(wide, (u0[padded], v0[padded]), (some.size, links), (longest, impacts, periods))
+        return _attractors(
+            wide, (u0[padded], v0[padded], kick[padded]), (some.size, links), (longest, impacts, periods)
+        )
 
     firsts = range(0, chains, lanes)
     with ThreadPoolExecutor(workers) as pool:
@@ -67,12 +77,13 @@ def survey(
 def _attractors(pair: ImpactPair, start: tuple, real: tuple[int, int], limits: tuple[int, int, int]):
     """Chain, link, walls, span and knots of every periodic attractor of a tile of chains."""
     longest, impacts, periods = limits
+    u0, v0, kick = start
     chains, links = real
     one = jnp.ones_like(jnp.asarray(pair.d))
     summary = simulate.follow(
         jax.tree.map(jnp.asarray, pair),
-        simulate.Starts(*(jnp.asarray(x) for x in (*start, np.zeros_like(start[0])))),
-        simulate.Growth(one, one),
+        simulate.Starts(jnp.asarray(u0), jnp.asarray(v0), jnp.zeros(u0.shape)),
+        simulate.Growth(one, one * kick[:, None]),
         one,
         one,
         Harvester(),
