@@ -8,6 +8,12 @@ again. Typical printout:
 
     gradients: dP/dkappa of four orbits of 50 digits, forward: largest error 1.8e-15
     gradients: dP/dkappa of four orbits of 50 digits, reverse: largest error 1.0e-15
+    gradients: attractors of random cells; regular ones looked at            2125; 1000
+    gradients: dP/dd: median, largest error against differences; above 1e-06 5.4e-13, 7.9e-04; 4
+    gradients: dP/dkappa: median, largest error against differences; above 1e-06 5.5e-13, 1.0e-07; 0
+    gradients: dP/dr: median, largest error against differences; above 1e-06 1.0e-12, 3.6e-06; 1
+    gradients: d2P/dkappa2: median, largest error against differences; above 1e-05 6.4e-13, 1.1e-06; 0
+    gradients: d2P/dkappa dr: median, largest error against differences; above 1e-05 1.5e-12, 1.3e-06; 0
     reference: small fast device, kappa (4.00713)                            4.00713
     reference: P, microjoule (57.75761)                                      57.75761
     reference: penetration, mm (6.026)                                       6.0266
@@ -20,6 +26,8 @@ again. Typical printout:
     scan: misses, below 0.999                                                14 of 306
     speed: P with dP/dkappa, forward, over P alone                           1.11
     speed: P with dP/d(d, kappa, r), reverse, over P alone                   0.95
+    cliffs: small fast device, kappa 3.69 to 3.72: optima; with a NaN; with no attracting orbit 3; 0; 0
+    cliffs: beside 25 orbits that nearly graze: optima; with a NaN; with no attracting orbit 21; 0; 0
 
 (parts of it; the scan with --points 2000, before surveys kicked their chains)
 """
