@@ -104,9 +104,8 @@ def random_cells() -> Orbit:
     tilt = np.where(np.arange(CHAINS)[:, None] % 2 == 0, 0.0, draw.uniform(-0.05, 0.05, shape))
     kappa = np.exp(draw.uniform(math.log(3), math.log(400), shape))
     columns = draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt
-    return survey(
-        ImpactPair(*map(jnp.asarray, columns)), np.zeros(CHAINS), np.full(CHAINS, 0.25), np.ones(CHAINS)
-    ).orbit
+    starts = np.zeros(CHAINS), np.full(CHAINS, 0.25), np.ones(CHAINS)
+    return survey(ImpactPair(*map(jnp.asarray, columns)), *starts, longest=4, impacts=8, periods=400).orbit
 
 
 def differences(function: Callable[[Any], Any], x: np.ndarray, axis: int) -> np.ndarray:

@@ -9,7 +9,8 @@ import vijax
 from vijax import clearance
 from vijax import orbit as orbits
 from vijax.model import ImpactPair, Status
-from vijax.survey import LINKS, survey
+from vijax.simulate import LINKS
+from vijax.survey import survey
 
 KAPPA = np.geomspace(3, 400, LINKS)
 
@@ -20,7 +21,15 @@ def found():
     kappa = np.stack([KAPPA, KAPPA[::-1], KAPPA])
     d = np.array([0.2, 0.2, 0.12])[:, None] * np.ones_like(kappa)
     one = np.ones_like(kappa)
-    return survey(ImpactPair(d, kappa, 0.5 * one, 0 * one), np.full(3, 0.05853), np.full(3, -0.47898), np.ones(3))
+    return survey(
+        ImpactPair(d, kappa, 0.5 * one, 0 * one),
+        np.full(3, 0.05853),
+        np.full(3, -0.47898),
+        np.ones(3),
+        longest=4,
+        impacts=8,
+        periods=400,
+    )
 
 
 def test_orbits_are_those_of_a_sweep(found):
@@ -50,7 +59,7 @@ def test_chaos_has_no_orbit(found):
 def test_clearances_are_those_of_the_motion_in_between(found):
     some = found.orbit[np.arange(0, len(found.orbit), 7)]
     sequence, knots = some.sequence, jnp.nan_to_num(some.knots)
-    room = jax.jit(jax.vmap(clearance.clearance))(some.pair, sequence, knots)
+    room = jax.jit(jax.vmap(clearance.between))(some.pair, sequence, knots).clearance
     assert (np.stack(room) > 0).all()
     _, u, _ = orbits.path(some, samples=2001)
     for index in range(len(some)):

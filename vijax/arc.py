@@ -109,7 +109,7 @@ def _tests(arc: Arc, y, tangent) -> Tests:
     around = shooting.monodromy(pair, arc.sequence, knots)
     trace = around[0, 0] + around[1, 1]
     determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
-    room = clearance.clearance(pair, arc.sequence, knots)
+    room = clearance.between(pair, arc.sequence, knots).clearance
     return Tests(
         fold=tangent[-1],
         plus=1 - trace + determinant,

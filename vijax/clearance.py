@@ -77,8 +77,17 @@ def _flight_room(pair: ImpactPair, passage: shooting.Passage):
     return jax.vmap(one)(passage.side, passage.speed, passage.t, passage.next_t)
 
 
-def contact_crests(pair: ImpactPair, side, knots: Knots, way: float):
-    """When each contact on a soft wall is deepest (way 1) or shallowest (-1) inside, and the penetration; or NaN."""
+class Between(NamedTuple):
+    """What happens between the onsets: the clearances, and when each contact on a soft wall is deepest (else NaN)."""
+
+    clearance: Clearance
+    deepest: Float[Array, "impact"]
+
+
+def _contacts(pair: ImpactPair, side, knots: Knots):
+    """When each contact is deepest, and its least penetration at a turning point inside where that is a minimum."""
+    if pair.kappa is None:
+        return jnp.full(side.shape, jnp.nan), jnp.full(side.shape, _NOTHING)
     wall = flow.membrane(pair, rolled=True)
 
     def one(side, knot):
@@ -92,32 +101,29 @@ def contact_crests(pair: ImpactPair, side, knots: Knots, way: float):
             w, rate = motion(s)
             return force.at(s) - wall.mu * rate - wall.kappa * wall.kappa * w
 
-        return _crest(_sampled(motion, bend, jnp.maximum(stay, 0.0)), way)
+        stretch = _sampled(motion, bend, jnp.maximum(stay, 0.0))
+        (deepest, _), (_, low) = _crest(stretch, 1.0), _crest(stretch, -1.0)
+        return deepest, jnp.where(jnp.isnan(low), _NOTHING, low)
 
     return jax.vmap(one)(side, knots)
 
 
-def _contact_room(pair: ImpactPair, side, knots: Knots):
-    """Least penetration at a turning point inside each contact where it is a minimum."""
-    if pair.kappa is None:
-        return jnp.full(side.shape, _NOTHING)
-    _, low = contact_crests(pair, side, knots, -1.0)
-    return jnp.where(jnp.isnan(low), _NOTHING, low)
-
-
-def clearance(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Clearance:
-    """The clearances of an orbit, each the least over its impacts."""
+def between(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Between:
+    """The motion of an orbit between its onsets; clearances are the least over its impacts."""
     real = sequence.real
     # Padded impacts are given harmless knots.
     knots = jnp.where(real[:, None], knots, 1.0)
     passage = shooting.passages(pair, sequence, knots)
 
+    deepest, shallow = _contacts(pair, passage.side, knots)
+
     def least(values):
         return jnp.where(real, values, _NOTHING).min()
 
-    return Clearance(
+    room = Clearance(
         speed=least(knots[:, 1]),
         flight=least(_flight_room(pair, passage)),
-        contact=least(_contact_room(pair, passage.side, knots)),
+        contact=least(shallow),
         exit=jnp.full_like(pair.d, _NOTHING) if pair.kappa is None else least(passage.speed / knots[:, 1]),
     )
+    return Between(room, deepest)

@@ -4,7 +4,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,7 +15,7 @@ import numpy as np
 from vijax import simulate
 from vijax.axes import AXES, Cells
 from vijax.method import Method, record
-from vijax.model import Harvester, Status
+from vijax.model import CONSTANTS, Harvester, Status
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -158,7 +158,7 @@ def provenance(planned: Plan) -> dict[str, Any]:
     """How a map was made: versions, commit, machine, settings, constants, tolerances."""
     accelerator = jax.devices()[0]
     # The constants that axes stand for are coordinates.
-    constants = [field.name for field in fields(planned.device) if field.name not in (*AXES, "penetration_limit")]
+    constants = [name for name in CONSTANTS if name not in AXES]
     return {
         "title": "Energy harvested by a vibro-impact pair",
         "Conventions": "CF-1.11",

@@ -5,7 +5,6 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 """
 
 import itertools
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,13 +26,15 @@ from vijax.model import Harvester, ImpactPair, Status
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
 from vijax.shooting import Sequence
+from vijax.simulate import LINKS
 from vijax.steady import Steady, steady
-from vijax.survey import LINKS, survey
+from vijax.survey import survey
 from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, moving, tuned, values, variables
 
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
-_WIDTHS = (2, 8)  # impacts that orbits are padded to
+_WIDTHS = (2, 8)  # impacts that orbits are padded to; longer ones are not climbed
+_LONGEST = 4  # forcing periods of an orbit
 _TILE = 64  # starts of one compiled call
 _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
@@ -133,7 +134,7 @@ def optimise_all(
     Args:
         devices: Where quantities that are not tuned are taken from; scalars.
         tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's.
-        bounds: Of tuned quantities; see `tuning.tuning` for the others.
+        bounds: Of tuned quantities; see `tuning.limits` for the others.
         objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P.
         tolerances: How constants scatter, for "mean" and "worst".
         samples: Random devices for these, in place of a quadrature.
@@ -275,7 +276,7 @@ def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, pe
     every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(wide, z.reshape(-1, len(tune)))
     pair = jax.tree.map(lambda x: np.asarray(x).reshape(owner.size, -1), jax.vmap(lambda d: d.pair())(every))
     u0, v0 = np.minimum(START[0], _REACH * pair.d[:, 0]), np.full(owner.size, START[1])
-    found = survey(pair, u0, v0, np.array(kicks), periods=periods)
+    found = survey(pair, u0, v0, np.array(kicks), longest=_LONGEST, impacts=_WIDTHS[-1], periods=periods)
     cell = found.chain * ladder.size + found.link
     own = jax.tree.map(lambda x: np.asarray(x)[cell], every)
     return _Met(found.orbit, own, z.reshape(-1, len(tune))[cell], owner[found.chain], found.chain, found.link)
@@ -364,7 +365,7 @@ def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_E
     for few, width in itertools.pairwise((0, *_WIDTHS)):
         some = np.flatnonzero((count > few) & (count <= width))
         jobs += [(some, width, tile) for tile in lanes.tiles(some.size, (_TILE,))]
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(lanes.workers()) as pool:
         list(pool.map(lambda job: part(*job), jobs))
     return [end for end in ends if end is not None]
 

@@ -4,7 +4,6 @@
 """
 
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from vijax import energy, simulate
 from vijax.axes import AXES, cells, check_axis
 from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance
 from vijax.grid import Axes
+from vijax.lanes import workers
 from vijax.method import whole
 from vijax.model import Harvester, ImpactPair, State, Status
 from vijax.record import Record, record
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
 _WAYS = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
 _CHOICES = {"direction": tuple(_WAYS), "wall": ("soft", "rigid"), "dtype": ("float64", "float32")}
-# A call takes chains so many points further: one compiled program for diagrams of every length.
-_LINKS = 64
-_FEWEST_LANES, _MOST_LANES = 8, 512
 _POINTS = {
     "P": ("J", "energy harvested per half forcing period"),
     "period": ("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided"),
@@ -226,14 +223,12 @@ def _table(diagram: Diagram) -> dict[str, np.ndarray]:
 def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Indices and fields of every tile of chains, as the tiles are done."""
     level = (table["gamma"] == 0).all(axis=1)
-    workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
-    pool = ThreadPoolExecutor(workers)
+    pool = ThreadPoolExecutor(workers())
     try:
         for group in (np.flatnonzero(level), np.flatnonzero(~level)):
             if not group.size:
                 continue
-            share = math.ceil(group.size / workers)
-            lanes = min(max(1 << (share - 1).bit_length(), _FEWEST_LANES), _MOST_LANES)
+            lanes = simulate.chains_at_once(group.size)
             number = math.ceil(group.size / lanes)
             tiles = [group[first::number] for first in range(number)]
             if number > 1:
@@ -285,11 +280,11 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
     for name, units in growth.items():
         units[:, 1:] = table[name][:, :-1] / table[name][:, 1:]
     state, parts = (table["u0"][:, 0], table["v0"][:, 0], np.zeros_like(table["u0"][:, 0])), []
-    for first in range(0, points, _LINKS):
-        links = min(_LINKS, points - first)
+    for first in range(0, points, simulate.LINKS):
+        links = min(simulate.LINKS, points - first)
 
         def padded(x: np.ndarray, first: int = first, links: int = links) -> jax.Array:
-            widths = ((0, lanes - chains), (0, _LINKS - links))
+            widths = ((0, lanes - chains), (0, simulate.LINKS - links))
             return jnp.asarray(np.pad(x[:, first : first + links], widths, mode="edge"))
 
         soft = planned.settings["wall"] == "soft"

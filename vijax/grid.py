@@ -4,7 +4,6 @@
 """
 
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
@@ -18,6 +17,7 @@ from vijax import method as methods
 from vijax import simulate
 from vijax.axes import cells
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
+from vijax.lanes import workers
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
 from vijax.store import load, save
@@ -199,14 +199,14 @@ def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray
     """Flat indices and fields of `Summary` of every tile of a group of cells, as the tiles are done."""
     if not group.size:
         return
-    workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
-    share = math.ceil(group.size / workers)
+    count = workers()
+    share = math.ceil(group.size / count)
     tile = min(max(1 << (share - 1).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
     # Strided tiles are samples of the whole plane: they cost the same, and no core is left with the slow corner.
     number = math.ceil(group.size / tile)
     tiles = [group[first::number] for first in range(number)]
     # No tile runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
-    pool = ThreadPoolExecutor(workers)
+    pool = ThreadPoolExecutor(count)
     try:
         if number > 1:
             # Compiles, and runs no cell; all threads at once would each compile.

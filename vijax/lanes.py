@@ -4,6 +4,7 @@ Knows no physics: a `Program` says what a cell is, what one quick trip does to e
 lane that declines needs instead. Memory is set by L and by the rows that go in and come out.
 """
 
+import os
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -32,6 +33,11 @@ _CPU_OPTIONS = {
 def compiler_options() -> dict[str, Any]:
     """Options for `jax.jit` of a program that calls `run`, on the backend that JAX will use."""
     return dict(_CPU_OPTIONS) if jax.default_backend() == "cpu" else {}
+
+
+def workers() -> int:
+    """Threads that call programs on different tiles: one a core of a CPU, one for an accelerator."""
+    return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
 
 
 class Service(NamedTuple):

@@ -190,6 +190,10 @@ class Harvester(eqx.Module):
         return ImpactPair(d, None if wall == "rigid" else kappa, r, gamma)
 
 
+CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field.name != "penetration_limit")
+"""Constants of the device; the penetration limit is none, but a choice of who builds it."""
+
+
 def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
     """The device that has the given nondimensional form, by its s, omega0, r and beta; the inverse of `Harvester.pair`.
 

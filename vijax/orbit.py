@@ -1,7 +1,6 @@
 """Periodic orbits, stable and unstable: from states or impact sequences, by Newton, each verified by the impact map."""
 
 import itertools
-import os
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vijax import flow, lanes, shooting
@@ -93,7 +91,7 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
         found = work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: tile.real], found)
 
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(lanes.workers()) as pool:
         found = list(pool.map(part, lanes.tiles(jax.tree.leaves(rows)[0].shape[0], _TILES)))
     return concatenate(found)
 
@@ -128,7 +126,7 @@ def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit i
 def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[Array, "orbit"]) -> _Claim:
     around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
     passage = jax.vmap(shooting.passages)(pair, sequence, knots)
-    return _Claim(knots, residual, floquet(around, sequence.mirrored), passage, *flow.wrap_phase(passage.t))
+    return _Claim(knots, residual, shooting.floquet(around, sequence.mirrored), passage, *flow.wrap_phase(passage.t))
 
 
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
@@ -179,23 +177,6 @@ def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) ->
         residual=claim.residual,
         status=status,
     )
-
-
-def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
-    """Eigenvalues of 2 x 2 monodromy matrices, the larger modulus first; squared where the orbit is closed half way.
-
-    The smaller of two real ones is the determinant over the larger: their difference would cancel.
-    """
-    half = 0.5 * (around[:, 0, 0] + around[:, 1, 1])
-    product = around[:, 0, 0] * around[:, 1, 1] - around[:, 0, 1] * around[:, 1, 0]
-    spread = half * half - product
-    root = jnp.sqrt(jnp.abs(spread))
-    large = half + jnp.where(half < 0, -root, root)
-    small = product / jnp.where(large == 0, 1.0, large)
-    real = (spread >= 0)[:, None]
-    parts = jnp.where(real, jnp.stack([large, small], axis=1), half[:, None])
-    values = lax.complex(parts, jnp.where(real, 0.0, jnp.stack([root, -root], axis=1)))
-    return jnp.where(mirrored[:, None], values * values, values)
 
 
 def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1, settle: int = 0) -> Orbit:

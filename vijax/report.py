@@ -1,14 +1,13 @@
 """What a design is worth: everything known of it as plain numbers and words, and the lines that a builder reads."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vijax.design import Design, Optimum
 from vijax.energy import energy_ratio
-from vijax.model import Harvester
+from vijax.model import CONSTANTS
 from vijax.objective import OBJECTIVES
 from vijax.surroundings import Surroundings
 from vijax.tolerance import Tolerance
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15}
-_CONSTANTS = tuple(field.name for field in fields(Harvester) if field.name != "penetration_limit")
 _TIE = 1e-6  # optima whose objectives differ by less, relative, are a tie
 _MOST_ROWS = 12
 _LOSSES = {"lost": "lose the orbit", "inadmissible": "are inadmissible"}
@@ -92,7 +90,7 @@ def optimum(one: Optimum) -> dict[str, Any]:
         "omega0": float(device.omega0),
         "pair": {"d": float(value_of(device, "d")), "kappa": kappa, "r": float(device.r)}
         | {"gamma": float(value_of(device, "gamma"))},
-        "device": {name: float(getattr(device, name)) for name in _CONSTANTS},
+        "device": {name: float(getattr(device, name)) for name in CONSTANTS},
         "penetration": state.depth[:count],
         "penetration_limit": float(device.depth_limit),
         "energy": energy,

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vijax import elimination, flow
 from vijax.model import ImpactPair
@@ -278,3 +278,20 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
     start = jnp.eye(2, dtype=knots.dtype)
     around, _ = lax.scan(one, start, (side, t, speed, stay, next_t - t - stay, sequence.real))
     return jnp.where(sequence.mirrored, -1.0, 1.0) * around
+
+
+def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
+    """Eigenvalues of 2 x 2 monodromy matrices, the larger modulus first; squared where the orbit is closed half way.
+
+    The smaller of two real ones is the determinant over the larger: their difference would cancel.
+    """
+    half = 0.5 * (around[:, 0, 0] + around[:, 1, 1])
+    product = around[:, 0, 0] * around[:, 1, 1] - around[:, 0, 1] * around[:, 1, 0]
+    spread = half * half - product
+    root = jnp.sqrt(jnp.abs(spread))
+    large = half + jnp.where(half < 0, -root, root)
+    small = product / jnp.where(large == 0, 1.0, large)
+    real = (spread >= 0)[:, None]
+    parts = jnp.where(real, jnp.stack([large, small], axis=1), half[:, None])
+    values = lax.complex(parts, jnp.where(real, 0.0, jnp.stack([root, -root], axis=1)))
+    return jnp.where(mirrored[:, None], values * values, values)

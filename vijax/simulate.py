@@ -1,5 +1,6 @@
 """Cells from start to summary: one compiled program for every kind of run, a tile of cells a call."""
 
+import math
 from functools import lru_cache, partial
 
 import equinox as eqx
@@ -100,6 +101,16 @@ def _compiled(plan: Plan, width: int):
         return unpack(plan, table)
 
     return jax.jit(tile, compiler_options=lanes.compiler_options())
+
+
+LINKS = 64  # of a call on chains: one compiled program for chains of every length
+_FEWEST_CHAINS, _MOST_CHAINS = 8, 512
+
+
+def chains_at_once(chains: int) -> int:
+    """Lanes for a tile of chains, a power of two: they spread over every core, and few programs are compiled."""
+    share = math.ceil(chains / lanes.workers())
+    return min(max(1 << (share - 1).bit_length(), _FEWEST_CHAINS), _MOST_CHAINS)
 
 
 def _width(cells: int, level: bool) -> int:

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vijax import elimination, energy, flow, shooting
-from vijax.clearance import Clearance, clearance, contact_crests
+from vijax.clearance import Clearance, between
 from vijax.exact import implicit_root
 from vijax.model import Harvester, ImpactPair, Status
 from vijax.shooting import Knots, Sequence
@@ -110,13 +110,13 @@ def response(
 ) -> Steady:
     """What the orbit with the given knots yields; the knots follow device and pair under differentiation."""
     frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
-    status, multiplier, condition, room = _validity(*frozen)
+    status, multiplier, condition, (room, deepest) = _validity(*frozen)
     # Harmless numbers where there is no orbit: what is computed from them is thrown away.
     absent = (status == Status.NO_ORBIT) | ~sequence.real
     knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)
     knots = _follows(pair, sequence, knots)
     valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    depth, harvested, work = (valid * x for x in _impacts(device, pair, sequence, knots))
+    depth, harvested, work = (valid * x for x in _impacts(device, pair, sequence, knots, deepest))
     P = jnp.where(sequence.real, harvested, 0.0).sum() / sequence.span
     left, right = ((sequence.side == wall).sum(dtype=jnp.int32) for wall in (-1, 1))
     # Closed half way, the mirror image of the orbit is the rest of it.
@@ -145,24 +145,20 @@ _HARMLESS = (0.0, 1.0, 0.5)  # a knot
 
 def _validity(pair: ImpactPair, sequence: Sequence, knots: Knots, residual):
     around = shooting.monodromy(pair, sequence, knots)
-    determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
-    half = 0.5 * (around[0, 0] + around[1, 1])
-    spread = half * half - determinant
-    modulus = jnp.where(spread >= 0, jnp.abs(half) + jnp.sqrt(jnp.abs(spread)), jnp.sqrt(jnp.abs(determinant)))
-    multiplier = jnp.where(sequence.mirrored, modulus * modulus, modulus)
+    multiplier = jnp.abs(shooting.floquet(around[None], sequence.mirrored[None])).max()
     away = jnp.eye(2, dtype=knots.dtype) - around
     condition = (away * away).sum() / jnp.abs(away[0, 0] * away[1, 1] - away[0, 1] * away[1, 0])
-    room = clearance(pair, sequence, knots)
+    motion = between(pair, sequence, knots)
     found = residual < _CONVERGED
-    real = jnp.stack(room).min() > 0
+    real = jnp.stack(motion.clearance).min() > 0
     attracts = multiplier < 1 - _MARGIN
     status = jnp.where(attracts, Status.OK, Status.UNSTABLE)
     status = jnp.where(real, status, Status.VIRTUAL)
     status = jnp.where(found, status, Status.NO_ORBIT).astype(jnp.int32)
-    return status, multiplier, condition, room
+    return status, multiplier, condition, motion
 
 
-def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots):
+def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):
     """Depth [m], harvested energy [J] and energy given to the membrane [J] of every impact."""
     real = sequence.real
     t, speed, stay = knots.T
@@ -172,7 +168,7 @@ def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Kno
         work = energy.membrane_work_rigid(speed, pair.r)
     else:
         passage = shooting.passages(pair, sequence, knots)
-        depth = _depths(pair, passage.side, knots)
+        depth = _depths(pair, passage.side, knots, deepest)
         signed = passage.side * speed, -passage.side * passage.speed
         work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, passage.side, t, stay, *signed)
     depth = jnp.where(real, depth, 0.0) * device.length_unit
@@ -180,10 +176,8 @@ def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Kno
     return depth, energy.harvested_energy(device, depth), work
 
 
-def _depths(pair: ImpactPair, side, knots: Knots) -> Float[Array, "impact"]:
+def _depths(pair: ImpactPair, side, knots: Knots, deepest) -> Float[Array, "impact"]:
     """Largest penetration of each contact on a soft wall: that of its deepest turning point, which moves along."""
-    held, wall_of, at = jax.tree.map(lax.stop_gradient, (pair, side, knots))
-    when = jnp.nan_to_num(contact_crests(held, wall_of, at, 1.0)[0])
     wall = flow.membrane(pair, rolled=True)
 
     def one(side, knot, when):
@@ -191,7 +185,7 @@ def _depths(pair: ImpactPair, side, knots: Knots) -> Float[Array, "impact"]:
         args = wall, flow.contact_force(pair.gamma, side, t), jnp.zeros_like(t), speed
         return flow.oscillate(*args, implicit_root(_rate, when, args))[0]
 
-    return jax.vmap(one)(side, knots, when)
+    return jax.vmap(one)(side, knots, jnp.nan_to_num(deepest))
 
 
 def _rate(s, args):

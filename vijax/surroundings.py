@@ -36,7 +36,8 @@ class Edge(NamedTuple):
     """The first bifurcation that the optimum's orbit meets on one side.
 
     Attributes:
-        kind: "fold", "flip", "pitchfork", "grazing ..." (see `branch.Point`), or "none" as far as was looked.
+        kind: "fold", "flip", "pitchfork", "grazing ..." (see `branch.Point`), "none" as far as was looked, or why the
+            branch could not be followed so far (see `branch.Branch.ends`).
         omega0: Where [rad/s].
         percent: How far that is from the optimum, in percent of its omega0.
     """
@@ -97,7 +98,12 @@ def _edge(optimum: Optimum, way: str, reach: float) -> Edge:
     kappa = float(device.omega0) * math.pi / float(device.omega)
     within = ((1 - reach) * kappa, (1 + reach) * kappa)
     (followed,) = branch.follow(optimum.orbit, "kappa", within, direction=way)
-    kind, at = followed.points[0][:2] if followed.points else ("none", within[way == "up"])
+    if followed.points:
+        kind, at = followed.points[0][:2]
+    elif followed.ends[1] in ("low", "high"):
+        kind, at = "none", within[way == "up"]
+    else:
+        kind, at = followed.ends[1], float(followed.values[-1])
     return Edge(kind, float(device.omega0) * at / kappa, 100 * (at / kappa - 1))
 
 

@@ -1,7 +1,5 @@
 """Which periodic orbits attract along chains of cells: where designs set out from."""
 
-import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -10,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax import simulate
+from vijax.lanes import Tile, tiles, workers
 from vijax.model import Harvester, ImpactPair, State, Status
 from vijax.orbit import Orbit, solve
 from vijax.record import record
 from vijax.shooting import Sequence
-
-LINKS = 64  # of a call: one compiled program for chains of every length
-_FEWEST_LANES, _MOST_LANES = 8, 512
+from vijax.simulate import LINKS
 
 
 class Survey(NamedTuple):
@@ -33,9 +30,9 @@ def survey(
     v0: np.ndarray,
     kick: np.ndarray,
     *,
-    longest: int = 4,
-    impacts: int = 8,
-    periods: int = 400,
+    longest: int,
+    impacts: int,
+    periods: int,
 ) -> Survey:
     """The periodic attractors along chains of cells, each cell starting in the state in which the last one ended.
 
@@ -51,21 +48,17 @@ def survey(
     """
     pair = jax.tree.map(np.asarray, pair)
     chains, links = pair.d.shape
-    workers = (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
-    lanes = min(max(1 << (math.ceil(chains / workers) - 1).bit_length(), _FEWEST_LANES), _MOST_LANES)
 
-    def work(first: int) -> tuple[np.ndarray, ...]:
-        some = np.arange(first, min(first + lanes, chains))
-        padded = np.resize(some, lanes)
-        wide = jax.tree.map(lambda x: np.pad(x[padded], ((0, 0), (0, LINKS - links)), mode="edge"), pair)
-        return _attractors(
-            wide, (u0[padded], v0[padded], kick[padded]), (some.size, links), (longest, impacts, periods)
-        )
+    def work(tile: Tile) -> tuple[np.ndarray, ...]:
+        rows = tile.rows
+        wide = jax.tree.map(lambda x: np.pad(x[rows], ((0, 0), (0, LINKS - links)), mode="edge"), pair)
+        start = u0[rows], v0[rows], kick[rows]
+        chain, *found = _attractors(wide, start, (tile.real, links), (longest, impacts, periods))
+        return rows[chain], *found
 
-    firsts = range(0, chains, lanes)
-    with ThreadPoolExecutor(workers) as pool:
-        parts = list(pool.map(work, firsts))
-    chain = np.concatenate([first + part[0] for first, part in zip(firsts, parts, strict=True)])
+    with ThreadPoolExecutor(workers()) as pool:
+        parts = list(pool.map(work, tiles(chains, (simulate.chains_at_once(chains),))))
+    chain = np.concatenate([part[0] for part in parts])
     link, side, span, knots = (np.concatenate([part[i] for part in parts]) for i in range(1, 5))
     own = jax.tree.map(lambda x: jnp.asarray(x[chain, link]), pair)
     sequence = Sequence(jnp.asarray(side), jnp.asarray(span), jnp.zeros(chain.size, bool))

@@ -1,18 +1,17 @@
 """Tolerances of a device's constants as quadrature nodes: factors on the constants, and their weights."""
 
-import dataclasses
 import itertools
 from typing import NamedTuple
 
 import numpy as np
 
-from vijax.model import Harvester
+from vijax.model import CONSTANTS
 
 _NODES = {1: 17, 2: 9, 3: 5}  # of each constant, by the number of them
 
 
 # beta, often zero, has no relative tolerance.
-CONSTANTS = tuple(f.name for f in dataclasses.fields(Harvester) if f.name not in ("penetration_limit", "beta"))
+SCATTERED = tuple(name for name in CONSTANTS if name != "beta")
 
 
 class Tolerance(NamedTuple):
@@ -36,8 +35,8 @@ def check_tolerances(tolerances: tuple[Tolerance, ...], bounded: bool) -> None:
         bounded: Whether the distribution must end: that of a worst case.
     """
     for one in tolerances:
-        if one.name not in CONSTANTS:
-            raise ValueError(f"tolerances must be those of {', '.join(CONSTANTS)}; got {one.name!r}")
+        if one.name not in SCATTERED:
+            raise ValueError(f"tolerances must be those of {', '.join(SCATTERED)}; got {one.name!r}")
         if one.kind not in ("uniform", "lognormal"):
             raise ValueError(f"tolerances must be uniform or lognormal; got {one.kind!r} of {one.name}")
         if not 0 < one.spread < 1:

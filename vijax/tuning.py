@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vijax.model import Harvester, check
+from vijax.model import CONSTANTS, Harvester, check
 
 # Other names of what a constant decides: each is applied after the constants, in this order.
 _ALIASES = {"k": "omega0", "kappa": "omega0", "d": "s", "gamma": "beta"}
@@ -17,7 +17,7 @@ _LEAST_KAPPA, _MOST_KAPPA = 2.0, 400.0
 _LEAST_R, _MOST_R = 0.05, 0.95
 _TILT = 0.1  # rad
 _MOVING = ("omega0", "s", "r", "A", "omega", "beta")  # the motion depends on these
-NAMES = tuple(f.name for f in dataclasses.fields(Harvester) if f.name != "penetration_limit") + tuple(_ALIASES)
+NAMES = CONSTANTS + tuple(_ALIASES)
 
 
 def constant(name: str) -> str:
