@@ -81,3 +81,11 @@ def test_a_start_that_is_no_point_goes_nowhere():
     assert end.lost[0]
     assert end.looks[0] == 1
     np.testing.assert_array_equal(end.z, [[0.5, 0.0]])
+
+
+def test_an_edge_towards_which_only_the_barrier_pushes_is_left_again():
+    # Highest at the constraint z0 = 0; the barrier's first maximum, at z0 = 0.03, lies beyond the edge.
+    starts = [[0.019, 0.1], [0.01, -0.3]]
+    end = climb(lambda z: -z[0] - z[1] ** 2, lambda z: z[:1], starts, exists=lambda z: z[0] < 0.02)
+    np.testing.assert_allclose(end.z, np.zeros((2, 2)), atol=1e-6)
+    assert (end.z[:, 0] > 0).all()

@@ -6,6 +6,7 @@ halved. So from the first admissible point on, every point is admissible.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -80,6 +81,15 @@ class Climb(eqx.Module):
     state: Any
 
 
+class _Task(NamedTuple):
+    """What stays the same on every way: what is looked at, the bounds, the most looks, optax's memory of curvature."""
+
+    look: Callable[..., Look]
+    box: Box
+    looks: int
+    lbfgs: Any
+
+
 def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory: Any, box: Box, looks: int) -> Climb:
     """Climb from every start, under jit.
 
@@ -87,76 +97,23 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
         look: (points, the points whose memory is given, that memory) -> what is seen, bounds aside.
         z: Starts, within the bounds.
         memory: Of the starts.
+        box: Their bounds.
         looks: Evaluations that a start may take, the first one included.
     """
     import optax  # here, as importing vijax must not load it
 
-    lbfgs = optax.scale_by_lbfgs(_MEMORY)
+    task = _Task(look, box, looks, optax.scale_by_lbfgs(_MEMORY))
+    start = _begun(task, z, memory)
+    return lax.while_loop(lambda c: c.going.any() & (c.trip < looks), partial(_advance, task), start)
 
-    def update(descent, state, z):
-        # Optax mixes whole numbers and truths, which callers may have forbidden.
-        with jax.numpy_dtype_promotion("standard"):
-            return jax.vmap(lbfgs.update)(descent, state, z)
 
-    def view(z, near, memory) -> Look:
-        """With the bounds among the constraints."""
-        seen = look(z, near, memory)
-        eye = jnp.broadcast_to(jnp.eye(z.shape[1], dtype=z.dtype), (*z.shape, z.shape[1]))
-        return seen._replace(
-            margins=jnp.concatenate([seen.margins, z - box.low, box.high - z], axis=1),
-            slopes=jnp.concatenate([seen.slopes, eye, -eye], axis=1),
-        )
-
-    def aim(z, seen: Look, weight, state):
-        """The next step, and the state of optax after it; afresh where its curvature points down."""
-        ahead = _gradient(seen, weight)
-        step, after = update(-ahead, state, z)
-        straight, again = update(-ahead, jax.vmap(lbfgs.init)(z), z)
-        sound = (step * ahead).sum(axis=1) < 0
-        step, after = jax.tree.map(lambda a, b: _choose(sound, a, b), (step, after), (straight, again))
-        return _shortened(-step, seen, box.radius), after
-
-    def advance(c: Climb) -> Climb:
-        trial = c.z + c.pace[:, None] * c.step
-        seen = view(trial, c.z, c.seen.memory)
-        better = c.going & seen.there & _higher(c, seen)
-        # Converged for this weight when the step promised less than the barrier weighs.
-        promised = (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
-        inside = _inside(c.seen)
-        falls = better & inside & (c.pace == 1) & (promised < c.weight)
-        lower = jnp.minimum(_FALL * c.weight, c.weight**_HASTE)
-        weight = jnp.where(falls, jnp.maximum(lower, _LAST), c.weight)
-        # Curvature compares gradients of one function: that before, under the new weight; none across the border.
-        state = c.state._replace(updates=-_gradient(c.seen, weight))
-        crossed = better & ~inside & _inside(seen)
-        state = jax.tree.map(lambda a, b: _choose(crossed, a, b), jax.vmap(lbfgs.init)(c.z), state)
-        z, now = jax.tree.map(lambda a, b: _choose(better, a, b), (trial, seen), (c.z, c.seen))
-        step, state = jax.tree.map(lambda a, b: _choose(better, a, b), aim(z, now, weight, state), (c.step, c.state))
-        length = jnp.abs(step).max(axis=1)
-        settled = better & (length <= _ARRIVED) & (weight <= _LAST)
-        pace = jnp.where(better, jnp.minimum(2 * c.pace, 1.0), 0.5 * c.pace)
-        count = c.looks + c.going.astype(jnp.int32)
-        return Climb(
-            z=z,
-            seen=now,
-            weight=weight,
-            step=step,
-            pace=jnp.where(c.going, pace, c.pace),
-            going=c.going & ~settled & (pace * length > _STUCK) & (count < looks),
-            lost=jnp.where(c.going, ~seen.there, c.lost),
-            looks=count,
-            path=c.path.at[c.trip].set(jnp.where(better[:, None], trial, jnp.nan)),
-            heights=c.heights.at[c.trip].set(jnp.where(better, seen.value, jnp.nan)),
-            trip=c.trip + 1,
-            state=state,
-        )
-
+def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb:
     starts = z.shape[0]
-    seen = view(z, z, memory)
+    seen = _view(task, z, z, memory)
     weight = jnp.full(starts, _FIRST, z.dtype)
-    step, state = aim(z, seen, weight, jax.vmap(lbfgs.init)(z))
-    blank = jnp.full((looks, *z.shape), jnp.nan, z.dtype)
-    start = Climb(
+    step, state = _aim(task, z, seen, weight, _forgotten(task, z))
+    blank = jnp.full((task.looks, *z.shape), jnp.nan, z.dtype)
+    return Climb(
         z=z,
         seen=seen,
         weight=weight,
@@ -170,7 +127,81 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
         trip=jnp.int32(1),
         state=state,
     )
-    return lax.while_loop(lambda c: c.going.any() & (c.trip < looks), advance, start)
+
+
+def _advance(task: _Task, c: Climb) -> Climb:
+    """One trial of every start that is on its way."""
+    trial = c.z + c.pace[:, None] * c.step
+    seen = _view(task, trial, c.z, c.seen.memory)
+    better = c.going & seen.there & _higher(c, seen)
+    turns = _turns(c, seen)
+    falls = turns | (better & (c.pace == 1) & _little(c))
+    weight = jnp.where(falls, jnp.maximum(jnp.minimum(_FALL * c.weight, c.weight**_HASTE), _LAST), c.weight)
+    # Curvature compares gradients of one function: that before, under the new weight; none across the border, nor where
+    # it turns.
+    state = c.state._replace(updates=-_gradient(c.seen, weight))
+    afresh = turns | (better & ~_inside(c.seen) & _inside(seen))
+    state = _choose_all(afresh, _forgotten(task, c.z), state)
+    z, now = _choose_all(better, (trial, seen), (c.z, c.seen))
+    step, state = _choose_all(better | turns, _aim(task, z, now, weight, state), (c.step, c.state))
+    length = jnp.abs(step).max(axis=1)
+    settled = better & (length <= _ARRIVED) & (weight <= _LAST)
+    refused = 0.5 * c.pace * jnp.abs(c.step).max(axis=1) / jnp.maximum(length, _STUCK)
+    pace = jnp.minimum(jnp.where(better, 2 * c.pace, refused), 1.0)
+    count = c.looks + c.going.astype(jnp.int32)
+    return Climb(
+        z=z,
+        seen=now,
+        weight=weight,
+        step=step,
+        pace=jnp.where(c.going, pace, c.pace),
+        going=c.going & ~settled & (pace * length > _STUCK) & (count < task.looks),
+        lost=jnp.where(c.going, ~seen.there, c.lost),
+        looks=count,
+        path=c.path.at[c.trip].set(jnp.where(better[:, None], trial, jnp.nan)),
+        heights=c.heights.at[c.trip].set(jnp.where(better, seen.value, jnp.nan)),
+        trip=c.trip + 1,
+        state=state,
+    )
+
+
+def _view(task: _Task, z, near, memory) -> Look:
+    """What is seen, with the bounds among the constraints."""
+    seen = task.look(z, near, memory)
+    eye = jnp.broadcast_to(jnp.eye(z.shape[1], dtype=z.dtype), (*z.shape, z.shape[1]))
+    return seen._replace(
+        margins=jnp.concatenate([seen.margins, z - task.box.low, task.box.high - z], axis=1),
+        slopes=jnp.concatenate([seen.slopes, eye, -eye], axis=1),
+    )
+
+
+def _little(c: Climb) -> Bool[Array, "start"]:
+    """Which have converged for the weight of their barrier: the step promises less than the barrier weighs."""
+    promised = c.pace * (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
+    return c.going & _inside(c.seen) & (promised < c.weight)
+
+
+def _turns(c: Climb, trial: Look) -> Bool[Array, "start"]:
+    """Which may have to turn back: converged at an edge beyond which there is no point.
+
+    The barrier may have pushed them there; with less of it the way may lead elsewhere.
+    """
+    return _little(c) & ~trial.there & (c.weight > _LAST)
+
+
+def _forgotten(task: _Task, z) -> Any:
+    """The state of optax without any memory of curvature."""
+    return jax.vmap(task.lbfgs.init)(z)
+
+
+def _aim(task: _Task, z, seen: Look, weight, state):
+    """The next step, and the state of optax after it; afresh where its curvature points down."""
+    ahead = _gradient(seen, weight)
+    # Optax mixes whole numbers and truths, which callers may have forbidden.
+    with jax.numpy_dtype_promotion("standard"):
+        found, straight = (jax.vmap(task.lbfgs.update)(-ahead, of, z) for of in (state, _forgotten(task, z)))
+    step, after = _choose_all((found[0] * ahead).sum(axis=1) < 0, found, straight)
+    return _shortened(-step, seen, task.box.radius), after
 
 
 def converged(c: Climb) -> Bool[Array, "start"]:
@@ -180,6 +211,10 @@ def converged(c: Climb) -> Bool[Array, "start"]:
 
 def _choose(which: Bool[Array, "start"], a: Array, b: Array) -> Array:
     return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+
+def _choose_all(which: Bool[Array, "start"], a: Any, b: Any) -> Any:
+    return jax.tree.map(partial(_choose, which), a, b)
 
 
 def _inside(seen: Look) -> Bool[Array, "start"]:
