@@ -72,7 +72,7 @@ def say(what: str, value: str) -> None:
 # --- gradients ----------------------------------------------------------------------------------------------------
 
 CELLS = 1000
-CHAINS, LINKS = 64, 40  # of random cells, to find as many regular ones
+DRAWN = 2560  # random cells, to find as many regular ones
 # A cell is regular if differences can be trusted there: well-conditioned, contracting, no impact about to come or go.
 MOST_CONDITION, MOST_MULTIPLIER, LEAST_CLEARANCE = 1e3, 0.9, 0.02
 NAMES = ("d", "kappa", "r")
@@ -100,12 +100,12 @@ def reference_orbits() -> list[tuple[dict, Orbit]]:
 def random_cells() -> Orbit:
     """Periodic attractors of random cells, half of them tilted."""
     draw = np.random.default_rng(SEED)
-    shape = (CHAINS, LINKS)
-    tilt = np.where(np.arange(CHAINS)[:, None] % 2 == 0, 0.0, draw.uniform(-0.05, 0.05, shape))
+    shape = (DRAWN,)
+    tilt = np.where(np.arange(DRAWN) % 2 == 0, 0.0, draw.uniform(-0.05, 0.05, shape))
     kappa = np.exp(draw.uniform(math.log(3), math.log(400), shape))
     columns = draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt
-    starts = np.zeros(CHAINS), np.full(CHAINS, 0.25), np.ones(CHAINS)
-    return survey(ImpactPair(*map(jnp.asarray, columns)), *starts, longest=4, impacts=8, periods=400).orbit
+    rest, speed = np.zeros(shape), np.full(shape, 0.25)
+    return survey(ImpactPair(*map(jnp.asarray, columns)), rest, speed, longest=4, impacts=8, periods=400).orbit
 
 
 def differences(function: Callable[[Any], Any], x: np.ndarray, axis: int) -> np.ndarray:

@@ -84,7 +84,6 @@ ROOMS: dict[str, set[str]] = {
         "objective",
         "orbit",
         "survey",
-        "simulate",
         "axes",
     },
     "surroundings": {"model", "method", "orbit", "steady", "branch", "attractor", "tuning", "design"},

@@ -9,55 +9,57 @@ import vijax
 from vijax import clearance
 from vijax import orbit as orbits
 from vijax.model import ImpactPair, Status
-from vijax.simulate import LINKS
 from vijax.survey import survey
 
-KAPPA = np.geomspace(3, 400, LINKS)
+KAPPA = np.geomspace(3, 400, 64)
 
 
 @pytest.fixture(scope="module")
 def found():
-    """Up and down in kappa at d = 0.2 and up at d = 0.12, where chaos is."""
-    kappa = np.stack([KAPPA, KAPPA[::-1], KAPPA])
-    d = np.array([0.2, 0.2, 0.12])[:, None] * np.ones_like(kappa)
-    one = np.ones_like(kappa)
-    return survey(
-        ImpactPair(d, kappa, 0.5 * one, 0 * one),
-        np.full(3, 0.05853),
-        np.full(3, -0.47898),
-        np.ones(3),
-        longest=4,
-        impacts=8,
-        periods=400,
-    )
+    """Along kappa at d = 0.2, and at d = 0.12, where chaos is; more cells than a tile holds."""
+    d, kappa, u0 = (x.ravel() for x in np.broadcast_arrays(*np.ix_([0.2, 0.12], KAPPA, np.linspace(-0.05, 0.05, 9))))
+    pair = ImpactPair(d, kappa, np.full(d.size, 0.5), np.zeros(d.size))
+    return pair, survey(pair, u0, np.full(d.size, -0.47898), longest=4, impacts=8, periods=400)
 
 
 def test_orbits_are_those_of_a_sweep(found):
+    pair, met = found
     # The only attractor at d = 0.2 from kappa 5 on, mirror images aside.
+    here = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] > KAPPA[7]))
+    assert here.size == 9 * (KAPPA.size - 8)
     swept = vijax.sweep(d=0.2, kappa=KAPPA[8:], r=0.5, outputs=["P", "period"])
-    here = np.flatnonzero((found.chain == 0) & (found.link >= 8))
-    assert here.size == KAPPA.size - 8
-    np.testing.assert_allclose(orbits.power(found.orbit[here], vijax.Harvester()), swept["P"], rtol=1e-7)
-    np.testing.assert_array_equal(orbits.counts(found.orbit[here]).period, swept["period"])
+    power, period = (np.repeat(swept[name].values, 9) for name in ("P", "period"))
+    np.testing.assert_allclose(orbits.power(met.orbit[here], vijax.Harvester()), power, rtol=1e-7)
+    np.testing.assert_array_equal(orbits.counts(met.orbit[here]).period, period)
 
 
 def test_every_orbit_is_verified_attracts_and_stands_at_its_cell(found):
-    assert (np.asarray(found.orbit.status) == Status.OK).all()
-    assert (np.abs(np.asarray(found.orbit.multipliers)).max(axis=1) < 1).all()
-    down = found.chain == 1
-    np.testing.assert_array_equal(found.orbit.pair.kappa[down], KAPPA[::-1][found.link[down]])
-    assert (np.diff(found.chain * LINKS + found.link) > 0).all()
+    pair, met = found
+    assert (np.asarray(met.orbit.status) == Status.OK).all()
+    assert (np.abs(np.asarray(met.orbit.multipliers)).max(axis=1) < 1).all()
+    np.testing.assert_array_equal(met.orbit.pair.kappa, pair.kappa[met.cell])
+    np.testing.assert_array_equal(met.orbit.pair.d, pair.d[met.cell])
+    assert (np.diff(met.cell) > 0).all()
+
+
+def test_coexisting_attractors_are_met(found):
+    pair, met = found
+    many = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] == 3.0))
+    power = np.asarray(orbits.power(met.orbit[many], vijax.Harvester()))
+    assert np.unique(np.round(1e9 * power)).size > 1
 
 
 def test_chaos_has_no_orbit(found):
-    swept = vijax.sweep(d=0.12, kappa=KAPPA, r=0.5, outputs=["period"])
-    chaos = np.flatnonzero(swept["period"].values == 0)
+    _, met = found
+    swept = vijax.sweep(d=0.12, kappa=KAPPA, u0=np.linspace(-0.05, 0.05, 9), r=0.5, outputs=["period"])
+    chaos = np.flatnonzero(swept["period"].values.ravel() == 0)
     assert chaos.size
-    assert not np.isin(chaos, found.link[found.chain == 2]).any()
+    assert not np.isin(chaos + KAPPA.size * 9, met.cell).any()
 
 
 def test_clearances_are_those_of_the_motion_in_between(found):
-    some = found.orbit[np.arange(0, len(found.orbit), 7)]
+    _, met = found
+    some = met.orbit[np.arange(0, len(met.orbit), 61)]
     sequence, knots = some.sequence, jnp.nan_to_num(some.knots)
     room = jax.jit(jax.vmap(clearance.between))(some.pair, sequence, knots).clearance
     assert (np.stack(room) > 0).all()

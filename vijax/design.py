@@ -19,30 +19,26 @@ from vijax import lanes
 from vijax import objective as aims
 from vijax import orbit as orbits
 from vijax.ascent import Box, Climb, ascend, converged
-from vijax.axes import START
 from vijax.energy import harvested_energy
 from vijax.method import whole
 from vijax.model import Harvester, ImpactPair, Status
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
 from vijax.shooting import Sequence
-from vijax.simulate import LINKS
 from vijax.steady import Steady, steady
 from vijax.survey import survey
 from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, moving, tuned, values, variables
 
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
-_WIDTHS = (2, 8)  # impacts that orbits are padded to; longer ones are not climbed
-_LONGEST = 4  # forcing periods of an orbit
+_WIDTHS = (2, 8, 16)  # impacts that orbits are padded to; longer ones are not climbed
+_LONGEST = 8  # forcing periods of an orbit
 _TILE = 64  # starts of one compiled call
 _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
-_ONE = 1e-6  # starts that agree so closely are one
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
-# Factors on the velocity that cells of a survey hand on: one chain follows an attractor, the others leave its basin.
-_KICKS = (1.0, -1.0, 0.3, 2.5)
-_REACH = 0.49  # of the gap that a start's displacement may take
+_STEPS, _BALLS = 128, 8  # values of the first quantity in the survey, and starts of the ball at each
+_REACH = 0.49, 0.6  # of the gap that its displacement may take, and its velocity
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
 _HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
 
@@ -127,9 +123,9 @@ def optimise_all(
 ) -> list[Design]:
     """The admissible designs that harvest most, each device's tuned quantities between bounds.
 
-    Attractors of a coarse survey, up and down the first quantity, are the starts. All of them climb in one jitted call
-    along exact gradients; an optimum is admissible in every impact (E_j <= W_j, penetration within the device's limit),
-    attracting, and verified by the exact impact map.
+    Attractors of a coarse survey along the first quantity, from many starts of the ball, are where the ascents begin.
+    All of them climb in one jitted call along exact gradients; an optimum is admissible in every impact (E_j <= W_j,
+    penetration within the device's limit), attracting, and verified by the exact impact map.
 
     Args:
         devices: Where quantities that are not tuned are taken from; scalars.
@@ -237,7 +233,7 @@ class _Met(NamedTuple):
 
     Attributes:
         owner: Which of the devices given.
-        chain, link: Of the survey.
+        level, step: Of the survey's values of the first quantity, and of all others together.
         device: Leaves [orbit].
     """
 
@@ -245,8 +241,8 @@ class _Met(NamedTuple):
     device: Harvester
     z: np.ndarray
     owner: np.ndarray
-    chain: np.ndarray
-    link: np.ndarray
+    level: np.ndarray
+    step: np.ndarray
 
     def some(self, index: np.ndarray) -> "_Met":
         """Those with the given indices."""
@@ -254,36 +250,56 @@ class _Met(NamedTuple):
 
 
 def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, periods: int) -> _Met:
-    """The attractors of every device, up and down the first quantity that moves the ball, at levels of the others."""
+    """The attractors of every device, along the first quantity that moves the ball at levels of the others."""
     first = next((i for i, name in enumerate(tune) if moving(name)), None)
-    ladder = np.linspace(0.0, 1.0, 1 if first is None else LINKS)
-    levels = [(0.5,) if i == first or not moving(name) else _LEVELS for i, name in enumerate(tune)]
-    ways = (ladder, ladder[::-1]) if first is not None else (ladder,)
-    rows: list[np.ndarray] = []
-    mine: list[int] = []
-    kicks: list[float] = []
-    for index, (low, high) in enumerate(box):
-        for place, way, kick in itertools.product(itertools.product(*levels), ways, _KICKS):
-            parts = np.tile(np.array(place), (ladder.size, 1))
-            if first is not None:
-                parts[:, first] = way
-            rows.append(low + parts * (high - low))
-            mine.append(index)
-            kicks.append(kick)
-    z, owner = np.array(rows), np.array(mine)
-    given = jax.tree.map(lambda *x: np.array(x, float), *devices)
-    wide = jax.tree.map(lambda x: np.repeat(x[owner], ladder.size), given)
-    every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(wide, z.reshape(-1, len(tune)))
-    pair = jax.tree.map(lambda x: np.asarray(x).reshape(owner.size, -1), jax.vmap(lambda d: d.pair())(every))
-    u0, v0 = np.minimum(START[0], _REACH * pair.d[:, 0]), np.full(owner.size, START[1])
-    found = survey(pair, u0, v0, np.array(kicks), longest=_LONGEST, impacts=_WIDTHS[-1], periods=periods)
-    cell = found.chain * ladder.size + found.link
-    own = jax.tree.map(lambda x: np.asarray(x)[cell], every)
-    return _Met(found.orbit, own, z.reshape(-1, len(tune))[cell], owner[found.chain], found.chain, found.link)
+    sides = [(0.5,) if i == first or not moving(name) else _LEVELS for i, name in enumerate(tune)]
+    levels, steps = np.array(list(itertools.product(*sides))), _STEPS if first is not None else 1
+    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, _BALLS)))
+    parts = levels[level]
+    if first is not None:
+        parts[:, first] = step / (steps - 1)
+    low, high = box[owner].swapaxes(0, 1)
+    z = low + parts * (high - low)
+    given = jax.tree.map(lambda *x: np.array(x, float)[owner], *devices)
+    every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(given, z)
+    pair = jax.tree.map(np.asarray, jax.vmap(lambda device: device.pair())(every))
+    # The same for every device: designs of one do not depend on the others.
+    draw = np.random.default_rng(0).uniform(-1, 1, (2, owner.size // len(devices)))
+    u0, v0 = (reach * np.tile(x, len(devices)) for reach, x in zip(_REACH, draw, strict=True))
+    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, impacts=_WIDTHS[-1], periods=periods)
+    own = jax.tree.map(lambda x: np.asarray(x)[found.cell], every)
+    return _Met(found.orbit, own, *(x[found.cell] for x in (z, owner, level, step)))
 
 
 def _promising(met: _Met, objective: str) -> np.ndarray:
-    """Indices of the attractors to climb from: along its chain no neighbour of the same impacts is better."""
+    """Indices of the attractors to climb from: best of their kind in their cell, and no better one a step away.
+
+    A kind is given by span and impacts; the walls may change places where the tube is level.
+    """
+    kind = np.column_stack([np.asarray(met.orbit.sequence.span), *_impacts(met.orbit)])
+    place = np.column_stack([met.owner, met.level, kind, met.step])
+    score = _score(met, objective)
+    order = np.lexsort((-score, *place.T[::-1]))
+    new = np.append(True, (np.diff(place[order], axis=0) != 0).any(axis=1))
+    best = order[new]
+    apart = np.diff(place[best], axis=0)
+    beside = (apart[:, :-1] == 0).all(axis=1) & (apart[:, -1] == 1)
+    score = score[best]
+    behind = np.append(False, beside & (score[:-1] > score[1:]))
+    ahead = np.append(beside & (score[1:] > score[:-1]), False)
+    return np.sort(best[~behind & ~ahead])
+
+
+def _impacts(orbit: Orbit) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right impacts of orbits; in a level tube the more and the fewer."""
+    side, level = np.asarray(orbit.sequence.side), np.asarray(orbit.pair.gamma) == 0
+    left, right = (side < 0).sum(axis=1), (side > 0).sum(axis=1)
+    swap = level & (right > left)
+    return np.where(swap, right, left), np.where(swap, left, right)
+
+
+def _score(met: _Met, objective: str) -> np.ndarray:
+    """What an attractor promises: the logarithm of the objective; far below where a constraint is broken."""
     device, orbit = met.device, met.orbit
     deep = np.asarray(orbit.depth) * np.asarray(device.length_unit)[:, None]
     gained = np.asarray(jax.vmap(harvested_energy)(device, jnp.asarray(deep)))
@@ -294,16 +310,7 @@ def _promising(met: _Met, objective: str) -> np.ndarray:
     value = np.nansum(gained, axis=1) / np.asarray(orbit.sequence.span)
     if objective == "speed":
         value = np.nanmax(np.asarray(orbit.knots)[..., 1], axis=1)
-    score = np.where(lacks < 0, _HOPELESS + lacks, np.log(value))
-    side = np.asarray(orbit.sequence.side)
-    alike = (np.diff(met.chain) == 0) & (np.diff(met.link) == 1)
-    alike &= (side[1:] == side[:-1]).all(axis=1) & (np.diff(np.asarray(orbit.sequence.span)) == 0)
-    behind = np.append(False, alike & (score[:-1] > score[1:]))
-    ahead = np.append(alike & (score[1:] > score[:-1]), False)
-    best = np.flatnonzero(~behind & ~ahead)
-    # Chains meet each other's orbits.
-    place = np.round(np.column_stack([met.owner, met.z, orbits.marks(orbit)])[best] / _ONE)
-    return np.sort(best[np.unique(place, axis=0, return_index=True)[1]])
+    return np.where(lacks < 0, _HOPELESS + lacks, np.log(value))
 
 
 @lru_cache(maxsize=8)

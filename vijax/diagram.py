@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 _WAYS = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
 _CHOICES = {"direction": tuple(_WAYS), "wall": ("soft", "rigid"), "dtype": ("float64", "float32")}
+# A call takes chains so many points further: one compiled program for diagrams of every length.
+_LINKS = 64
+_FEWEST_LANES, _MOST_LANES = 8, 512
 _POINTS = {
     "P": ("J", "energy harvested per half forcing period"),
     "period": ("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided"),
@@ -228,7 +231,8 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
         for group in (np.flatnonzero(level), np.flatnonzero(~level)):
             if not group.size:
                 continue
-            lanes = simulate.chains_at_once(group.size)
+            share = math.ceil(group.size / workers())
+            lanes = min(max(1 << (share - 1).bit_length(), _FEWEST_LANES), _MOST_LANES)
             number = math.ceil(group.size / lanes)
             tiles = [group[first::number] for first in range(number)]
             if number > 1:
@@ -280,11 +284,11 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
     for name, units in growth.items():
         units[:, 1:] = table[name][:, :-1] / table[name][:, 1:]
     state, parts = (table["u0"][:, 0], table["v0"][:, 0], np.zeros_like(table["u0"][:, 0])), []
-    for first in range(0, points, simulate.LINKS):
-        links = min(simulate.LINKS, points - first)
+    for first in range(0, points, _LINKS):
+        links = min(_LINKS, points - first)
 
         def padded(x: np.ndarray, first: int = first, links: int = links) -> jax.Array:
-            widths = ((0, lanes - chains), (0, simulate.LINKS - links))
+            widths = ((0, lanes - chains), (0, _LINKS - links))
             return jnp.asarray(np.pad(x[:, first : first + links], widths, mode="edge"))
 
         soft = planned.settings["wall"] == "soft"

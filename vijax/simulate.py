@@ -1,6 +1,5 @@
 """Cells from start to summary: one compiled program for every kind of run, a tile of cells a call."""
 
-import math
 from functools import lru_cache, partial
 
 import equinox as eqx
@@ -103,16 +102,6 @@ def _compiled(plan: Plan, width: int):
     return jax.jit(tile, compiler_options=lanes.compiler_options())
 
 
-LINKS = 64  # of a call on chains: one compiled program for chains of every length
-_FEWEST_CHAINS, _MOST_CHAINS = 8, 512
-
-
-def chains_at_once(chains: int) -> int:
-    """Lanes for a tile of chains, a power of two: they spread over every core, and few programs are compiled."""
-    share = math.ceil(chains / lanes.workers())
-    return min(max(1 << (share - 1).bit_length(), _FEWEST_CHAINS), _MOST_CHAINS)
-
-
 def _width(cells: int, level: bool) -> int:
     """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill.
 
@@ -189,6 +178,66 @@ def summarise(
     return _compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)
 
 
+def attractors(
+    pair: ImpactPair,
+    u0: Float[Array, "cell"],
+    v0: Float[Array, "cell"],
+    *,
+    periods: int,
+    keep: int,
+    count: int | None = None,
+) -> Summary:
+    """Run a tile of soft cells from phase 0, each until its attractor is certain, in one jitted call; with their ends.
+
+    Args:
+        pair: Cells.
+        u0, v0: Starts.
+        periods: The most that the search for an attractor may take.
+        keep: Periods at the end whose impacts will be wanted.
+        count: How many cells are real, the rest being padding; all unless given.
+
+    Returns:
+        The summary, in the units of `pair`, with its `handover`.
+    """
+    one, zero = jnp.ones_like(pair.d), jnp.zeros_like(pair.d)
+    cells = jnp.stack([pair.d, pair.kappa, pair.r, pair.gamma, one, one, u0, v0, zero], axis=1)
+    plan = _chained(pair)
+    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
+    return _compiled(plan, _width(pair.d.shape[0], plan.level))(
+        cells, number, _chained_settings(pair, Harvester(), periods, keep)
+    )
+
+
+def _chained(pair: ImpactPair) -> Plan:
+    """The plan of cells whose ends are wanted."""
+    return Plan(
+        until="attractor",
+        stepping=None,
+        rigid=pair.kappa is None,
+        level=bool((np.asarray(pair.gamma) == 0).all()),
+        deep=True,
+        energies=True,
+        asymmetry=False,
+        tangent=True,
+        variants=1,
+        chained=True,
+    )
+
+
+def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, keep: int) -> Settings:
+    dtype = pair.d.dtype
+    one = jnp.ones(1, dtype)
+    return Settings(
+        periods=jnp.asarray(periods, dtype),
+        transient=jnp.asarray(jnp.floor(TRANSIENT_SHARE * periods), dtype),
+        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        method=None,
+        length_variant=one,
+        speed_variant=one,
+        keep=jnp.asarray(keep, dtype),
+    )
+
+
 class Starts(eqx.Module):
     """Where chains start: displacement, velocity and phase."""
 
@@ -259,32 +308,10 @@ def follow(
     Returns:
         The summary of every cell, with its `handover`.
     """
-    dtype = pair.d.dtype
-    plan = Plan(
-        until="attractor",
-        stepping=None,
-        rigid=pair.kappa is None,
-        level=bool((np.asarray(pair.gamma) == 0).all()),
-        deep=True,
-        energies=True,
-        asymmetry=False,
-        tangent=True,
-        variants=1,
-        chained=True,
-    )
     kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
     zero = jnp.zeros_like(pair.d)
     rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, length, speed, growth.u, growth.v, zero], axis=2)
     chains, most = pair.d.shape
-    one = jnp.ones(1, dtype)
-    settings = Settings(
-        periods=jnp.asarray(periods, dtype),
-        transient=jnp.asarray(jnp.floor(TRANSIENT_SHARE * periods), dtype),
-        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
-        method=None,
-        length_variant=one,
-        speed_variant=one,
-        keep=jnp.asarray(keep, dtype),
-    )
     number, long = (jnp.asarray(x, jnp.int32) for x in (count or chains, links or most))
-    return _compiled_chains(plan)(rows, starts, number, long, settings)
+    settings = _chained_settings(pair, device, periods, keep)
+    return _compiled_chains(_chained(pair))(rows, starts, number, long, settings)
