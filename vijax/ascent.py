@@ -108,24 +108,24 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
 
 
 def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb:
+    """Before the first look, which the loop takes: so it is compiled once."""
     starts = z.shape[0]
-    seen = _view(task, z, z, memory)
-    weight = jnp.full(starts, _FIRST, z.dtype)
-    step, state = _aim(task, z, seen, weight, _forgotten(task, z))
-    blank = jnp.full((task.looks, *z.shape), jnp.nan, z.dtype)
+    shapes = jax.eval_shape(partial(_view, task), z, z, memory)
+    blank: Look = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    path = jnp.full((task.looks, *z.shape), jnp.nan, z.dtype)
     return Climb(
         z=z,
-        seen=seen,
-        weight=weight,
-        step=step,
+        seen=blank._replace(memory=memory),
+        weight=jnp.full(starts, _FIRST, z.dtype),
+        step=jnp.zeros_like(z),
         pace=jnp.ones(starts, z.dtype),
-        going=seen.there,
-        lost=~seen.there,
-        looks=jnp.ones(starts, jnp.int32),
-        path=blank.at[0].set(jnp.where(seen.there[:, None], z, jnp.nan)),
-        heights=blank[..., 0].at[0].set(jnp.where(seen.there, seen.value, jnp.nan)),
-        trip=jnp.int32(1),
-        state=state,
+        going=jnp.ones(starts, bool),
+        lost=jnp.zeros(starts, bool),
+        looks=jnp.zeros(starts, jnp.int32),
+        path=path,
+        heights=path[..., 0],
+        trip=jnp.int32(0),
+        state=_forgotten(task, z),
     )
 
 
@@ -133,7 +133,7 @@ def _advance(task: _Task, c: Climb) -> Climb:
     """One trial of every start that is on its way."""
     trial = c.z + c.pace[:, None] * c.step
     seen = _view(task, trial, c.z, c.seen.memory)
-    better = c.going & seen.there & _higher(c, seen)
+    better = c.going & seen.there & (_higher(c, seen) | (c.trip == 0))
     turns = _turns(c, seen)
     falls = turns | (better & (c.pace == 1) & _little(c))
     weight = jnp.where(falls, jnp.maximum(jnp.minimum(_FALL * c.weight, c.weight**_HASTE), _LAST), c.weight)

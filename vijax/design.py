@@ -5,6 +5,7 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 """
 
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, moving, tuned, values, variables
 
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
-_WIDTHS = (2, 8, 16)  # impacts that orbits are padded to; longer ones are not climbed
+_WIDTHS = (2, 8, 16)  # impacts that orbits are padded to; orbits of more are not looked for
 _LONGEST = 8  # forcing periods of an orbit
 _TILE = 64  # starts of one compiled call
 _FEW = (16, 256)  # optima of one
@@ -40,6 +41,7 @@ _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
 _STEPS, _BALLS = 128, 8  # values of the first quantity in the survey, and starts of the ball at each
 _REACH = 0.49, 0.6  # of the gap that its displacement may take, and its velocity
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
+_NARROW = 0.8  # of the best start's objective: an orbit of many impacts that promises less is not climbed
 _HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
 
 
@@ -287,7 +289,13 @@ def _promising(met: _Met, objective: str) -> np.ndarray:
     score = score[best]
     behind = np.append(False, beside & (score[:-1] > score[1:]))
     ahead = np.append(beside & (score[1:] > score[:-1]), False)
-    return np.sort(best[~behind & ~ahead])
+    found = np.sort(best[~behind & ~ahead])
+    # Orbits of many impacts live in narrow windows, where no climb leads far.
+    most = np.full(met.owner.max(initial=-1) + 1, -np.inf)
+    score = _score(met.some(found), objective)
+    np.maximum.at(most, met.owner[found], score)
+    few = np.asarray(met.orbit.count)[found] <= _WIDTHS[-2]
+    return found[few | (score > most[met.owner[found]] + math.log(_NARROW))]
 
 
 def _impacts(orbit: Orbit) -> tuple[np.ndarray, np.ndarray]:
