@@ -5,10 +5,12 @@ A script is a click command whose body is one `door`, one run under `progress`, 
 
 import math
 import os
+import signal
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from vijax.model import Harvester, ImpactPair
 
 _STARTED = time.perf_counter()
+_MOST_HOST_DEVICES = 8  # more, and the share of a tile leaves lanes empty; further cores run further tiles
 VALUES = (
     "VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --u0=-0.1:0.1:9); a number "
     "may be a multiple of pi, as in 6pi."
@@ -120,15 +123,24 @@ def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft
 
 
 def targets(
-    out: str | None, plot: str | None, defaults: tuple[str, str], overwrite: bool, ending: str = ".zarr"
+    out: str | None,
+    plot: str | None,
+    defaults: tuple[str, str],
+    overwrite: bool,
+    ending: str = ".zarr",
+    goes_on: bool = False,
 ) -> tuple[Path | None, Path | None]:
-    """Store and picture to write, both defaults where neither was given; raises unless they can be written."""
+    """Store and picture to write, both defaults where neither was given; raises unless they can be written.
+
+    With `goes_on` a store that is there is left to `study.check`, and its picture is drawn again.
+    """
     from vijax.store import check_output
 
     if out is None and plot is None:
         out, plot = defaults
     if out is not None and not out.endswith(ending):
         raise ValueError(f"out must end in {ending}; got {out!r}")
+    overwrite = overwrite or (goes_on and out is not None and Path(out).exists())
     return (
         None if out is None else check_output("out", out, overwrite),
         None if plot is None else check_output("plot", plot, overwrite),
@@ -154,6 +166,16 @@ def keep_compiled() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+def use_every_core() -> None:
+    """Let JAX see the cores of a CPU as devices, unless it has begun or was told how many there are."""
+    import jax
+
+    told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not told:
+        with suppress(RuntimeError):  # it has begun
+            jax.config.update("jax_num_cpu_devices", min(os.cpu_count() or 1, _MOST_HOST_DEVICES))
+
+
 @contextmanager
 def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], None]]:
     """A progress bar, as the callback (done, in all) that runs take."""
@@ -176,9 +198,10 @@ def finish(
     plot: Path | None,
     picture: "Callable[[xr.Dataset, Path], Any]",
     overwrite: bool,
+    kept: bool = False,
 ) -> None:
-    """Write the store and the picture, then say what the run found, what was written and how long it all took."""
-    if out is not None:
+    """Write the store, unless the run did, and the picture; say what was found and written, and how long it took."""
+    if out is not None and not kept:
         from vijax.store import save
 
         save(dataset, out, overwrite=overwrite)
@@ -210,15 +233,38 @@ def tally(words: Iterable[str]) -> str:
     return ", ".join(f"{word} {n:,}" for word, n in Counter(words).items())
 
 
+class _Terminated(KeyboardInterrupt):
+    """What SIGTERM raises."""
+
+
+def _terminate(signum: int, frame: Any) -> None:
+    raise _Terminated
+
+
 def run(command: click.Command, arguments: list[str] | None = None) -> int:
-    """Exit code of a script: 0, or 2 after bad input, when nothing was run; after Ctrl-C the process ends with 130."""
+    """Exit code of a script: 0; 1 if what it writes could not be written; 2 after bad input, when nothing was run.
+
+    After Ctrl-C the process ends with 130, after SIGTERM with 143.
+    """
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         command.main(arguments, standalone_mode=False)
     except click.ClickException as error:
         click.echo(f"error: {error.format_message()}", err=True)
         return 2
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("stopped; nothing half-written is left", err=True)
+    except (click.Abort, KeyboardInterrupt) as error:
+        cause = error.__cause__ or error
+        click.echo(f"stopped; {_kept(cause)}", err=True)
         # A compiled call cannot be stopped: leave without waiting for it.
-        os._exit(130)
+        os._exit(143 if isinstance(cause, _Terminated) else 130)
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
+        os._exit(1)
     return 0
+
+
+def _kept(error: BaseException) -> str:
+    """What a run that came to no end says of its files."""
+    return " ".join(getattr(error, "__notes__", ["nothing half-written is left"]))

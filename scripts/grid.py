@@ -87,10 +87,13 @@ def power_map(
     **given: Any,
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
+    command.use_every_core()
     with command.door():
         _check_show(show, compare, given["until"])
         picture = show if compare is None else "difference"
-        out, plot = command.targets(given.pop("out"), given.pop("plot"), _FILES[picture], overwrite)
+        out, plot = command.targets(
+            given.pop("out"), given.pop("plot"), _FILES[picture], overwrite, goes_on=compare is None
+        )
         axes, device = command.take_axes(given, _DEFAULT_PLANE), command.device(constants)
         if compare is None and tolerance is not None:
             raise ValueError(f"tolerance must come with compare; got {tolerance:g} alone; add --compare rigid")
@@ -101,12 +104,19 @@ def power_map(
             planned = _comparison(axes, device, outputs, compare, tolerance, given)
         if plot is not None:
             _check_picture(plot, planned, show)
+        if compare is None and out is not None:
+            _check_study(planned, out, overwrite)
     keep_compiled()
-    began = time.perf_counter()
-    dataset = _run(planned)
-    pace = command.pace(planned.count, time.perf_counter() - began)
+    dataset, pace = _run(planned, out, overwrite)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
-    command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite)
+    kept = compare is None
+    command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite, kept)
+
+
+def _check_study(planned: Any, out: Path, overwrite: bool) -> None:
+    from vijax import study
+
+    study.check(planned, out, overwrite)
 
 
 def _check_show(show: str, compare: str | None, until: str) -> None:
@@ -189,12 +199,23 @@ def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
 
 
-def _run(planned: "Plan | Comparison") -> "xr.Dataset":
+def _run(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> "tuple[xr.Dataset, str]":
+    """The map, and how fast it was made."""
     from vijax import grid
     from vijax.compare import Comparison, run
 
+    before: list[int] = []  # cells that a store held already
+
     with command.progress(planned.count) as show:
-        return run(planned, show) if isinstance(planned, Comparison) else grid.run(planned, show)
+
+        def tell(done: int, total: int) -> None:
+            before.append(done)
+            show(done, total)
+
+        began = time.perf_counter()
+        found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite)
+    pace = command.pace(planned.count - before[0], time.perf_counter() - began)
+    return found, f"{pace}, {before[0]:,} were there" if before[0] else pace
 
 
 def _draw(picture: str, dataset: "xr.Dataset", path: Path) -> None:

@@ -93,14 +93,14 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
 
 
 @lru_cache(maxsize=32)
-def _compiled(plan: Plan, width: int):
-    """The jitted program of a plan: a whole tile of cells in one call."""
+def _compiled(plan: Plan, width: int, devices: tuple[jax.Device, ...]):
+    """The jitted program of a plan: a whole tile of cells in one call, shared by the devices."""
 
     def tile(cells, count, settings):
-        table = lanes.run(_program(plan, settings), cells, count, columns(plan), width)
+        table = lanes.run(_program(plan, settings), cells, count[0], columns(plan), width)
         return unpack(plan, table)
 
-    return jax.jit(tile, compiler_options=lanes.compiler_options())
+    return lanes.spread(tile, devices)
 
 
 LINKS = 64  # of a call on chains: one compiled program for chains of every length
@@ -113,12 +113,15 @@ def chains_at_once(chains: int) -> int:
     return min(max(1 << (share - 1).bit_length(), _FEWEST_CHAINS), _MOST_CHAINS)
 
 
+_LEAST_LANES = 128
+
+
 def _width(cells: int, level: bool) -> int:
-    """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill.
+    """Lanes for a share of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
 
     A sampled step holds some dozens of samples a lane.
     """
-    return max(min(cells // 8, 512 if level else 256), 128)
+    return max(min(cells // 8, 512 if level else 256), _LEAST_LANES)
 
 
 def tolerances(dtype: str) -> dict[str, float]:
@@ -147,6 +150,8 @@ def summarise(
     count: int | None = None,
 ) -> Summary:
     """Run a tile of cells from phase 0, each until its attractor is certain or its window is over, in one jitted call.
+
+    Every local device of JAX takes a share of them. A cell's numbers do not depend on how many there are.
 
     Args:
         pair: Cells; `kappa=None` for rigid walls.
@@ -177,7 +182,6 @@ def summarise(
     )
     kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
     cells = jnp.stack([pair.d, kappa, pair.r, pair.gamma, scale.length, scale.speed, u0, v0], axis=1)
-    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
     settings = Settings(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
@@ -186,7 +190,35 @@ def summarise(
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
     )
-    return _compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)
+    return _dealt(plan, cells, pair.d.shape[0] if count is None else count, settings)
+
+
+def _dealt(plan: Plan, cells: Float[Array, "cell in"], count: int, settings: Settings) -> Summary:
+    """The summary of a table of cells, shared by as many devices as have a lane for it."""
+    rows = cells.shape[0]
+    devices = lanes.devices()[: max(rows // _LEAST_LANES, 1)]
+    hands = lanes.deal(rows, count, len(devices))
+    program = _compiled(plan, _width(hands.row.size // len(devices), plan.level), devices)
+    if len(devices) == 1:
+        return program(cells, hands.real, settings)
+    found = program(np.asarray(cells)[hands.row], hands.real, jax.tree.map(np.asarray, settings))
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[hands.place]), found)
+
+
+def blank(count: int, variants: int, dtype: str) -> Summary:
+    """A summary without content of so many cells: which shape and kind of number each field has."""
+    plan = Plan(
+        until="attractor",
+        stepping=None,
+        rigid=False,
+        level=True,
+        deep=True,
+        energies=True,
+        asymmetry=True,
+        tangent=True,
+        variants=variants,
+    )
+    return unpack(plan, jnp.zeros((count, columns(plan)), dtype))
 
 
 class Starts(eqx.Module):
