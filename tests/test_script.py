@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 
 import grid as script
 import numpy as np
@@ -227,17 +228,17 @@ def test_from_arguments_to_store_and_picture(folder, monkeypatch):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGINT reaches no single process there")
 def test_ctrl_c_leaves_what_is_done(folder):
-    process = started(["--out", "map.zarr", "--plot", "map.png"], folder)
+    process = started(["--d", "0.05:0.3:512", "--kappa", "3:400:512:log", "--out", "map.zarr"], folder)
     try:
-        said = ""
-        while "compiling" not in said:
-            said += process.stderr.read(1)
-            assert process.poll() is None, said
+        while not (folder / "map.zarr").exists():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.05)
+        time.sleep(1)  # until it is at the tiles
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=30)
     finally:
         process.kill()
     assert process.returncode == 130
-    assert err.endswith("stopped; 0 of 16,384 cells are in map.zarr; the same command goes on from there\n")
+    assert err.endswith("stopped; 0 of 262,144 cells are in map.zarr; the same command goes on from there\n")
     assert {path.name for path in folder.iterdir()} <= {"cache", "map.zarr"}
     assert (grid.load(folder / "map.zarr")["status"] == Status.NOT_RUN).all()
