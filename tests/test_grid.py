@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import stand_in
 
 from vijax import dataset, grid, simulate
 from vijax.axes import cells, parse_axis
@@ -29,14 +30,6 @@ LONG = 40  # periods: enough for the 1:1 orbits of these tests
 ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "max_penetration", "max_impact_speed"}
 
 
-def formula(pair, u0, v0, scale):
-    """A stand-in for the engine whose every field tells which cell it is."""
-    kappa = np.ones_like(pair.d) if pair.kappa is None else np.asarray(pair.kappa)
-    mark = np.asarray(pair.d) + 10 * kappa + 1e4 * np.asarray(pair.gamma) + 1e5 * np.asarray(u0) + 0 * np.asarray(v0)
-    metres = np.asarray(scale.length)[:, None] * np.asarray(scale.length_variant)
-    return mark, mark[:, None] * metres
-
-
 @pytest.fixture
 def engine(monkeypatch):
     """The stand-in in place of the engine; its list says how many real cells each tile had."""
@@ -44,12 +37,7 @@ def engine(monkeypatch):
 
     def summarise(pair, u0, v0, scale, device, *, count, **settings):
         tiles.append((int(count), settings, pair, device))
-        mark, energy = formula(pair, u0, v0, scale)
-        whole = np.arange(mark.size, dtype=np.int32)
-        wide, narrow = ("P", "P_stderr", "energy_ratio"), ("period", "impacts_left", "impacts_right", "status")
-        fields = {name: mark for name in simulate.Summary.__dataclass_fields__}
-        fields |= dict.fromkeys(wide, energy) | dict.fromkeys(narrow, 0 * whole)
-        return simulate.Summary(**fields)
+        return stand_in(pair, u0, v0, scale, device, count=count, **settings)
 
     monkeypatch.setattr(simulate, "summarise", summarise)
     return tiles

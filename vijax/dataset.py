@@ -132,7 +132,7 @@ def specimen(planned: Plan) -> "xr.Dataset":
     first = planned.cut({dim: slice(1) for dim in planned.cells.dynamic})
     variants = math.prod(planned.cells.sizes[dim] for dim in planned.cells.variant)
     blank = simulate.blank(1, variants, planned.settings["dtype"])
-    return label(first, {name: getattr(blank, name) for name in planned.needs})
+    return label(first, {name: np.asarray(getattr(blank, name)) for name in planned.needs})
 
 
 def flagged(status: "xr.Variable") -> "xr.Variable":

@@ -226,7 +226,7 @@ def _fill(plane: study.Study, tell: Callable[[int, int], None]) -> None:
     """Simulate and write the tiles of a study that are not done."""
     left = study.left(plane, _LOG.warning)
     total = plane.planned.count
-    done = total - sum(plane.cut(tile).count for tile in left)
+    done = total - sum(map(plane.count, left))
     rows = _rows(plane.most)
     try:
         tell(done, total)
@@ -301,6 +301,7 @@ def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
 def _simulate(tile: _Tile) -> tuple[Fields, float]:
     """Fields of `Summary` for the cells of a tile, and the seconds it took."""
     began = time.perf_counter()
+    _LOG.info("tile %d begins", tile.number)
     found: Fields = {}
     for part in _kinds(tile):
         _put(found, tile.cells.size, part, _summarise(tile.planned, tile.cells[part], tile.rows, part.size))

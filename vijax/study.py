@@ -79,6 +79,10 @@ class Study:
             for dim, extent in self.extents.items()
         }
 
+    def count(self, tile: int) -> int:
+        """Cells of a tile."""
+        return math.prod(part.stop - part.start for part in self.block(tile).values())
+
     def cut(self, tile: int) -> Plan:
         """The plan of a tile alone."""
         return self.planned.cut(self.block(tile))
@@ -249,9 +253,9 @@ def _words(values: "xr.Variable | xr.DataArray | None") -> str:
     if values is None:
         return "left out"
     if values.ndim == 0:
-        return f"{float(values):.17g}"
-    ends = f"{values.values.flat[0]:.17g} to {values.values.flat[-1]:.17g}"
-    return f"{values.size} values over {', '.join(map(str, values.dims))} from {ends}"
+        return f"{float(values)}"
+    first, last = (float(values.values.flat[at]) for at in (0, -1))
+    return f"{values.size} values over {', '.join(map(str, values.dims))} from {first} to {last}"
 
 
 # --- what is done, what is left --------------------------------------------------------------------------------------
@@ -259,6 +263,8 @@ def _words(values: "xr.Variable | xr.DataArray | None") -> str:
 
 def left(study: Study, say: Callable[[str], None]) -> list[int]:
     """Tiles that are not done, and those whose files are no longer what was written; of these is said why."""
+    for half_written in study.path.rglob("*.part*"):  # what a killed process was at
+        half_written.unlink()
     found = []
     for tile in study.tiles:
         record = study.record(tile)
@@ -312,10 +318,10 @@ def write(study: Study, tile: int, found: "xr.Dataset", seconds: float) -> None:
     block = study.block(tile)
     for name, dims in study.dims.items():
         # Also a chunk that is void: a missing one is a damage.
-        array = zarr.open_array(study.path / name, mode="r+", config={"write_empty_chunks": True})
+        array = zarr.open_array(study.path / name, mode="r+").with_config({"write_empty_chunks": True})
         array[tuple(block.get(dim, slice(None)) for dim in dims)] = found[name].values
     record = {
-        "cells": study.cut(tile).count,
+        "cells": study.count(tile),
         "seconds": round(seconds, 3),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         **made_by(),
