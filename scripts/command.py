@@ -225,12 +225,19 @@ def pace(count: int, seconds: float, unit: str = "cells") -> str:
 def flags(variable: "xr.DataArray") -> str:
     """How often each value of a variable with CF flags occurs."""
     names = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
-    return tally(names[value] for value in variable.values.flat)
+    return tally(variable.values, names.get)
 
 
-def tally(words: Iterable[str]) -> str:
-    """How often each word occurs, in the order of their first."""
-    return ", ".join(f"{word} {n:,}" for word, n in Counter(words).items())
+def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:
+    """How often each name occurs among that many values, the least values first, or those least by `order`."""
+    import numpy as np
+
+    kinds, counts = np.unique(values, return_counts=True)
+    found: Counter[str] = Counter()
+    rows = zip(kinds.tolist(), counts.tolist(), strict=True)
+    for kind, count in sorted(rows, key=lambda row: (order or float)(row[0])):
+        found[str(name(kind))] += count
+    return ", ".join(f"{word} {n:,}" for word, n in found.items())
 
 
 class _Terminated(KeyboardInterrupt):

@@ -1,7 +1,7 @@
 """A map of harvested energy from one command: a labelled store, a picture, a closing summary.
 
     python scripts/grid.py
-    python scripts/grid.py --gamma 0.1 --out inclined.zarr --plot inclined.png
+    python scripts/grid.py --gamma 0.1 --out inclined.zarr --plot inclined.png  # stopped, it goes on when given again
     python scripts/grid.py --omega pi:6pi:96 --omega0 20:400:96 --plot device.png
     python scripts/grid.py --show label --plot labels.png
     python scripts/grid.py --kappa 3:4000:128:log --compare rigid --tolerance 0.05
@@ -74,7 +74,8 @@ def _options() -> list[click.Parameter]:
 @click.command(
     params=_options(),
     epilog=f"{command.VALUES} With neither --out nor --plot, power_map.zarr and power_map.png are written, "
-    "or the same of label_map or comparison.",
+    "or the same of label_map or comparison. A map is written as it is made: stopped in whatever way, the same command "
+    "goes on with it, and --overwrite begins anew.",
     context_settings={"max_content_width": 120},
 )
 def power_map(
@@ -231,8 +232,12 @@ def _summary(dataset: "xr.Dataset") -> str:
     lines = [f"cells by status: {flags(dataset['status'])}"]
     if "period" in dataset:
         names = {-1: "undecided", 0: "aperiodic"} | {n: f"period {n}" for n in range(1, _LONG)}
-        periods = sorted(dataset["period"].values.flat, key=lambda period: period if period > 0 else math.inf)
-        lines.append(f"cells by period: {tally(names.get(period, f'{_LONG} and more') for period in periods)}")
+        periods = tally(
+            dataset["period"].values,
+            lambda period: names.get(period, f"{_LONG} and more"),
+            order=lambda period: period if period > 0 else math.inf,
+        )
+        lines.append(f"cells by period: {periods}")
     if {"P", "admissible"} <= set(dataset):
         peak = best(dataset)
         lines.append(f"largest admissible P: {'none' if peak is None else _place(peak, dataset)}")
