@@ -37,9 +37,8 @@ WRAPPER = (
     "logging.basicConfig(level=logging.INFO, format='%(message)s'); sys.argv = sys.argv[1:]; "
     "sys.path[0] = sys.argv[0].rpartition('/')[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
 )
-_REACH = (
-    0.6  # of a tile's time past the first tile, to which moments are drawn: some runs end with a tile, most without
-)
+_WARM = 182  # the least side whose tiles are as large as any, so that they are compiled
+_REACH = 0.6  # of a tile's time past the first tile, up to which moments are drawn: most kills find none done
 _DISK, _LARGER_DISK = 5, 100  # MiB; a tile of 32,768 cells takes about 2
 
 
@@ -89,7 +88,7 @@ def ended(process: subprocess.Popen) -> End:
 
 def done(out: Path) -> int:
     """Tiles that are done."""
-    return len(list(out.glob("status/tiles/*.json")))
+    return len(list(out.glob("status/tiles/[0-9]*.json")))
 
 
 def finish(scene: Scene, out: Path) -> End:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from vijax.model import Harvester, ImpactPair
 
 _STARTED = time.perf_counter()
-_MOST_HOST_DEVICES = 8  # more, and the share of a tile leaves lanes empty; further cores run further tiles
 VALUES = (
     "VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --u0=-0.1:0.1:9); a number "
     "may be a multiple of pi, as in 6pi."
@@ -164,16 +163,6 @@ def keep_compiled() -> None:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(cache / "vijax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-
-
-def use_every_core() -> None:
-    """Let JAX see the cores of a CPU as devices, unless it has begun or was told how many there are."""
-    import jax
-
-    told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if not told:
-        with suppress(RuntimeError):  # it has begun
-            jax.config.update("jax_num_cpu_devices", min(os.cpu_count() or 1, _MOST_HOST_DEVICES))
 
 
 @contextmanager

@@ -88,7 +88,6 @@ def power_map(
     **given: Any,
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
-    command.use_every_core()
     with command.door():
         _check_show(show, compare, given["until"])
         picture = show if compare is None else "difference"

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import command
 import grid as script
+import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -34,7 +35,7 @@ def slow_engine(*args, **settings):
 
 def prepare():
     """The stand-in and small tiles, in this process."""
-    simulate.summarise, study.LARGEST_TILE, grid.teams = slow_engine, MOST, lambda: 1
+    simulate.summarise, study.LARGEST_TILE, grid.places = slow_engine, MOST, lambda: jax.devices()[:1]
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(simulate, "summarise", stand_in)
     monkeypatch.setattr(study, "LARGEST_TILE", MOST)
-    monkeypatch.setattr(grid, "teams", lambda: 1)
+    monkeypatch.setattr(grid, "places", lambda: jax.devices()[:1])
     return tmp_path
 
 
@@ -72,7 +73,7 @@ def started(folder):
 
 def wait_for_tiles(folder, process, number):
     tiles = folder / "map.zarr" / "status" / "tiles"
-    while len(list(tiles.glob("*.json"))) < number:
+    while len(list(tiles.glob("[0-9]*.json"))) < number:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.01)
 
@@ -104,7 +105,7 @@ def test_a_stopped_process_loses_nothing(folder, which, code):
 
 def study_records(folder):
     """Completion records and when they were written."""
-    return {path.name: path.stat().st_mtime_ns for path in (folder / "map.zarr/status/tiles").glob("*.json")}
+    return {path.name: path.stat().st_mtime_ns for path in (folder / "map.zarr/status/tiles").glob("[0-9]*.json")}
 
 
 def test_a_second_process_is_refused_in_one_line(folder, capsys):

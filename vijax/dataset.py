@@ -185,13 +185,13 @@ def provenance(planned: Plan) -> dict[str, Any]:
 @cache
 def made_by() -> dict[str, str]:
     """What computes here: versions, commit, machine."""
-    devices = lanes.devices()
+    places = lanes.places()
     return {
         "source": f"vijax {_version('vijax')}",
         "commit": _commit(),
         **{f"version_{name}": _version(name) for name in ("jax", "jaxlib", "equinox", "numpy", "xarray", "zarr")},
         "version_python": platform.python_version(),
-        "device": f"{len(devices)} {devices[0].device_kind} ({devices[0].platform}), {platform.machine()}, "
+        "device": f"{len(set(places))} {places[0].device_kind} ({places[0].platform}), {platform.machine()}, "
         f"{os.cpu_count()} cores",
     }
 

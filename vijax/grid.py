@@ -1,4 +1,4 @@
-"""Sweeps: axes -> cells -> tiles on every device -> a labelled map, in memory or on disk.
+"""Sweeps: axes -> cells -> tiles on every device and core -> a labelled map, in memory or on disk.
 
 `plan` checks everything that can be wrong and starts nothing, `run` does the work, `sweep` is both.
 """
@@ -6,6 +6,7 @@
 import itertools
 import logging
 import math
+import queue
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -21,7 +22,7 @@ from vijax import method as methods
 from vijax import simulate, study
 from vijax.axes import cells
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
-from vijax.lanes import teams
+from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
 from vijax.store import load, save, view
@@ -264,8 +265,8 @@ def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray
     """Flat indices and fields of `Summary` of every tile of a group of cells, as the tiles are done."""
     if not group.size:
         return
-    rows = min(_rows(math.ceil(group.size / teams())), LARGEST_TILE)
-    # Strided tiles are samples of the whole plane: they cost the same, and no team is left with the slow corner.
+    rows = min(_rows(math.ceil(group.size / len(places()))), LARGEST_TILE)
+    # Strided tiles are samples of the whole plane: they cost the same, and nobody is left with the slow corner.
     number = math.ceil(group.size / rows)
     for tile, found, _ in _in_turn(_Tile(planned, group[first::number], rows, first) for first in range(number)):
         yield tile.cells, found
@@ -273,19 +274,22 @@ def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray
 
 def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
     """Tiles, their fields and the seconds they took, as they are done; the next ones run meanwhile."""
-    tiles, most = iter(tiles), teams() + 1  # one waits, so that nobody does
+    tiles, here = iter(tiles), places()
+    free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
+    for place in here:
+        free.put(place)
     # No tile runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
-    pool = ThreadPoolExecutor(teams())
+    pool = ThreadPoolExecutor(len(here))
     running: dict[Future[tuple[Fields, float]], _Tile] = {}
 
     def fill() -> None:
-        for tile in itertools.islice(tiles, most - len(running)):
-            running[pool.submit(_simulate, tile)] = tile
+        for tile in itertools.islice(tiles, len(here) + 1 - len(running)):  # one waits, so that nobody does
+            running[pool.submit(_simulate, tile, free)] = tile
 
     try:
-        if teams() > 1 and (first := next(tiles, None)):
-            # Compiles, and runs no cell; all teams at once would each compile.
-            pool.submit(_compile, first).result()
+        if len(here) > 1 and (first := next(tiles, None)):
+            # All threads at once would each compile what they share.
+            wait([pool.submit(_compile, first, place) for place in set(here)])
             tiles = itertools.chain([first], tiles)
         fill()
         while running:
@@ -298,19 +302,23 @@ def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _simulate(tile: _Tile) -> tuple[Fields, float]:
-    """Fields of `Summary` for the cells of a tile, and the seconds it took."""
-    began = time.perf_counter()
+def _simulate(tile: _Tile, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
+    """Fields of `Summary` for the cells of a tile, and the seconds it took, on a device that is free."""
+    began, place = time.perf_counter(), free.get()
     _LOG.info("tile %d begins", tile.number)
     found: Fields = {}
-    for part in _kinds(tile):
-        _put(found, tile.cells.size, part, _summarise(tile.planned, tile.cells[part], tile.rows, part.size))
+    try:
+        for part in _kinds(tile):
+            _put(found, tile.cells.size, part, _summarise(tile, tile.cells[part], part.size, place))
+    finally:
+        free.put(place)
     return found, time.perf_counter() - began
 
 
-def _compile(tile: _Tile) -> None:
+def _compile(tile: _Tile, place: jax.Device) -> None:
+    """What the tile needs, without running a cell."""
     for part in _kinds(tile):
-        _summarise(tile.planned, tile.cells[part], tile.rows, 0)
+        _summarise(tile, tile.cells[part], 0, place)
 
 
 def _kinds(tile: _Tile) -> list[np.ndarray]:
@@ -320,10 +328,11 @@ def _kinds(tile: _Tile) -> list[np.ndarray]:
     return [kind for kind in (np.flatnonzero(level), np.flatnonzero(~level)) if kind.size]
 
 
-def _summarise(planned: Plan, index: np.ndarray, rows: int, count: int) -> Fields:
+def _summarise(tile: _Tile, index: np.ndarray, count: int, place: jax.Device) -> Fields:
     """Fields of `Summary` for the first `count` of these cells, padded so that one program serves all."""
+    planned = tile.planned
     of, settings = planned.cells, planned.settings
-    padded = np.resize(index, rows)
+    padded = np.resize(index, tile.rows)
     needs = planned.needs
 
     def column(quantity: "xr.Variable") -> jax.Array:
@@ -350,5 +359,6 @@ def _summarise(planned: Plan, index: np.ndarray, rows: int, count: int) -> Field
         outputs=needs,
         method=planned.method,
         count=count,
+        on=place,
     )
     return {name: np.asarray(getattr(summary, name))[:count] for name in needs}

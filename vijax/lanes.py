@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int
 
 Carry = Any
@@ -41,56 +40,15 @@ def workers() -> int:
     return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
 
 
-def devices() -> tuple[jax.Device, ...]:
-    """The devices that share the cells of a call: all that this process has, or the one chosen as JAX's default."""
-    if jax.default_device.value is not None:
-        return (jnp.zeros(()).device,)
-    return tuple(jax.local_devices())
+def places() -> list[jax.Device]:
+    """A device for every tile that is run at once: all of this process, and a CPU's as often as its cores want.
 
-
-def teams() -> int:
-    """Calls at once that keep every core or accelerator busy, each call on all `devices`."""
-    return max(workers() // len(devices()), 1)
-
-
-def spread(work: Callable[[Any, Any, Any], Any], over: tuple[jax.Device, ...]) -> Callable[[Any, Any, Any], Any]:
-    """The jitted program of `work` (its share of the rows, how many of them are real [1], settings) on every device.
-
-    Each device runs its own loops to their end and waits for no other. Results lie device after device.
+    If one was chosen as JAX's default, that one alone. No tile is spread over several devices: XLA parts such a program
+    before it optimises, and rounds otherwise than on one.
     """
-    own, shared = PartitionSpec("device"), PartitionSpec()
-    # Replication is not checked: a loop that begins with constants and ends with shares has both in one place.
-    program = jax.shard_map(
-        work,
-        mesh=Mesh(np.array(over), ("device",)),
-        in_specs=(own, own, shared),
-        out_specs=own,
-        check_vma=False,
-    )
-    return jax.jit(program, compiler_options=compiler_options())
-
-
-class Deal(NamedTuple):
-    """Rows dealt out like cards, so that neighbours, which cost alike, lie on different devices.
-
-    Attributes:
-        row: Row at every place, device after device; the last row where there is none.
-        real: How many come first on each device that are no padding.
-        place: Where each row is.
-    """
-
-    row: np.ndarray
-    real: np.ndarray
-    place: np.ndarray
-
-
-def deal(rows: int, real: int, hands: int) -> Deal:
-    """`rows` rows, the first `real` of which are no padding, dealt to so many devices."""
-    share = -(-rows // hands)
-    hand = np.arange(hands)
-    row = np.minimum(hand[:, None] + hands * np.arange(share), rows - 1).ravel()
-    each = np.arange(rows)
-    return Deal(row, (-((hand - real) // hands)).astype(np.int32), each % hands * share + each // hands)
+    chosen = jax.default_device.value is not None
+    devices = [jnp.zeros(()).device] if chosen else jax.local_devices()
+    return devices * max(workers() // len(devices), 1)
 
 
 class Service(NamedTuple):

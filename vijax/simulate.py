@@ -93,14 +93,14 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
 
 
 @lru_cache(maxsize=32)
-def _compiled(plan: Plan, width: int, devices: tuple[jax.Device, ...]):
-    """The jitted program of a plan: a whole tile of cells in one call, shared by the devices."""
+def _compiled(plan: Plan, width: int):
+    """The jitted program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
-        table = lanes.run(_program(plan, settings), cells, count[0], columns(plan), width)
+        table = lanes.run(_program(plan, settings), cells, count, columns(plan), width)
         return unpack(plan, table)
 
-    return lanes.spread(tile, devices)
+    return jax.jit(tile, compiler_options=lanes.compiler_options())
 
 
 LINKS = 64  # of a call on chains: one compiled program for chains of every length
@@ -113,15 +113,12 @@ def chains_at_once(chains: int) -> int:
     return min(max(1 << (share - 1).bit_length(), _FEWEST_CHAINS), _MOST_CHAINS)
 
 
-_LEAST_LANES = 128
-
-
 def _width(cells: int, level: bool) -> int:
-    """Lanes for a share of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
+    """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill.
 
     A sampled step holds some dozens of samples a lane.
     """
-    return max(min(cells // 8, 512 if level else 256), _LEAST_LANES)
+    return max(min(cells // 8, 512 if level else 256), 128)
 
 
 def tolerances(dtype: str) -> dict[str, float]:
@@ -148,10 +145,9 @@ def summarise(
     outputs: frozenset[str] = frozenset({"P"}),
     method: Method | None = None,
     count: int | None = None,
+    on: jax.Device | None = None,
 ) -> Summary:
     """Run a tile of cells from phase 0, each until its attractor is certain or its window is over, in one jitted call.
-
-    Every local device of JAX takes a share of them. A cell's numbers do not depend on how many there are.
 
     Args:
         pair: Cells; `kappa=None` for rigid walls.
@@ -164,6 +160,7 @@ def summarise(
         outputs: Names of `Summary` fields that must be there; what only others need is not computed.
         method: The stepping method (`method.choose` makes it); None for the exact engine.
         count: How many cells are real, the rest being padding; all unless given.
+        on: The device that runs them; JAX's default unless given.
 
     Returns:
         The summary; a cell that fails says so in `status` and holds NaN.
@@ -190,19 +187,9 @@ def summarise(
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
     )
-    return _dealt(plan, cells, pair.d.shape[0] if count is None else count, settings)
-
-
-def _dealt(plan: Plan, cells: Float[Array, "cell in"], count: int, settings: Settings) -> Summary:
-    """The summary of a table of cells, shared by as many devices as have a lane for it."""
-    rows = cells.shape[0]
-    devices = lanes.devices()[: max(rows // _LEAST_LANES, 1)]
-    hands = lanes.deal(rows, count, len(devices))
-    program = _compiled(plan, _width(hands.row.size // len(devices), plan.level), devices)
-    if len(devices) == 1:
-        return program(cells, hands.real, settings)
-    found = program(np.asarray(cells)[hands.row], hands.real, jax.tree.map(np.asarray, settings))
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[hands.place]), found)
+    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
+    given = cells, number, settings
+    return _compiled(plan, _width(pair.d.shape[0], plan.level))(*(given if on is None else jax.device_put(given, on)))
 
 
 def blank(count: int, variants: int, dtype: str) -> Summary:
