@@ -293,7 +293,8 @@ def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
             tiles = itertools.chain([first], tiles)
         fill()
         while running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            done = wait(running, return_when=FIRST_COMPLETED).done
+            for future in [future for future in running if future in done]:  # in the order in which they began
                 tile = running.pop(future)
                 fill()
                 yield tile, *future.result()
