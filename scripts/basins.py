@@ -113,8 +113,7 @@ def _summary(dataset: "xr.Dataset") -> Iterator[str]:
     """The attractors of every cell, or how many cells have how many of them."""
     cells = [str(dim) for dim in dataset["attractors"].dims]
     if dataset["attractors"].size > 1:
-        numbers = sorted(int(number) for number in dataset["attractors"].values.flat)
-        yield f"cells by number of attractors: {command.tally(f'{number}:' for number in numbers)}"
+        yield f"cells by number of attractors: {command.tally(dataset['attractors'].values, '{:.0f}:'.format)}"
         return
     first = dataset.isel(dict.fromkeys(cells, 0))
     mirrors = ", mirror images as one" if dataset.attrs["merge_mirrors"] else ""

@@ -5,6 +5,8 @@ A script is a click command whose body is one `door`, one run under `progress`, 
 
 import math
 import os
+import signal
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -120,15 +122,24 @@ def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft
 
 
 def targets(
-    out: str | None, plot: str | None, defaults: tuple[str, str], overwrite: bool, ending: str = ".zarr"
+    out: str | None,
+    plot: str | None,
+    defaults: tuple[str, str],
+    overwrite: bool,
+    ending: str = ".zarr",
+    goes_on: bool = False,
 ) -> tuple[Path | None, Path | None]:
-    """Store and picture to write, both defaults where neither was given; raises unless they can be written."""
+    """Store and picture to write, both defaults where neither was given; raises unless they can be written.
+
+    With `goes_on` a store that is there is left to `study.check`, and its picture is drawn again.
+    """
     from vijax.store import check_output
 
     if out is None and plot is None:
         out, plot = defaults
     if out is not None and not out.endswith(ending):
         raise ValueError(f"out must end in {ending}; got {out!r}")
+    overwrite = overwrite or (goes_on and out is not None and Path(out).exists())
     return (
         None if out is None else check_output("out", out, overwrite),
         None if plot is None else check_output("plot", plot, overwrite),
@@ -176,9 +187,10 @@ def finish(
     plot: Path | None,
     picture: "Callable[[xr.Dataset, Path], Any]",
     overwrite: bool,
+    kept: bool = False,
 ) -> None:
-    """Write the store and the picture, then say what the run found, what was written and how long it all took."""
-    if out is not None:
+    """Write the store, unless the run did, and the picture; say what was found and written, and how long it took."""
+    if out is not None and not kept:
         from vijax.store import save
 
         save(dataset, out, overwrite=overwrite)
@@ -202,23 +214,53 @@ def pace(count: int, seconds: float, unit: str = "cells") -> str:
 def flags(variable: "xr.DataArray") -> str:
     """How often each value of a variable with CF flags occurs."""
     names = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
-    return tally(names[value] for value in variable.values.flat)
+    return tally(variable.values, names.get)
 
 
-def tally(words: Iterable[str]) -> str:
-    """How often each word occurs, in the order of their first."""
-    return ", ".join(f"{word} {n:,}" for word, n in Counter(words).items())
+def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:
+    """How often each name occurs among that many values, the least values first, or those least by `order`."""
+    import numpy as np
+
+    kinds, counts = np.unique(values, return_counts=True)
+    found: Counter[str] = Counter()
+    rows = zip(kinds.tolist(), counts.tolist(), strict=True)
+    for kind, count in sorted(rows, key=lambda row: (order or float)(row[0])):
+        found[str(name(kind))] += count
+    return ", ".join(f"{word} {n:,}" for word, n in found.items())
+
+
+class _Terminated(KeyboardInterrupt):
+    """What SIGTERM raises."""
+
+
+def _terminate(signum: int, frame: Any) -> None:
+    raise _Terminated
 
 
 def run(command: click.Command, arguments: list[str] | None = None) -> int:
-    """Exit code of a script: 0, or 2 after bad input, when nothing was run; after Ctrl-C the process ends with 130."""
+    """Exit code of a script: 0; 1 if what it writes could not be written; 2 after bad input, when nothing was run.
+
+    After Ctrl-C the process ends with 130, after SIGTERM with 143.
+    """
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _terminate)
     try:
         command.main(arguments, standalone_mode=False)
     except click.ClickException as error:
         click.echo(f"error: {error.format_message()}", err=True)
         return 2
-    except (click.Abort, KeyboardInterrupt):
-        click.echo("stopped; nothing half-written is left", err=True)
+    except (click.Abort, KeyboardInterrupt) as error:
+        cause = error.__cause__ or error
+        click.echo(f"stopped; {_kept(cause)}", err=True)
         # A compiled call cannot be stopped: leave without waiting for it.
-        os._exit(130)
+        os._exit(143 if isinstance(cause, _Terminated) else 130)
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
+        os._exit(1)
     return 0
+
+
+def _kept(error: BaseException) -> str:
+    """What a run that came to no end says of its files."""
+    return " ".join(getattr(error, "__notes__", ["nothing half-written is left"]))

@@ -1,7 +1,7 @@
 """A map of harvested energy from one command: a labelled store, a picture, a closing summary.
 
     python scripts/grid.py
-    python scripts/grid.py --gamma 0.1 --out inclined.zarr --plot inclined.png
+    python scripts/grid.py --gamma 0.1 --out inclined.zarr --plot inclined.png  # stopped, it goes on when given again
     python scripts/grid.py --omega pi:6pi:96 --omega0 20:400:96 --plot device.png
     python scripts/grid.py --show label --plot labels.png
     python scripts/grid.py --kappa 3:4000:128:log --compare rigid --tolerance 0.05
@@ -74,7 +74,8 @@ def _options() -> list[click.Parameter]:
 @click.command(
     params=_options(),
     epilog=f"{command.VALUES} With neither --out nor --plot, power_map.zarr and power_map.png are written, "
-    "or the same of label_map or comparison.",
+    "or the same of label_map or comparison. A map is written as it is made: stopped in whatever way, the same command "
+    "goes on with it, and --overwrite begins anew.",
     context_settings={"max_content_width": 120},
 )
 def power_map(
@@ -90,7 +91,9 @@ def power_map(
     with command.door():
         _check_show(show, compare, given["until"])
         picture = show if compare is None else "difference"
-        out, plot = command.targets(given.pop("out"), given.pop("plot"), _FILES[picture], overwrite)
+        out, plot = command.targets(
+            given.pop("out"), given.pop("plot"), _FILES[picture], overwrite, goes_on=compare is None
+        )
         axes, device = command.take_axes(given, _DEFAULT_PLANE), command.device(constants)
         if compare is None and tolerance is not None:
             raise ValueError(f"tolerance must come with compare; got {tolerance:g} alone; add --compare rigid")
@@ -101,12 +104,19 @@ def power_map(
             planned = _comparison(axes, device, outputs, compare, tolerance, given)
         if plot is not None:
             _check_picture(plot, planned, show)
+        if compare is None and out is not None:
+            _check_study(planned, out, overwrite)
     keep_compiled()
-    began = time.perf_counter()
-    dataset = _run(planned)
-    pace = command.pace(planned.count, time.perf_counter() - began)
+    dataset, pace = _run(planned, out, overwrite)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
-    command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite)
+    kept = compare is None
+    command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite, kept)
+
+
+def _check_study(planned: Any, out: Path, overwrite: bool) -> None:
+    from vijax import study
+
+    study.check(planned, out, overwrite)
 
 
 def _check_show(show: str, compare: str | None, until: str) -> None:
@@ -189,12 +199,23 @@ def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
 
 
-def _run(planned: "Plan | Comparison") -> "xr.Dataset":
+def _run(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> "tuple[xr.Dataset, str]":
+    """The map, and how fast it was made."""
     from vijax import grid
     from vijax.compare import Comparison, run
 
+    before: list[int] = []  # cells that a store held already
+
     with command.progress(planned.count) as show:
-        return run(planned, show) if isinstance(planned, Comparison) else grid.run(planned, show)
+
+        def tell(done: int, total: int) -> None:
+            before.append(done)
+            show(done, total)
+
+        began = time.perf_counter()
+        found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite)
+    pace = command.pace(planned.count - before[0], time.perf_counter() - began)
+    return found, f"{pace}, {before[0]:,} were there" if before[0] else pace
 
 
 def _draw(picture: str, dataset: "xr.Dataset", path: Path) -> None:
@@ -210,8 +231,12 @@ def _summary(dataset: "xr.Dataset") -> str:
     lines = [f"cells by status: {flags(dataset['status'])}"]
     if "period" in dataset:
         names = {-1: "undecided", 0: "aperiodic"} | {n: f"period {n}" for n in range(1, _LONG)}
-        periods = sorted(dataset["period"].values.flat, key=lambda period: period if period > 0 else math.inf)
-        lines.append(f"cells by period: {tally(names.get(period, f'{_LONG} and more') for period in periods)}")
+        periods = tally(
+            dataset["period"].values,
+            lambda period: names.get(period, f"{_LONG} and more"),
+            order=lambda period: period if period > 0 else math.inf,
+        )
+        lines.append(f"cells by period: {periods}")
     if {"P", "admissible"} <= set(dataset):
         peak = best(dataset)
         lines.append(f"largest admissible P: {'none' if peak is None else _place(peak, dataset)}")

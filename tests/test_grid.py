@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import stand_in
 
 from vijax import dataset, grid, simulate
 from vijax.axes import cells, parse_axis
@@ -29,14 +30,6 @@ LONG = 40  # periods: enough for the 1:1 orbits of these tests
 ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "max_penetration", "max_impact_speed"}
 
 
-def formula(pair, u0, v0, scale):
-    """A stand-in for the engine whose every field tells which cell it is."""
-    kappa = np.ones_like(pair.d) if pair.kappa is None else np.asarray(pair.kappa)
-    mark = np.asarray(pair.d) + 10 * kappa + 1e4 * np.asarray(pair.gamma) + 1e5 * np.asarray(u0) + 0 * np.asarray(v0)
-    metres = np.asarray(scale.length)[:, None] * np.asarray(scale.length_variant)
-    return mark, mark[:, None] * metres
-
-
 @pytest.fixture
 def engine(monkeypatch):
     """The stand-in in place of the engine; its list says how many real cells each tile had."""
@@ -44,12 +37,7 @@ def engine(monkeypatch):
 
     def summarise(pair, u0, v0, scale, device, *, count, **settings):
         tiles.append((int(count), settings, pair, device))
-        mark, energy = formula(pair, u0, v0, scale)
-        whole = np.arange(mark.size, dtype=np.int32)
-        wide, narrow = ("P", "P_stderr", "energy_ratio"), ("period", "impacts_left", "impacts_right", "status")
-        fields = {name: mark for name in simulate.Summary.__dataclass_fields__}
-        fields |= dict.fromkeys(wide, energy) | dict.fromkeys(narrow, 0 * whole)
-        return simulate.Summary(**fields)
+        return stand_in(pair, u0, v0, scale, device, count=count, **settings)
 
     monkeypatch.setattr(simulate, "summarise", summarise)
     return tiles
@@ -234,8 +222,8 @@ def test_an_unknown_axis_is_named(no_engine):
 
 
 def test_every_cell_lands_in_its_place(engine, monkeypatch):
-    monkeypatch.setattr(grid, "_SMALLEST_TILE", 4)
-    monkeypatch.setattr(grid, "_LARGEST_TILE", 8)
+    monkeypatch.setattr(grid, "SMALLEST_TILE", 4)
+    monkeypatch.setattr(grid, "LARGEST_TILE", 8)
     axes = {"A": [1.0, 2.0, 5.0], "kappa": [3.0, 30.0, 300.0], "gamma": [0.1, 0.0], "d": np.linspace(0.1, 0.3, 11)}
     steps = []
     here = threading.current_thread()
@@ -310,8 +298,8 @@ def test_admissible_asks_for_energy_and_depth(monkeypatch):
 
 
 def test_ctrl_c_drops_the_waiting_tiles(engine, monkeypatch):
-    monkeypatch.setattr(grid, "_SMALLEST_TILE", 2)
-    monkeypatch.setattr(grid, "_LARGEST_TILE", 2)
+    monkeypatch.setattr(grid, "SMALLEST_TILE", 2)
+    monkeypatch.setattr(grid, "LARGEST_TILE", 2)
     slow = simulate.summarise
 
     def summarise(*args, **settings):

@@ -66,9 +66,10 @@ ROOMS: dict[str, set[str]] = {
     "survey": {"lanes", "model", "simulate", "record", "shooting", "orbit"},
     "axes": {"model"},
     "branch": {"model", "method", "flow", "shooting", "orbit", "arc", "axes"},
-    "dataset": {"model", "method", "axes", "simulate"},
+    "dataset": {"lanes", "model", "method", "axes", "simulate"},
     "store": set(),
-    "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "simulate"},
+    "study": {"lanes", "model", "axes", "dataset", "store"},
+    "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "study", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
     "compare": {"model", "dataset", "label", "grid"},
     "design": {

@@ -221,3 +221,12 @@ def test_chains_and_links_that_are_padding_stay_zero_and_are_never_looked_at():
     assert np.array_equal(found[:5, :4], [plain_chain(rows) for rows in links[:5, :4]])
     assert not found[5:].any()
     assert not found[:, 4:].any()
+
+
+@pytest.mark.parametrize(("wanted", "expected"), [(1, ["a", "b"]), (2, ["a", "b"]), (5, ["a", "b", "a", "b"])])
+def test_every_device_has_a_place_and_more_where_there_are_cores(monkeypatch, wanted, expected):
+    monkeypatch.setattr(jax, "local_devices", lambda: ["a", "b"])
+    monkeypatch.setattr(lanes, "workers", lambda: wanted)
+    assert lanes.places() == expected
+    with jax.default_device(jax.devices()[0]):
+        assert lanes.places() == jax.devices()[:1] * wanted

@@ -5,7 +5,7 @@ This is the door of `grid.sweep` and of the scripts: whatever can be wrong with 
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -151,8 +151,25 @@ class Cells:
     def flat(self, quantity: "xr.Variable", index: np.ndarray) -> np.ndarray:
         """Values of a quantity in the cells with the given flat indices; variants at their first point."""
         first = quantity.isel({dim: 0 for dim in self.variant if dim in quantity.dims})
-        full = first.set_dims({dim: self.sizes[dim] for dim in self.dynamic}).transpose(*self.dynamic)
-        return full.values[np.unravel_index(index, full.shape)] if self.dynamic else np.full(index.shape, full.values)
+        # Never over all dimensions at once: a plane may be larger than memory.
+        places = np.unravel_index(index, [self.sizes[dim] for dim in self.dynamic]) if self.dynamic else ()
+        place = dict(zip(self.dynamic, places, strict=True))
+        return np.broadcast_to(first.values[tuple(place[str(dim)] for dim in first.dims)], index.shape)
+
+    def cut(self, block: Mapping[str, slice]) -> "Cells":
+        """The cells of a block, the other dimensions whole."""
+
+        def within(variable: "xr.Variable") -> "xr.Variable":
+            return variable.isel({dim: part for dim, part in block.items() if dim in variable.dims})
+
+        return replace(
+            self,
+            given={name: within(values) for name, values in self.given.items()},
+            sizes={dim: len(range(size)[block.get(dim, slice(None))]) for dim, size in self.sizes.items()},
+            quantities={name: within(values) for name, values in self.quantities.items()},
+            length=within(self.length),
+            speed=within(self.speed),
+        )
 
     def factors(self, scale: "xr.Variable") -> np.ndarray:
         """Factors by which the variants change a scale; the same for every cell, as scales are products over axes."""

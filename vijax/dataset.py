@@ -1,18 +1,19 @@
 """The map that a sweep returns: its variables, coordinates and units, and the record of how it was made."""
 
+import math
 import os
 import platform
 import subprocess
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import numpy as np
 
-from vijax import simulate
+from vijax import lanes, simulate
 from vijax.axes import AXES, Cells
 from vijax.method import Method, record
 from vijax.model import CONSTANTS, Harvester, Status
@@ -40,6 +41,15 @@ class Plan:
     def count(self) -> int:
         """Number of simulations."""
         return self.cells.count
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Fields of `Summary` that the outputs are made of."""
+        return frozenset(need for name in self.outputs for need in OUTPUTS[name].needs)
+
+    def cut(self, block: Mapping[str, slice]) -> "Plan":
+        """The same for a block of the cells."""
+        return replace(self, cells=self.cells.cut(block))
 
 
 class Output(NamedTuple):
@@ -117,6 +127,14 @@ def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
     return xr.Dataset(variables, coords=coordinates(of), attrs=provenance(planned))
 
 
+def specimen(planned: Plan) -> "xr.Dataset":
+    """The map of the first cell alone, its numbers void: what kind of variables there will be."""
+    first = planned.cut({dim: slice(1) for dim in planned.cells.dynamic})
+    variants = math.prod(planned.cells.sizes[dim] for dim in planned.cells.variant)
+    blank = simulate.blank(1, variants, planned.settings["dtype"])
+    return label(first, {name: np.asarray(getattr(blank, name)) for name in planned.needs})
+
+
 def flagged(status: "xr.Variable") -> "xr.Variable":
     """A variable of `Status` codes that says what they mean."""
     found = status.astype(np.int8)
@@ -155,18 +173,34 @@ def coordinates(of: Cells) -> "dict[str, xr.Variable]":
 
 
 def provenance(planned: Plan) -> dict[str, Any]:
-    """How a map was made: versions, commit, machine, settings, constants, tolerances."""
-    accelerator = jax.devices()[0]
-    # The constants that axes stand for are coordinates.
-    constants = [name for name in CONSTANTS if name not in AXES]
+    """How a map was made: versions, commit, machine, and all that was asked."""
     return {
         "title": "Energy harvested by a vibro-impact pair",
         "Conventions": "CF-1.11",
+        **made_by(),
+        **asked(planned),
+    }
+
+
+@cache
+def made_by() -> dict[str, str]:
+    """What computes here: versions, commit, machine."""
+    places = lanes.places()
+    return {
         "source": f"vijax {_version('vijax')}",
         "commit": _commit(),
         **{f"version_{name}": _version(name) for name in ("jax", "jaxlib", "equinox", "numpy", "xarray", "zarr")},
         "version_python": platform.python_version(),
-        "device": f"{accelerator.device_kind} ({accelerator.platform}), {platform.machine()}, {os.cpu_count()} cores",
+        "device": f"{len(set(places))} {places[0].device_kind} ({places[0].platform}), {platform.machine()}, "
+        f"{os.cpu_count()} cores",
+    }
+
+
+def asked(planned: Plan) -> dict[str, Any]:
+    """What a map holds besides its coordinates: settings, outputs, constants, tolerances."""
+    # The constants that axes stand for are coordinates.
+    constants = [name for name in CONSTANTS if name not in AXES]
+    return {
         **planned.settings,
         **record(planned.method),
         "outputs": " ".join(planned.outputs),

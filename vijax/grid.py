@@ -1,12 +1,17 @@
-"""Sweeps: axes -> cells -> tiles on every core -> a labelled map.
+"""Sweeps: axes -> cells -> tiles on every device and core -> a labelled map, in memory or on disk.
 
 `plan` checks everything that can be wrong and starts nothing, `run` does the work, `sweep` is both.
 """
 
+import itertools
+import logging
 import math
+import queue
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +19,14 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax import method as methods
-from vijax import simulate
+from vijax import simulate, study
 from vijax.axes import cells
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
-from vijax.lanes import workers
+from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
-from vijax.store import load, save
+from vijax.store import load, save, view
+from vijax.study import LARGEST_TILE, SMALLEST_TILE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,8 +38,9 @@ _CHOICES = {
     "wall": ("soft", "rigid"),
     "dtype": ("float64", "float32"),
 }
-# A tile is one compiled call of about a second: large enough to keep the lanes full, small enough for progress.
-_SMALLEST_TILE, _LARGEST_TILE = 1024, 32768
+_LOG = logging.getLogger(__name__)
+
+Fields = dict[str, np.ndarray]  # of `Summary`, by name
 
 
 class Axes(TypedDict, total=False):
@@ -69,6 +76,8 @@ def sweep(
     device: Harvester | None = None,
     dtype: str = "float64",
     progress: Callable[[int, int], None] | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
     """Energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
@@ -103,16 +112,21 @@ def sweep(
             given. What is not wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
-        progress: Called with (cells done, cells in all) from the calling thread, first with 0 done.
+        progress: Called with (cells done, cells in all) from the calling thread, first before anything is run.
+        out: Zarr store to write tile by tile, so that memory is set by a tile. It opens at any time, cells that were
+            not run yet by their `status`; stopped in whatever way, the same call goes on with what is left of it.
+            Without, everything is in memory.
+        overwrite: Begin anew whatever the store holds.
 
     Returns:
         A dataset with one dimension per array, every parameter as a coordinate with units, and the variables wanted,
         each without the dimensions that it cannot depend on. P is in joules per HALF forcing period. Believe it only
         where `admissible` is true, and read `status` (CF flags) where `period` is -1. Attributes record versions,
-        commit, machine, tolerances and every setting.
+        commit, machine, tolerances and every setting. With `out` nothing of it is read before it is looked at.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+        OSError: If `out` holds anything else, is being written by another run, or can be written no more.
 
     Source: Eqs. (36)-(38), corrected.
     """
@@ -132,7 +146,7 @@ def sweep(
         membrane=membrane,
         steps=steps,
     )
-    return run(planned, progress)
+    return run(planned, progress, out, overwrite)
 
 
 def plan(
@@ -177,53 +191,149 @@ def plan(
     )
 
 
-def run(planned: Plan, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
-    """The map of a plan, its cells simulated tile by tile on every core; see `sweep`."""
-    of, tell = planned.cells, progress or (lambda done, total: None)
+def run(
+    planned: Plan,
+    progress: Callable[[int, int], None] | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+) -> "xr.Dataset":
+    """The map of a plan, its cells simulated tile by tile on every device; see `sweep`."""
+    tell = progress or (lambda done, total: None)
+    if out is None:
+        return label(planned, _in_memory(planned, tell))
+    with study.opened(planned, out, overwrite) as plane:
+        _fill(plane, tell)
+    return view(out)
+
+
+def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
+    of = planned.cells
     tell(0, of.count)
     gamma = of.flat(of.quantities["gamma"], np.arange(of.count))
     # Level cells have a faster program, and one cell with gravity in a tile would keep all of it from that.
     groups = [np.flatnonzero(gamma == 0), np.flatnonzero(gamma != 0)]
-    found: dict[str, np.ndarray] = {}
+    found: Fields = {}
     done = 0
     for group in groups:
-        for index, fields_found in _simulate_all(planned, group):
-            for name, part in fields_found.items():
-                found.setdefault(name, np.empty((of.count, *part.shape[1:]), part.dtype))[index] = part
+        for index, part in _simulate_all(planned, group):
+            _put(found, of.count, index, part)
             done += index.size
             tell(done, of.count)
-    return label(planned, found)
+    return found
 
 
-def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+def _fill(plane: study.Study, tell: Callable[[int, int], None]) -> None:
+    """Simulate and write the tiles of a study that are not done."""
+    left = study.left(plane, _LOG.warning)
+    total = plane.planned.count
+    done = total - sum(map(plane.count, left))
+    rows = _rows(plane.most)
+    try:
+        tell(done, total)
+        tiles = (_Tile(part := plane.cut(tile), np.arange(part.count), rows, tile) for tile in left)
+        for tile, found, seconds in _in_turn(tiles):
+            study.write(plane, tile.number, label(tile.planned, found), seconds)
+            done += tile.cells.size
+            tell(done, total)
+    except (KeyboardInterrupt, OSError) as error:
+        error.add_note(f"{done:,} of {total:,} cells are in {plane.path}; the same command goes on from there")
+        raise
+
+
+class _Tile(NamedTuple):
+    """Cells of a plan by flat index, how many rows their call has, and which tile it is."""
+
+    planned: Plan
+    cells: np.ndarray
+    rows: int
+    number: int
+
+
+def _rows(cells: int) -> int:
+    """Rows of the call for so many cells: a power of two, so that few programs are compiled."""
+    return max(1 << (cells - 1).bit_length(), SMALLEST_TILE)
+
+
+def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
+    """Lay a part of the cells into the fields of all."""
+    for name, values in part.items():
+        found.setdefault(name, np.empty((count, *values.shape[1:]), values.dtype))[index] = values
+
+
+def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray, Fields]]:
     """Flat indices and fields of `Summary` of every tile of a group of cells, as the tiles are done."""
     if not group.size:
         return
-    count = workers()
-    share = math.ceil(group.size / count)
-    tile = min(max(1 << (share - 1).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
-    # Strided tiles are samples of the whole plane: they cost the same, and no core is left with the slow corner.
-    number = math.ceil(group.size / tile)
-    tiles = [group[first::number] for first in range(number)]
+    rows = min(_rows(math.ceil(group.size / len(places()))), LARGEST_TILE)
+    # Strided tiles are samples of the whole plane: they cost the same, and nobody is left with the slow corner.
+    number = math.ceil(group.size / rows)
+    for tile, found, _ in _in_turn(_Tile(planned, group[first::number], rows, first) for first in range(number)):
+        yield tile.cells, found
+
+
+def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
+    """Tiles, their fields and the seconds they took, as they are done; the next ones run meanwhile."""
+    tiles, here = iter(tiles), places()
+    free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
+    for place in here:
+        free.put(place)
     # No tile runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
-    pool = ThreadPoolExecutor(count)
+    pool = ThreadPoolExecutor(len(here))
+    running: dict[Future[tuple[Fields, float]], _Tile] = {}
+
+    def fill() -> None:
+        for tile in itertools.islice(tiles, len(here) + 1 - len(running)):  # one waits, so that nobody does
+            running[pool.submit(_simulate, tile, free)] = tile
+
     try:
-        if number > 1:
-            # Compiles, and runs no cell; all threads at once would each compile.
-            pool.submit(_simulate, planned, tiles[0], tile, 0).result()
-        running = {pool.submit(_simulate, planned, index, tile, index.size): index for index in tiles}
-        for future in as_completed(running):
-            yield running.pop(future), future.result()
+        if len(here) > 1 and (first := next(tiles, None)):
+            # All threads at once would each compile what they share.
+            wait([pool.submit(_compile, first, place) for place in set(here)])
+            tiles = itertools.chain([first], tiles)
+        fill()
+        while running:
+            done = wait(running, return_when=FIRST_COMPLETED).done
+            for future in [future for future in running if future in done]:  # in the order in which they began
+                tile = running.pop(future)
+                fill()
+                yield tile, *future.result()
     finally:
         # After Ctrl-C the waiting tiles are dropped, and those that run end by themselves.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _simulate(planned: Plan, index: np.ndarray, tile: int, count: int) -> dict[str, np.ndarray]:
-    """Fields of `Summary` for the first `count` of these cells, padded to a tile so that one program serves all."""
+def _simulate(tile: _Tile, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
+    """Fields of `Summary` for the cells of a tile, and the seconds it took, on a device that is free."""
+    began, place = time.perf_counter(), free.get()
+    _LOG.info("tile %d begins", tile.number)
+    found: Fields = {}
+    try:
+        for part in _kinds(tile):
+            _put(found, tile.cells.size, part, _summarise(tile, tile.cells[part], part.size, place))
+    finally:
+        free.put(place)
+    return found, time.perf_counter() - began
+
+
+def _compile(tile: _Tile, place: jax.Device) -> None:
+    """What the tile needs, without running a cell."""
+    for part in _kinds(tile):
+        _summarise(tile, tile.cells[part], 0, place)
+
+
+def _kinds(tile: _Tile) -> list[np.ndarray]:
+    """Places of a tile's level cells, which have a faster program, and of the others; those that there are."""
+    of = tile.planned.cells
+    level = of.flat(of.quantities["gamma"], tile.cells) == 0
+    return [kind for kind in (np.flatnonzero(level), np.flatnonzero(~level)) if kind.size]
+
+
+def _summarise(tile: _Tile, index: np.ndarray, count: int, place: jax.Device) -> Fields:
+    """Fields of `Summary` for the first `count` of these cells, padded so that one program serves all."""
+    planned = tile.planned
     of, settings = planned.cells, planned.settings
-    padded = np.resize(index, tile)
-    needs = frozenset(need for name in planned.outputs for need in OUTPUTS[name].needs)
+    padded = np.resize(index, tile.rows)
+    needs = planned.needs
 
     def column(quantity: "xr.Variable") -> jax.Array:
         return jnp.asarray(of.flat(quantity, padded).astype(settings["dtype"]))
@@ -249,5 +359,6 @@ def _simulate(planned: Plan, index: np.ndarray, tile: int, count: int) -> dict[s
         outputs=needs,
         method=planned.method,
         count=count,
+        on=place,
     )
     return {name: np.asarray(getattr(summary, name))[:count] for name in needs}

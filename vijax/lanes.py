@@ -40,6 +40,17 @@ def workers() -> int:
     return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
 
 
+def places() -> list[jax.Device]:
+    """A device for every tile that is run at once: all of this process, and a CPU's as often as its cores want.
+
+    If one was chosen as JAX's default, that one alone. No tile is spread over several devices: XLA parts such a program
+    before it optimises, and rounds otherwise than on one.
+    """
+    chosen = jax.default_device.value is not None
+    devices = [jnp.zeros(()).device] if chosen else jax.local_devices()
+    return devices * max(workers() // len(devices), 1)
+
+
 class Service(NamedTuple):
     """What becomes of lanes that a trip declined; every function works on a whole batch of lanes, row by row.
 

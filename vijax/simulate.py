@@ -134,6 +134,7 @@ def summarise(
     outputs: frozenset[str] = frozenset({"P"}),
     method: Method | None = None,
     count: int | None = None,
+    on: jax.Device | None = None,
 ) -> Summary:
     """Run a tile of cells from phase 0, each until its attractor is certain or its window is over, in one jitted call.
 
@@ -148,6 +149,7 @@ def summarise(
         outputs: Names of `Summary` fields that must be there; what only others need is not computed.
         method: The stepping method (`method.choose` makes it); None for the exact engine.
         count: How many cells are real, the rest being padding; all unless given.
+        on: The device that runs them; JAX's default unless given.
 
     Returns:
         The summary; a cell that fails says so in `status` and holds NaN.
@@ -166,7 +168,6 @@ def summarise(
     )
     kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
     cells = jnp.stack([pair.d, kappa, pair.r, pair.gamma, scale.length, scale.speed, u0, v0], axis=1)
-    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
     settings = Settings(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
@@ -175,7 +176,25 @@ def summarise(
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
     )
-    return _compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)
+    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
+    given = cells, number, settings
+    return _compiled(plan, _width(pair.d.shape[0], plan.level))(*(given if on is None else jax.device_put(given, on)))
+
+
+def blank(count: int, variants: int, dtype: str) -> Summary:
+    """A summary without content of so many cells: which shape and kind of number each field has."""
+    plan = Plan(
+        until="attractor",
+        stepping=None,
+        rigid=False,
+        level=True,
+        deep=True,
+        energies=True,
+        asymmetry=True,
+        tangent=True,
+        variants=variants,
+    )
+    return unpack(plan, jnp.zeros((count, columns(plan)), dtype))
 
 
 def attractors(

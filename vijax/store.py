@@ -72,28 +72,42 @@ def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) ->
     Raises:
         FileExistsError, FileNotFoundError, PermissionError: As `check_output`.
     """
+    target = check_output("path", path, overwrite)
+    with replacing(target) as part:
+        write(dataset, part)
+
+
+def write(dataset: "xr.Dataset", path: Path) -> None:
+    """Write a new store."""
+    encoding = {name: {"compressors": compressors()} for name in dataset.variables}
+    dataset.to_zarr(path, mode="w-", zarr_format=3, consolidated=False, encoding=encoding)
+
+
+def compressors() -> tuple[Any, ...]:
+    """Of every chunk, its checksum last."""
     from zarr.codecs import Crc32cCodec, ZstdCodec  # here, as importing vijax must not load it
 
-    target = check_output("path", path, overwrite)
-    compressors = (ZstdCodec(level=3), Crc32cCodec())
-    encoding = {name: {"compressors": compressors} for name in dataset.variables}
-    with replacing(target) as part:
-        dataset.to_zarr(part, mode="w-", zarr_format=3, consolidated=False, encoding=encoding)
+    return ZstdCodec(level=3), Crc32cCodec()
 
 
 def load(path: str | Path) -> "xr.Dataset":
-    """The map that `save` wrote, equal to the one that was saved.
+    """The map that `save` wrote, equal to the one that was saved, or what there is of a study.
 
     Raises:
         FileNotFoundError: If there is no store.
         ValueError: If a checksum does not match.
     """
+    with view(path) as dataset:
+        return dataset.load()
+
+
+def view(path: str | Path) -> "xr.Dataset":
+    """As `load`, but nothing is read before it is looked at."""
     import xarray as xr  # here, as importing vijax must not load it
 
     if not (Path(path) / "zarr.json").is_file():
-        raise FileNotFoundError(f"path must name a zarr store written by vijax.save; got {path}")
-    with xr.open_zarr(path, consolidated=False, chunks=None) as dataset:
-        return dataset.load()
+        raise FileNotFoundError(f"path must name a zarr store written by vijax; got {path}")
+    return xr.open_zarr(path, consolidated=False, chunks=None)
 
 
 def write_json(report: Any, path: Path) -> None:
