@@ -66,6 +66,12 @@ def _options() -> list[click.Parameter]:
             metavar="NAME,NAME",
             help="variables wanted [all but asymmetry, lyapunov; for labels lyapunov too]",
         ),
+        click.Option(
+            ["--refine"],
+            type=int,
+            metavar="LEVELS",
+            help="compute every 2^LEVELS-th cell along each axis, then those at borders; fill the others",
+        ),
         click.Option(["--show"], default="power", show_default=True, help="what the picture shows: power or label"),
         *command.file_options(),
     ]
@@ -104,7 +110,7 @@ def power_map(
     keep_compiled()
     began = time.perf_counter()
     dataset = _run(planned)
-    pace = command.pace(planned.count, time.perf_counter() - began)
+    pace = command.pace(dataset.attrs.get("refine_computed", planned.count), time.perf_counter() - began)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
     command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite)
 
@@ -148,6 +154,8 @@ def _comparison(
         raise ValueError(f"wall must not be chosen with compare, which runs soft and rigid ones; got {wall!r}")
     if outputs is not None:
         raise ValueError(f"outputs must not be chosen with compare; got {outputs!r}; leave them out")
+    if (levels := settings.pop("refine")) is not None:
+        raise ValueError(f"refine must not be chosen with compare, which computes every cell; got {levels}")
     for name in _METHOD_OPTIONS:
         if (value := settings.pop(name)) not in (None, "exact"):
             raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
@@ -208,6 +216,9 @@ def _summary(dataset: "xr.Dataset") -> str:
     from vijax.dataset import best
 
     lines = [f"cells by status: {flags(dataset['status'])}"]
+    if "computed" in dataset:
+        computed, shown = dataset.attrs["refine_computed"], dataset.attrs["refine_shown"]
+        lines.insert(0, f"cells computed: {computed:,} of {shown:,} shown, {computed / shown:.1%}; the others filled")
     if "period" in dataset:
         names = {-1: "undecided", 0: "aperiodic"} | {n: f"period {n}" for n in range(1, _LONG)}
         periods = sorted(dataset["period"].values.flat, key=lambda period: period if period > 0 else math.inf)

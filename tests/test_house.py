@@ -68,7 +68,8 @@ ROOMS: dict[str, set[str]] = {
     "branch": {"model", "method", "flow", "shooting", "orbit", "arc", "axes"},
     "dataset": {"model", "method", "axes", "simulate"},
     "store": set(),
-    "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "simulate"},
+    "refine": {"label"},
+    "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "refine", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
     "compare": {"model", "dataset", "label", "grid"},
     "design": {

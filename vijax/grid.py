@@ -6,6 +6,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import jax
@@ -14,8 +15,9 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax import method as methods
+from vijax import refine as refinement
 from vijax import simulate
-from vijax.axes import cells
+from vijax.axes import Cells, cells
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
 from vijax.lanes import workers
 from vijax.membrane import HuntCrossley, Law
@@ -68,6 +70,7 @@ def sweep(
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
     dtype: str = "float64",
+    refine: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
@@ -103,7 +106,11 @@ def sweep(
             given. What is not wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
-        progress: Called with (cells done, cells in all) from the calling thread, first with 0 done.
+        refine: Levels of refinement: every 2^refine-th cell along each axis is computed, then only those at borders
+            between kinds of motion or where P is not interpolated to 1 %, and the others are filled (`vijax.refine`).
+            `computed` says which are which.
+        progress: Called with (cells done, cells in all) from the calling thread, first with 0 done. While a plane is
+            refined "in all" are those known to be needed, and grow.
 
     Returns:
         A dataset with one dimension per array, every parameter as a coordinate with units, and the variables wanted,
@@ -131,6 +138,7 @@ def sweep(
         atol=atol,
         membrane=membrane,
         steps=steps,
+        refine=refine,
     )
     return run(planned, progress)
 
@@ -145,7 +153,7 @@ def plan(
         outputs: As in `sweep`.
         device: As in `sweep`.
         settings: periods, until, transient, wall, method, dtype: all of them, as in `sweep`; and of solver, rtol, atol,
-            membrane, steps those that are given.
+            membrane, steps, refine those that are given.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
@@ -156,6 +164,7 @@ def plan(
         if settings[name] not in allowed:
             choices = " or ".join(f'"{choice}"' for choice in allowed)
             raise ValueError(f"{name} must be {choices}; got {settings[name]!r}")
+    refine = settings.pop("refine", None)
     options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
     method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
     if outputs is None:
@@ -167,41 +176,99 @@ def plan(
     device = Harvester() if device is None else device
     given = {name: values for name, values in axes.items() if values is not None}
     lossy = method is None or not isinstance(method.law, HuntCrossley)
+    laid_out = cells(given, device, settings["wall"], restitution=lossy)
     return Plan(
-        cells=cells(given, device, settings["wall"], restitution=lossy),
+        cells=laid_out,
         settings=settings,
         method=method,
         # No map can be read without knowing how its cells ended.
         outputs=tuple(name for name in OUTPUTS if name in wanted or name == "status"),
         device=device,
+        refine=0 if refine is None else _levels(refine, laid_out, settings["until"]),
     )
+
+
+def _levels(refine: Any, of: Cells, until: str) -> int:
+    levels = methods.whole("refine", refine, 1)
+    if until != "attractor":
+        raise ValueError(f"refine must be left out with until={until!r}, whose cells have no label; got {levels}")
+    longest = max((of.sizes[dim] for dim in of.dynamic), default=1)
+    most = refinement.most_levels(longest)
+    if levels > most:
+        raise ValueError(
+            f"refine must leave 4 steps of 2^refine cells along the longest axis that the motion depends on, "
+            f"at most {most} levels for {longest} values; got {levels}"
+        )
+    return levels
 
 
 def run(planned: Plan, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
     """The map of a plan, its cells simulated tile by tile on every core; see `sweep`."""
     of, tell = planned.cells, progress or (lambda done, total: None)
+    if planned.refine:
+        return _refined(planned, tell)
     tell(0, of.count)
-    gamma = of.flat(of.quantities["gamma"], np.arange(of.count))
-    # Level cells have a faster program, and one cell with gravity in a tile would keep all of it from that.
-    groups = [np.flatnonzero(gamma == 0), np.flatnonzero(gamma != 0)]
     found: dict[str, np.ndarray] = {}
-    done = 0
-    for group in groups:
-        for index, fields_found in _simulate_all(planned, group):
-            for name, part in fields_found.items():
-                found.setdefault(name, np.empty((of.count, *part.shape[1:]), part.dtype))[index] = part
-            done += index.size
-            tell(done, of.count)
+    for done in _compute(planned, np.arange(of.count), found):
+        tell(done, of.count)
     return label(planned, found)
 
 
-def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
+    """The map of a plan of which a part is computed, in rounds, and the rest filled."""
+    of = planned.cells
+    varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
+    mesh = refinement.Mesh(tuple(of.given[dim].values for dim in varied), planned.refine)
+    level_ground = of.flat(of.quantities["gamma"], np.arange(of.count)) == 0
+    asked = replace(planned, outputs=tuple(dict.fromkeys((*planned.outputs, *refinement.NEEDS))))
+    found: dict[str, np.ndarray] = {}
+    computed = np.zeros(of.count, bool)
+    past, tile = 0, None
+    for cells_wanted in refinement.rounds(mesh, found, level_ground):
+        # One size for all rounds is one program to compile.
+        tile = tile or _tile(cells_wanted.size)
+        tell(past, past + cells_wanted.size)
+        for done in _compute(asked, cells_wanted, found, tile):
+            tell(past + done, past + cells_wanted.size)
+        computed[cells_wanted] = True
+        past += cells_wanted.size
+    refinement.fill(mesh, found, computed, level_ground)
+    told = {"units": "1", "long_name": "whether the cell was computed; the others are filled between those that were"}
+    dataset = label(planned, found)
+    dataset["computed"] = of.dynamic, computed.reshape([of.sizes[dim] for dim in of.dynamic]), told
+    dataset.attrs |= {
+        "refine": planned.refine,
+        "refine_tolerance": refinement.TOLERANCE,
+        "refine_computed": past,
+        "refine_shown": of.count,
+    }
+    return dataset
+
+
+def _compute(planned: Plan, wanted: np.ndarray, found: dict[str, np.ndarray], tile: int | None = None) -> Iterator[int]:
+    """Compute cells, given by flat indices, into fields over all cells; yields how many are done."""
+    of, done = planned.cells, 0
+    gamma = of.flat(of.quantities["gamma"], wanted)
+    # Level cells have a faster program, and one cell with gravity in a tile would keep all of it from that.
+    for group in (wanted[gamma == 0], wanted[gamma != 0]):
+        for index, fields_found in _simulate_all(planned, group, tile or _tile(group.size)):
+            for name, part in fields_found.items():
+                found.setdefault(name, np.empty((of.count, *part.shape[1:]), part.dtype))[index] = part
+            done += index.size
+            yield done
+
+
+def _tile(cells: int) -> int:
+    """Cells in a tile where there are so many."""
+    share = math.ceil(cells / workers())
+    return min(max(1 << max(share - 1, 0).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
+
+
+def _simulate_all(planned: Plan, group: np.ndarray, tile: int) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Flat indices and fields of `Summary` of every tile of a group of cells, as the tiles are done."""
     if not group.size:
         return
     count = workers()
-    share = math.ceil(group.size / count)
-    tile = min(max(1 << (share - 1).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
     # Strided tiles are samples of the whole plane: they cost the same, and no core is left with the slow corner.
     number = math.ceil(group.size / tile)
     tiles = [group[first::number] for first in range(number)]
