@@ -223,12 +223,11 @@ def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
     asked = replace(planned, outputs=tuple(dict.fromkeys((*planned.outputs, *refinement.NEEDS))))
     found: dict[str, np.ndarray] = {}
     computed = np.zeros(of.count, bool)
-    past, tile = 0, None
+    past = 0
     for cells_wanted in refinement.rounds(mesh, found, level_ground):
-        # One size for all rounds is one program to compile.
-        tile = tile or _tile(cells_wanted.size)
         tell(past, past + cells_wanted.size)
-        for done in _compute(asked, cells_wanted, found, tile):
+        # The tile of the whole plane for all rounds: one program to compile, and the one of the plane in full.
+        for done in _compute(asked, cells_wanted, found, _tile(of.count)):
             tell(past + done, past + cells_wanted.size)
         computed[cells_wanted] = True
         past += cells_wanted.size
@@ -270,7 +269,7 @@ def _simulate_all(planned: Plan, group: np.ndarray, tile: int) -> Iterator[tuple
         return
     count = workers()
     # Strided tiles are samples of the whole plane: they cost the same, and no core is left with the slow corner.
-    number = math.ceil(group.size / tile)
+    number = max(math.ceil(group.size / tile), min(count, math.ceil(group.size / _SMALLEST_TILE)))
     tiles = [group[first::number] for first in range(number)]
     # No tile runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
     pool = ThreadPoolExecutor(count)
