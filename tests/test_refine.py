@@ -72,7 +72,10 @@ ODD = {
 
 @pytest.mark.parametrize("axes", ODD.values(), ids=ODD)
 def test_a_power_law_is_filled_exactly_from_the_coarsest_lattice(axes):
-    plane = painted(axes, power=lambda *x: np.exp(sum((i + 1) * y / 10 for i, y in enumerate(x))))
+    def law(*x):
+        return np.prod([y**1.5 if (y > 0).all() else np.exp(y / 3) for y in x], axis=0)
+
+    plane = painted(axes, power=law)
     found, known = refined(axes, plane)
     assert known.sum() == lattice_size(axes, LEVELS)
     np.testing.assert_allclose(found["P"].ravel(), plane["P"].ravel(), rtol=1e-12)
@@ -160,21 +163,24 @@ def test_nothing_computed_contradicts_what_is_filled(seed, levels, shape):
     kind, power = plane["period"].reshape(shape), plane["P"].reshape(shape)
     mesh = Mesh(tuple(axes), levels)
     for level in range(1, levels + 1):
-        sides = [list(itertools.pairwise(mesh.ranks(axis, level))) for axis in (0, 1)]
+        sides = [itertools.pairwise(mesh.ranks(axis, level)) for axis in (0, 1)]
+        halves = [mesh.ranks(axis, level - 1) for axis in (0, 1)]
         for (a, b), (c, d) in itertools.product(*sides):
-            inside = np.s_[a : b + 1, c : d + 1]
-            corners = kind[np.ix_([a, b], [c, d])]
-            if (
-                not known[np.ix_([a, b], [c, d])].all()
-                or known[np.ix_([a, (a + b) // 2, b], [c, (c + d) // 2, d])].all()
-            ):
+            inside, ends = np.s_[a : b + 1, c : d + 1], np.ix_([a, b], [c, d])
+            within = np.ix_(
+                *(half[(low <= half) & (half <= high)] for half, low, high in zip(halves, (a, c), (b, d), strict=True))
+            )
+            if not known[ends].all() or known[within].all():
                 continue
+            corners = kind[ends]
             assert (kind[inside][known[inside]] == corners[0, 0]).all()
             assert (found["period"][inside] == corners[0, 0]).all()
             x, y = ((ranks - ranks[0]) / (ranks[-1] - ranks[0]) for ranks in (np.arange(a, b + 1), np.arange(c, d + 1)))
-            logs = np.log(power[np.ix_([a, b], [c, d])])
+            logs = np.log(power[ends])
             guess = np.stack([1 - x, x]).T @ logs @ np.stack([1 - y, y])
-            assert (abs(guess - np.log(power[inside]))[known[inside]] <= refine.TOLERANCE).all()
+            # A narrow block at the end of an axis may have corners that only its neighbours asked for: it was judged as
+            # a part of the block around it.
+            assert (abs(guess - np.log(power[inside]))[known[inside]] <= 2 * refine.TOLERANCE).all()
 
 
 def test_status_alone_makes_a_border():
@@ -250,7 +256,7 @@ def test_noise_within_its_standard_error_is_not_refined(error, refined_too):
 
 @pytest.fixture
 def mirrors():
-    """A plane of 1:2 orbits and their mirror images 2:1, as chance has it, but for the coarsest lattice's first row."""
+    """A plane of 1:2 orbits and their mirror images 2:1, as chance has it."""
     axes = [LINE, LINE]
     turned = np.random.default_rng(4).uniform(size=(65, 65)) < 0.5
 
@@ -297,7 +303,7 @@ def test_no_periods_were_run_in_a_filled_cell():
 
 # --- sweeps ---------------------------------------------------------------------------------------------------------
 
-AXES = {"d": np.linspace(0.15, 0.3, 34), "kappa": np.geomspace(20, 200, 21)}
+AXES = {"d": np.linspace(0.2, 0.3, 66), "kappa": np.geomspace(20, 200, 41)}
 PERIODS = 60
 
 
@@ -344,7 +350,7 @@ def test_attributes_say_what_was_computed(both):
 def test_progress_grows_with_what_is_wanted(both):
     _, found, told = both
     done, total = (np.array(column) for column in zip(*told, strict=True))
-    assert told[0] == (0, 10 * 6)
+    assert told[0] == (0, lattice_size(AXES.values(), 2))
     assert (np.diff(done) >= 0).all()
     assert (np.diff(total) >= 0).all()
     assert told[-1] == (found.computed.values.sum(),) * 2
@@ -374,7 +380,7 @@ BAD = [
     (0, {}, "refine must be a whole number of at least 1; got 0"),
     (1.5, {}, "refine must be a whole number of at least 1; got 1.5"),
     ("two", {}, "refine must be a whole number of at least 1; got 'two'"),
-    (4, {}, "at most 3 levels for 34 values; got 4"),
+    (5, {}, "at most 4 levels for 66 values; got 5"),
     (1, {"d": 0.2, "kappa": 30.0}, "at most 0 levels for 1 values; got 1"),
     (1, {"d": np.linspace(0.1, 0.3, 8), "kappa": 30.0}, "at most 0 levels for 8 values; got 1"),
     (2, {"wall": "rigid", "d": 0.2}, "at most 0 levels for 1 values; got 2"),  # kappa enters energies alone there

@@ -63,6 +63,11 @@ class Mesh:
         return tuple(axis.size for axis in self.axes)
 
     @cached_property
+    def _values(self) -> list[np.ndarray]:
+        # Most of what depends on a stiffness or a gap does so about as a power.
+        return [np.log(axis) if (axis > 0).all() else axis for axis in self.axes]
+
+    @cached_property
     def _orders(self) -> list[np.ndarray]:
         return [np.argsort(axis, kind="stable") for axis in self.axes]
 
@@ -98,11 +103,12 @@ class Mesh:
     def corners(self, cells: Cells, level: int) -> tuple[np.ndarray, np.ndarray, Cells]:
         """Corners [corner, cell] of the blocks that cells lie in, their weights there, and the nearest corner.
 
-        On a block's border only corners of that border have a weight; the nearest stands for the others.
+        Weights are linear in the logarithms of an axis, or in its values unless all are positive. On a block's border
+        only corners of that border have a weight; the nearest stands for the others.
         """
         ends, weights = [], []
         for axis, rank in enumerate(self.ranks_of(cells)):
-            order, values = self._orders[axis], self.axes[axis]
+            order, values = self._orders[axis], self._values[axis]
             points = order[self.ranks(axis, level)]
             _, block = self.blocks(axis, level, rank)
             low, high = points[block], points[block + 1]
