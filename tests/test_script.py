@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 
+import command
 import grid as script
 import numpy as np
 import pytest
@@ -203,6 +204,29 @@ def test_labels_are_shown_with_exponents(folder, monkeypatch):
     assert {"lyapunov", "P", "period"} < set(plans[0].outputs)
     assert "asymmetry" not in plans[0].outputs
     assert drawn == ["labels.png"]
+
+
+def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
+    plans = []
+    ok = xr.Variable("d", [0, 0], {"flag_values": [0], "flag_meanings": "ok"})
+    found = xr.Dataset(
+        {"status": ok, "computed": ("d", [True, False])}, attrs={"refine_computed": 1, "refine_shown": 2}
+    )
+    monkeypatch.setattr(grid, "run", lambda plan, progress: plans.append(plan) or found)
+    monkeypatch.setattr(plot, "power_map", lambda found, path: None)
+    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    assert script.main(["--refine", "3", "--plot", "map.png"]) == 0
+    assert plans[0].refine == 3
+    out = capsys.readouterr().out
+    assert out.startswith("1 cells in")
+    assert "cells computed: 1 of 2 shown, 50.0%; the others filled" in out
+
+
+def test_the_progress_bar_follows_a_total_that_grows(capsys):
+    with command.progress(8) as show:
+        for done, total in ((0, 2), (2, 2), (2, 5), (5, 5)):
+            show(done, total)
+    assert "5.00/5.00" in capsys.readouterr().err
 
 
 def test_from_arguments_to_store_and_picture(folder, monkeypatch):
