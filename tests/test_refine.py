@@ -127,6 +127,11 @@ def test_a_border_is_found_and_nothing_is_filled_across_it(axes):
     assert known.sum() < known.size
 
 
+def test_the_neighbours_of_a_block_on_a_border_are_split():
+    _, known = refined([LINE], painted([LINE], kind=lambda x: 1 + (x > LINE[32]), power=lambda x: 1 + 0 * x), levels=1)
+    np.testing.assert_array_equal(np.flatnonzero(known[1::2]) * 2 + 1, [31, 33, 35])
+
+
 def test_a_border_costs_its_length():
     axes = [np.linspace(0, 1, 513)] * 2
     _, known = refined(axes, painted(axes, kind=disc, power=lambda *x: 1 + 0 * x[0]))
@@ -206,7 +211,7 @@ def test_failed_cells_are_a_kind_of_their_own():
 
 def test_no_energy_is_a_kind_of_its_own():
     axes = [LINE]
-    plane = painted(axes, power=lambda x: np.maximum(x - 0.49, 0))
+    plane = painted(axes, power=lambda x: np.where(x < 0.49, 0.0, 1.0))
     found, known = refined(axes, plane)
     np.testing.assert_array_equal(found["P"][LINE < 0.49], 0)
     assert known[[31, 32]].all()
