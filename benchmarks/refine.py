@@ -6,7 +6,19 @@
 
 Both planes are computed in the same run, the full one first. An aperiodic cell has no other P than its average, so P is
 compared where the full plane is periodic. The labels of coexisting attractors are speckled: cells with a neighbour of
-another label have to be computed by whoever wants the picture of the full plane.
+another label have to be computed by whoever wants the picture of the full plane. Printout of the first, two cores of a
+busy machine, programs compiled before:
+
+    full                         115.7 s, 71.7 s of all cores together
+    3 levels                     62.9 s, 34.6 s of all cores together
+    computed                     19.75% of 1,048,576 cells
+    forcing periods run          43.01% of the full plane's: cells on borders are the slow ones
+    computed cells               equal bit for bit in 18 variables
+    labels equal                 99.822% of all cells
+    filled periodic              71.51% of all cells, P within 1% in 99.937% of them
+    filled aperiodic             8.72% of all cells, P within 1% in 81.198% of them
+    forced by labels             7.50% of all cells have a neighbour of another label
+    speckles                     0.73% have none of their own
 """
 
 import argparse
