@@ -175,6 +175,7 @@ def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], N
         def show(done: int, total: int) -> None:
             if done:
                 bar.set_description(unit, refresh=False)
+            bar.total = total
             bar.update(done - bar.n)
 
         yield show

@@ -66,6 +66,12 @@ def _options() -> list[click.Parameter]:
             metavar="NAME,NAME",
             help="variables wanted [all but asymmetry, lyapunov; for labels lyapunov too]",
         ),
+        click.Option(
+            ["--refine"],
+            type=int,
+            metavar="LEVELS",
+            help="compute every 2^LEVELS-th cell along each axis, then those at borders; fill the others",
+        ),
         click.Option(["--show"], default="power", show_default=True, help="what the picture shows: power or label"),
         *command.file_options(),
     ]
@@ -105,7 +111,7 @@ def power_map(
         if plot is not None:
             _check_picture(plot, planned, show)
         if compare is None and out is not None:
-            _check_study(planned, out, overwrite)
+            _check_store(planned, out, overwrite)
     keep_compiled()
     dataset, pace = _run(planned, out, overwrite)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
@@ -113,10 +119,10 @@ def power_map(
     command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite, kept)
 
 
-def _check_study(planned: Any, out: Path, overwrite: bool) -> None:
-    from vijax import study
+def _check_store(planned: Any, out: Path, overwrite: bool) -> None:
+    from vijax import grid
 
-    study.check(planned, out, overwrite)
+    grid.check(planned, out, overwrite)
 
 
 def _check_show(show: str, compare: str | None, until: str) -> None:
@@ -158,6 +164,8 @@ def _comparison(
         raise ValueError(f"wall must not be chosen with compare, which runs soft and rigid ones; got {wall!r}")
     if outputs is not None:
         raise ValueError(f"outputs must not be chosen with compare; got {outputs!r}; leave them out")
+    if (levels := settings.pop("refine")) is not None:
+        raise ValueError(f"refine must not be chosen with compare, which computes every cell; got {levels}")
     for name in _METHOD_OPTIONS:
         if (value := settings.pop(name)) not in (None, "exact"):
             raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
@@ -204,18 +212,18 @@ def _run(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> "tu
     from vijax import grid
     from vijax.compare import Comparison, run
 
-    before: list[int] = []  # cells that a store held already
+    told: list[int] = []  # cells done, at first those that a store held already
 
     with command.progress(planned.count) as show:
 
         def tell(done: int, total: int) -> None:
-            before.append(done)
+            told.append(done)
             show(done, total)
 
         began = time.perf_counter()
         found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite)
-    pace = command.pace(planned.count - before[0], time.perf_counter() - began)
-    return found, f"{pace}, {before[0]:,} were there" if before[0] else pace
+    pace = command.pace(told[-1] - told[0], time.perf_counter() - began)
+    return found, f"{pace}, {told[0]:,} were there" if told[0] else pace
 
 
 def _draw(picture: str, dataset: "xr.Dataset", path: Path) -> None:
@@ -229,6 +237,9 @@ def _summary(dataset: "xr.Dataset") -> str:
     from vijax.dataset import best
 
     lines = [f"cells by status: {flags(dataset['status'])}"]
+    if "computed" in dataset:
+        computed, shown = dataset.attrs["refine_computed"], dataset.attrs["refine_shown"]
+        lines.insert(0, f"cells computed: {computed:,} of {shown:,} shown, {computed / shown:.1%}; the others filled")
     if "period" in dataset:
         names = {-1: "undecided", 0: "aperiodic"} | {n: f"period {n}" for n in range(1, _LONG)}
         periods = tally(

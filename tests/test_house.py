@@ -69,7 +69,8 @@ ROOMS: dict[str, set[str]] = {
     "dataset": {"lanes", "model", "method", "axes", "simulate"},
     "store": set(),
     "study": {"lanes", "model", "axes", "dataset", "store"},
-    "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "study", "simulate"},
+    "refine": {"label"},
+    "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "study", "refine", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
     "compare": {"model", "dataset", "label", "grid"},
     "design": {

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+import command
 import grid as script
 import numpy as np
 import pytest
@@ -92,6 +93,11 @@ BAD = [
     (["--compare", "rigid", "--u0", "0.2", "--d", "0.1,0.2"], "u0 must lie in the gap"),
     (["--compare", "rigid", "--d", "0.1", "--kappa", "30"], "single cell"),
     (["--compare", "rigid", "--plot", "map.doc"], "plot must end in"),
+    (["--refine", "0"], "refine must be a whole number of at least 1; got 0"),
+    (["--refine", "9"], "refine must leave 4 steps .* at most 4 levels for 128 values; got 9"),
+    (["--refine", "2", "--until", "window"], "refine must be left out with until='window'"),
+    (["--refine", "some"], "--refine"),
+    (["--refine", "2", "--compare", "rigid"], "refine must not be chosen with compare"),
     (["--show", "phase"], "show must be power or label; got 'phase'"),
     (["--show", "label", "--until", "window"], "got label with until window"),
     (["--show", "label", "--compare", "rigid"], "got label with a comparison"),
@@ -202,6 +208,36 @@ def test_labels_are_shown_with_exponents(folder, monkeypatch):
     assert {"lyapunov", "P", "period"} < set(plans[0].outputs)
     assert "asymmetry" not in plans[0].outputs
     assert drawn == ["labels.png"]
+
+
+def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
+    plans = []
+    ok = xr.Variable("d", [0, 0], {"flag_values": [0], "flag_meanings": "ok"})
+    found = xr.Dataset(
+        {"status": ok, "computed": ("d", [True, False])}, attrs={"refine_computed": 1, "refine_shown": 2}
+    )
+
+    def run(plan, tell, *_):
+        plans.append(plan)
+        tell(0, 1)
+        tell(1, 1)
+        return found
+
+    monkeypatch.setattr(grid, "run", run)
+    monkeypatch.setattr(plot, "power_map", lambda found, path: None)
+    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    assert script.main(["--refine", "3", "--plot", "map.png"]) == 0
+    assert plans[0].refine == 3
+    out = capsys.readouterr().out
+    assert out.startswith("1 cells in")
+    assert "cells computed: 1 of 2 shown, 50.0%; the others filled" in out
+
+
+def test_the_progress_bar_follows_a_total_that_grows(capsys):
+    with command.progress(8) as show:
+        for done, total in ((0, 2), (2, 2), (2, 5), (5, 5)):
+            show(done, total)
+    assert "5.00/5.00" in capsys.readouterr().err
 
 
 def test_from_arguments_to_store_and_picture(folder, monkeypatch):

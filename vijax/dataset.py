@@ -28,7 +28,7 @@ Found = dict[str, Any]  # field of Summary -> xr.Variable
 class Plan:
     """A sweep that has passed the door: its cells, its settings by name, its method unless it is the exact one.
 
-    And the outputs wanted, and the device.
+    And the outputs wanted, the device, and the levels of refinement, 0 where every cell is computed.
     """
 
     cells: Cells
@@ -36,6 +36,7 @@ class Plan:
     method: Method | None
     outputs: tuple[str, ...]
     device: Harvester
+    refine: int = 0
 
     @property
     def count(self) -> int:

@@ -10,6 +10,7 @@ import queue
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
@@ -19,13 +20,14 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax import method as methods
+from vijax import refine as refinement
 from vijax import simulate, study
-from vijax.axes import cells
+from vijax.axes import Cells, cells
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
 from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
-from vijax.store import load, save, view
+from vijax.store import check_output, load, save, view
 from vijax.study import LARGEST_TILE, SMALLEST_TILE
 
 if TYPE_CHECKING:
@@ -75,6 +77,7 @@ def sweep(
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
     dtype: str = "float64",
+    refine: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -112,10 +115,14 @@ def sweep(
             given. What is not wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
-        progress: Called with (cells done, cells in all) from the calling thread, first before anything is run.
+        refine: Levels of refinement: every 2^refine-th cell along each axis is computed, then only those at borders
+            between kinds of motion or where P is not interpolated to 1 %, and the others are filled (`vijax.refine`).
+            `computed` says which are which.
+        progress: Called with (cells done, cells in all) from the calling thread, first before anything is run. While a
+            plane is refined, all are those known to be needed, and grow.
         out: Zarr store to write tile by tile, so that memory is set by a tile. It opens at any time, cells that were
             not run yet by their `status`; stopped in whatever way, the same call goes on with what is left of it.
-            Without, everything is in memory.
+            A refined plane is written when it is whole. Without, everything is in memory.
         overwrite: Begin anew whatever the store holds.
 
     Returns:
@@ -145,6 +152,7 @@ def sweep(
         atol=atol,
         membrane=membrane,
         steps=steps,
+        refine=refine,
     )
     return run(planned, progress, out, overwrite)
 
@@ -159,7 +167,7 @@ def plan(
         outputs: As in `sweep`.
         device: As in `sweep`.
         settings: periods, until, transient, wall, method, dtype: all of them, as in `sweep`; and of solver, rtol, atol,
-            membrane, steps those that are given.
+            membrane, steps, refine those that are given.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
@@ -170,6 +178,7 @@ def plan(
         if settings[name] not in allowed:
             choices = " or ".join(f'"{choice}"' for choice in allowed)
             raise ValueError(f"{name} must be {choices}; got {settings[name]!r}")
+    refine = settings.pop("refine", None)
     options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
     method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
     if outputs is None:
@@ -181,14 +190,30 @@ def plan(
     device = Harvester() if device is None else device
     given = {name: values for name, values in axes.items() if values is not None}
     lossy = method is None or not isinstance(method.law, HuntCrossley)
+    laid_out = cells(given, device, settings["wall"], restitution=lossy)
     return Plan(
-        cells=cells(given, device, settings["wall"], restitution=lossy),
+        cells=laid_out,
         settings=settings,
         method=method,
         # No map can be read without knowing how its cells ended.
         outputs=tuple(name for name in OUTPUTS if name in wanted or name == "status"),
         device=device,
+        refine=0 if refine is None else _levels(refine, laid_out, settings["until"]),
     )
+
+
+def _levels(refine: Any, of: Cells, until: str) -> int:
+    levels = methods.whole("refine", refine, 1)
+    if until != "attractor":
+        raise ValueError(f"refine must be left out with until={until!r}, whose cells have no label; got {levels}")
+    longest = max((of.sizes[dim] for dim in of.dynamic), default=1)
+    most = refinement.most_levels(longest)
+    if levels > most:
+        raise ValueError(
+            f"refine must leave 4 steps of 2^refine cells along the longest axis that the motion depends on, "
+            f"at most {most} levels for {longest} values; got {levels}"
+        )
+    return levels
 
 
 def run(
@@ -200,26 +225,78 @@ def run(
     """The map of a plan, its cells simulated tile by tile on every device; see `sweep`."""
     tell = progress or (lambda done, total: None)
     if out is None:
-        return label(planned, _in_memory(planned, tell))
+        return _refined(planned, tell) if planned.refine else label(planned, _in_memory(planned, tell))
+    if planned.refine:
+        check(planned, out, overwrite)
+        # Which cells are computed depends on all that were: no part of it could be gone on with.
+        save(_refined(planned, tell), out, overwrite=overwrite)
+        return view(out)
     with study.opened(planned, out, overwrite) as plane:
         _fill(plane, tell)
     return view(out)
 
 
+def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
+    """Raise unless the map of a plan can be written there, or goes on there; makes nothing.
+
+    Raises:
+        OSError: Of which kind `study.check` and `store.check_output` say.
+    """
+    if planned.refine:
+        check_output("out", out, overwrite)
+    else:
+        study.check(planned, out, overwrite)
+
+
 def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
-    of = planned.cells
-    tell(0, of.count)
-    gamma = of.flat(of.quantities["gamma"], np.arange(of.count))
-    # Level cells have a faster program, and one cell with gravity in a tile would keep all of it from that.
-    groups = [np.flatnonzero(gamma == 0), np.flatnonzero(gamma != 0)]
+    count = planned.count
+    tell(0, count)
     found: Fields = {}
-    done = 0
-    for group in groups:
-        for index, part in _simulate_all(planned, group):
+    for done in _compute(planned, np.arange(count), found):
+        tell(done, count)
+    return found
+
+
+def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
+    """The map of a plan of which a part is computed, in rounds, and the rest filled."""
+    of = planned.cells
+    varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
+    mesh = refinement.Mesh(tuple(of.given[dim].values for dim in varied), planned.refine)
+    level_ground = of.flat(of.quantities["gamma"], np.arange(of.count)) == 0
+    asked = replace(planned, outputs=tuple(dict.fromkeys((*planned.outputs, *refinement.NEEDS))))
+    found: Fields = {}
+    computed = np.zeros(of.count, bool)
+    past = 0
+    for cells_wanted in refinement.rounds(mesh, found, level_ground):
+        tell(past, past + cells_wanted.size)
+        # The tile of the whole plane for all rounds: one program to compile, and the one of the plane in full.
+        for done in _compute(asked, cells_wanted, found, _share(of.count)):
+            tell(past + done, past + cells_wanted.size)
+        computed[cells_wanted] = True
+        past += cells_wanted.size
+    refinement.fill(mesh, found, computed, level_ground)
+    told = {"units": "1", "long_name": "whether the cell was computed; the others are filled between those that were"}
+    dataset = label(planned, found)
+    dataset["computed"] = of.dynamic, computed.reshape([of.sizes[dim] for dim in of.dynamic]), told
+    dataset.attrs |= {
+        "refine": planned.refine,
+        "refine_tolerance": refinement.TOLERANCE,
+        "refine_computed": past,
+        "refine_shown": of.count,
+    }
+    return dataset
+
+
+def _compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
+    """Compute cells, given by flat indices, into fields over all cells; yields how many are done."""
+    of, done = planned.cells, 0
+    gamma = of.flat(of.quantities["gamma"], wanted)
+    # Level cells have a faster program, and one cell with gravity in a tile would keep all of it from that.
+    for group in (wanted[gamma == 0], wanted[gamma != 0]):
+        for index, part in _simulate_all(planned, group, rows or _share(group.size)):
             _put(found, of.count, index, part)
             done += index.size
-            tell(done, of.count)
-    return found
+            yield done
 
 
 def _fill(plane: study.Study, tell: Callable[[int, int], None]) -> None:
@@ -251,7 +328,7 @@ class _Tile(NamedTuple):
 
 def _rows(cells: int) -> int:
     """Rows of the call for so many cells: a power of two, so that few programs are compiled."""
-    return max(1 << (cells - 1).bit_length(), SMALLEST_TILE)
+    return max(1 << max(cells - 1, 0).bit_length(), SMALLEST_TILE)
 
 
 def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
@@ -260,13 +337,17 @@ def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
         found.setdefault(name, np.empty((count, *values.shape[1:]), values.dtype))[index] = values
 
 
-def _simulate_all(planned: Plan, group: np.ndarray) -> Iterator[tuple[np.ndarray, Fields]]:
+def _share(cells: int) -> int:
+    """Rows of a call where there are so many cells for all devices together."""
+    return min(_rows(math.ceil(cells / len(places()))), LARGEST_TILE)
+
+
+def _simulate_all(planned: Plan, group: np.ndarray, rows: int) -> Iterator[tuple[np.ndarray, Fields]]:
     """Flat indices and fields of `Summary` of every tile of a group of cells, as the tiles are done."""
     if not group.size:
         return
-    rows = min(_rows(math.ceil(group.size / len(places()))), LARGEST_TILE)
     # Strided tiles are samples of the whole plane: they cost the same, and nobody is left with the slow corner.
-    number = math.ceil(group.size / rows)
+    number = max(math.ceil(group.size / rows), min(len(places()), math.ceil(group.size / SMALLEST_TILE)))
     for tile, found, _ in _in_turn(_Tile(planned, group[first::number], rows, first) for first in range(number)):
         yield tile.cells, found
 
