@@ -18,18 +18,19 @@ again. Typical printout:
     reference: P, microjoule (57.75761)                                      57.75761
     reference: penetration, mm (6.026)                                       6.0266
     reference: largest multiplier (0.533)                                    0.5335
-    scan: devices from the whole box; left out, their best being aperiodic   200; 9
-    scan: small and fast devices added, to have half of them interior; left out 106; 91
-    scan: best points of the scans clear of constraints                      153 of 306
-    scan: largest excess over a constraint, relative                         -1.8e-09
-    scan: most evaluations of a start that won; median                       60; 31
-    scan: misses, below 0.999                                                14 of 306
+    scan: devices from the whole box; left out, their best being aperiodic   135; 8
+    scan: small and fast devices added, to have half of them interior; left out 73; 48
+    scan: best points of the scans clear of constraints                      104 of 208
+    scan: largest excess over a constraint, relative                         -1.7e-09
+    scan: most evaluations of a start that won; median                       55; 32
+    scan: optimum over the scan's best: least, median, largest               0.19374, 1.00011, 1.72807
+    scan: misses, below 0.999                                                2 of 208
     speed: P with dP/dkappa, forward, over P alone                           1.11
     speed: P with dP/d(d, kappa, r), reverse, over P alone                   0.95
     cliffs: small fast device, kappa 3.69 to 3.72: optima; with a NaN; with no attracting orbit 3; 0; 0
     cliffs: beside 25 orbits that nearly graze: optima; with a NaN; with no attracting orbit 21; 0; 0
 
-(parts of it; the scan with --points 2000, before surveys kicked their chains)
+(parts of it; the scan with --devices 135, about an hour)
 """
 
 import argparse

@@ -220,7 +220,7 @@ def test_from_arguments_to_store_and_picture(found, tmp_path, monkeypatch, capsy
         "24 cells in",
         "soft cells by status: ok 20",
         "label: ",
-        "cheapest model within 1 %: soft 9, undecided 3, rigid 8",
+        "cheapest model within 1 %: rigid 8, soft 9, undecided 3",
         "least kappa from which on it is rigid: 1000 to 1e+04, median 1000 (3 of 4 found)",
         "wrote comparison.zarr, comparison.png",
     ):

@@ -288,7 +288,7 @@ from vijax import grid, lanes
 assert set(lanes.places()) == set(jax.devices())
 grid.SMALLEST_TILE = 128
 vijax.study.LARGEST_TILE = 128
-axes = dict(d=np.linspace(0.2, 0.3, 17), kappa=np.geomspace(50, 400, 21), periods=12, until="window")
+axes = dict(d=np.linspace(0.2, 0.3, 17), r=np.linspace(0.3, 0.7, 21), wall="rigid", periods=12, until="window")
 vijax.sweep(**axes, outputs=["impacts_per_period", "restitution"], out=sys.argv[2])
 """
 
