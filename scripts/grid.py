@@ -68,6 +68,8 @@ def _options() -> list[click.Parameter]:
         ),
         click.Option(["--show"], default="power", show_default=True, help="what the picture shows: power or label"),
         *command.file_options(),
+        click.Option(["--workers"], type=int, help="processes that share the cores and write the store, by Dask"),
+        click.Option(["--scheduler"], metavar="ADDRESS", help="of Dask: its workers, which see the store, write it"),
     ]
 
 
@@ -85,6 +87,8 @@ def power_map(
     tolerance: float | None,
     show: str,
     overwrite: bool,
+    workers: int | None,
+    scheduler: str | None,
     **given: Any,
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
@@ -104,13 +108,29 @@ def power_map(
             planned = _comparison(axes, device, outputs, compare, tolerance, given)
         if plot is not None:
             _check_picture(plot, planned, show)
+        crew = _crew(workers, scheduler, compare, out)
         if compare is None and out is not None:
             _check_study(planned, out, overwrite)
     keep_compiled()
-    dataset, pace = _run(planned, out, overwrite)
+    dataset, pace = _run(planned, out, overwrite, crew)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
     kept = compare is None
     command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite, kept)
+
+
+def _crew(workers: int | None, scheduler: str | None, compare: str | None, out: Path | None) -> int | str | None:
+    """Who runs the tiles, unless this process does."""
+    from vijax.grid import check_workers
+
+    if workers is not None and scheduler is not None:
+        raise ValueError(f"workers must be left out with scheduler, which has its own; got {workers}")
+    crew = scheduler if workers is None else workers
+    if crew is None:
+        return None
+    if compare is not None:
+        raise ValueError(f"workers must be left out with compare, which runs in one process; got {crew}")
+    check_workers(crew, out)
+    return crew
 
 
 def _check_study(planned: Any, out: Path, overwrite: bool) -> None:
@@ -199,7 +219,9 @@ def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
 
 
-def _run(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> "tuple[xr.Dataset, str]":
+def _run(
+    planned: "Plan | Comparison", out: Path | None, overwrite: bool, crew: int | str | None
+) -> "tuple[xr.Dataset, str]":
     """The map, and how fast it was made."""
     from vijax import grid
     from vijax.compare import Comparison, run
@@ -213,7 +235,7 @@ def _run(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> "tu
             show(done, total)
 
         began = time.perf_counter()
-        found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite)
+        found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite, crew)
     pace = command.pace(planned.count - before[0], time.perf_counter() - began)
     return found, f"{pace}, {before[0]:,} were there" if before[0] else pace
 
