@@ -35,7 +35,8 @@ SCRIPT = Path(__file__).parent.parent / "scripts" / "grid.py"
 # Says which tile begins, and hears Ctrl-C though a background job's children ignore it.
 WRAPPER = (
     "import logging, runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "logging.basicConfig(level=logging.INFO, format='%(message)s'); sys.argv = sys.argv[1:]; "
+    "logging.basicConfig(format='%(message)s'); logging.getLogger('vijax').setLevel(logging.INFO); "
+    "sys.argv = sys.argv[1:]; "
     "sys.path[0] = sys.argv[0].rpartition('/')[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
 )
 _WARM = 182  # the least side whose tiles are as large as any, so that they are compiled

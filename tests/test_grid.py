@@ -222,7 +222,7 @@ def test_an_unknown_axis_is_named(no_engine):
 
 
 def test_every_cell_lands_in_its_place(engine, monkeypatch):
-    monkeypatch.setattr(grid, "_SMALLEST_TILE", 4)
+    monkeypatch.setattr(grid, "SMALLEST_TILE", 4)
     monkeypatch.setattr(grid, "LARGEST_TILE", 8)
     axes = {"A": [1.0, 2.0, 5.0], "kappa": [3.0, 30.0, 300.0], "gamma": [0.1, 0.0], "d": np.linspace(0.1, 0.3, 11)}
     steps = []
@@ -298,7 +298,7 @@ def test_admissible_asks_for_energy_and_depth(monkeypatch):
 
 
 def test_ctrl_c_drops_the_waiting_tiles(engine, monkeypatch):
-    monkeypatch.setattr(grid, "_SMALLEST_TILE", 2)
+    monkeypatch.setattr(grid, "SMALLEST_TILE", 2)
     monkeypatch.setattr(grid, "LARGEST_TILE", 2)
     slow = simulate.summarise
 

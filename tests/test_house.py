@@ -68,7 +68,7 @@ ROOMS: dict[str, set[str]] = {
     "branch": {"model", "method", "flow", "shooting", "orbit", "arc", "axes"},
     "dataset": {"lanes", "model", "method", "axes", "simulate"},
     "store": set(),
-    "study": {"model", "dataset", "store"},
+    "study": {"lanes", "model", "axes", "dataset", "store"},
     "cluster": {"method"},
     "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "study", "cluster", "simulate"},
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},

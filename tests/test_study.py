@@ -228,6 +228,15 @@ def test_tiles_are_blocks_of_at_most_so_many_cells(sizes, most, expected):
     assert study.extents(sizes, most) == expected
 
 
+def test_a_small_plane_has_tiles_for_everyone(calls, out, monkeypatch):
+    monkeypatch.setattr(study, "LARGEST_TILE", 1000)
+    monkeypatch.setattr(study, "SMALLEST_TILE", 3)
+    monkeypatch.setattr(study, "places", lambda: jax.devices()[:1] * 2)
+    sweep(**AXES, out=out)
+    assert len(calls) >= 4
+    assert max(calls) <= 5
+
+
 def test_a_tile_of_many_variants_has_fewer_cells(calls, out, monkeypatch):
     monkeypatch.setattr(study, "_LARGEST_CHUNK", 8)
     sweep(**AXES, A=[1.0, 2.0, 3.0, 4.0], out=out)
@@ -277,7 +286,7 @@ import numpy as np
 import vijax
 from vijax import grid, lanes
 assert set(lanes.places()) == set(jax.devices())
-grid._SMALLEST_TILE = 128
+grid.SMALLEST_TILE = 128
 vijax.study.LARGEST_TILE = 128
 axes = dict(d=np.linspace(0.2, 0.3, 17), kappa=np.geomspace(50, 400, 21), periods=12, until="window")
 vijax.sweep(**axes, outputs=["impacts_per_period", "restitution"], out=sys.argv[2])

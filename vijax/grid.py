@@ -29,7 +29,7 @@ from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
 from vijax.store import load, save, view
-from vijax.study import LARGEST_TILE
+from vijax.study import LARGEST_TILE, SMALLEST_TILE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,7 +41,6 @@ _CHOICES = {
     "wall": ("soft", "rigid"),
     "dtype": ("float64", "float32"),
 }
-_SMALLEST_TILE = 1024  # a smaller one pays for lanes that stand empty
 _COMPILING = threading.Lock()  # or each thread of a worker would compile the same
 _LOG = logging.getLogger(__name__)
 
@@ -314,7 +313,7 @@ def _whole(tile: study.Tile, rows: int) -> _Tile:
 
 def _rows(cells: int) -> int:
     """Rows of the call for so many cells: a power of two, so that few programs are compiled."""
-    return max(1 << (cells - 1).bit_length(), _SMALLEST_TILE)
+    return max(1 << (cells - 1).bit_length(), SMALLEST_TILE)
 
 
 def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:

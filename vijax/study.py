@@ -20,7 +20,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vijax.axes import Cells
 from vijax.dataset import Plan, asked, coordinates, made_by, provenance, specimen
+from vijax.lanes import places
 from vijax.model import Status
 from vijax.store import check_output, compressors, replacing, view, write_json
 from vijax.store import write as write_store
@@ -28,8 +30,9 @@ from vijax.store import write as write_store
 if TYPE_CHECKING:
     import xarray as xr
 
-# A second or two of two cores: large enough to keep lanes full and files few, small enough to lose.
-LARGEST_TILE = 32768
+# A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
+SMALLEST_TILE, LARGEST_TILE = 1024, 32768
+_SHARES = 2  # tiles of a small plane for everyone who takes some: blocks do not cost the same
 _LARGEST_CHUNK = 1 << 21  # numbers: of many variants a tile has fewer cells
 _RECORDS = Path("status", "tiles")
 _SHOWN = 3  # of the settings that differ
@@ -194,8 +197,7 @@ def _write_blank(planned: Plan, path: Path) -> None:
     of = planned.cells
     write_store(xr.Dataset(coords=coordinates(of), attrs=provenance(planned)), path)
     group = zarr.open_group(path, mode="r+")
-    variants = math.prod(of.sizes[dim] for dim in of.variant)
-    tile = extents({dim: of.sizes[dim] for dim in of.dynamic}, min(LARGEST_TILE, max(_LARGEST_CHUNK // variants, 1)))
+    tile = extents({dim: of.sizes[dim] for dim in of.dynamic}, _most(of))
     for name, variable in specimen(planned).data_vars.items():
         group.create_array(
             str(name),
@@ -218,6 +220,13 @@ def _lock(path: Path) -> Path:
 
 def _birth(path: Path) -> str:
     return _lock(path).read_text(encoding="utf-8")
+
+
+def _most(of: Cells) -> int:
+    """Cells of a tile, at most."""
+    share = max(-(-of.count // (_SHARES * len(places()))), SMALLEST_TILE)
+    room = _LARGEST_CHUNK // math.prod(of.sizes[dim] for dim in of.variant)
+    return min(share, LARGEST_TILE, max(room, 1))
 
 
 def _void(name: str, dtype: np.dtype) -> Any:
