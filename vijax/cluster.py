@@ -69,21 +69,23 @@ def _in_turn(client: "Client", work: Callable[[Task], None], tasks: Iterator[Tas
 
     def fill() -> None:
         most = _WAITING * max(sum(client.nthreads().values()), 1)
-        for task in itertools.islice(tasks, max(most - len(running), 0)):
-            # Not pure: what it is for is what it does, and that may have been undone since the same was asked.
-            future = client.submit(work, task, pure=False)
-            running[future] = task
-            finished.add(future)
+        some = list(itertools.islice(tasks, max(most - len(running), 0)))
+        # Not pure: what it is for is what it does, and that may have been undone since the same was asked.
+        futures = client.map(work, some, pure=False)
+        running.update(zip(futures, some, strict=True))
+        finished.update(futures)
 
     fill()
-    for future in finished:
-        task = running.pop(future)
-        _ended(future)
+    for batch in finished.batches():
+        ended = []
+        for future in batch:
+            _check_ended(future)
+            ended.append(running.pop(future))
         fill()
-        yield task
+        yield from ended
 
 
-def _ended(future: "Future") -> None:
+def _check_ended(future: "Future") -> None:
     """Raise what ended a task, if it did not come to its own end."""
     from distributed.scheduler import KilledWorker
 

@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ from vijax.store import write as write_store
 
 if TYPE_CHECKING:
     import xarray as xr
+    import zarr
 
 # A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
 SMALLEST_TILE, LARGEST_TILE = 1024, 32768
@@ -91,8 +93,8 @@ class Study:
 
     def tile(self, number: int) -> "Tile":
         """A tile alone."""
-        block = self.block(number)
-        return Tile(number, self.path.absolute(), self.birth, self.planned.cut(block), self.dims, block, self.place(number))
+        block, path = self.block(number), self.path.absolute()
+        return Tile(number, path, self.birth, self.planned.cut(block), self.dims, block, self.place(number))
 
     def record(self, tile: int) -> Path:
         """Where it is written that a tile is done."""
@@ -366,12 +368,9 @@ def write(tile: Tile, found: "xr.Dataset", seconds: float) -> None:
     Raises:
         OSError: If the store cannot be written, or is no longer the one that the tile is of.
     """
-    import zarr
-
     _check_born(tile)
     for name, dims in tile.dims.items():
-        # Also a chunk that is void: a missing one is a damage.
-        array = zarr.open_array(tile.path / name, mode="r+").with_config({"write_empty_chunks": True})
+        array = _array(tile.path / name, tile.birth)
         array[tuple(tile.block.get(dim, slice(None)) for dim in dims)] = found[name].values
     record = {
         "cells": tile.planned.count,
@@ -383,6 +382,15 @@ def write(tile: Tile, found: "xr.Dataset", seconds: float) -> None:
     }
     _check_born(tile)
     write_json(record, _record(tile.path, tile.number))
+
+
+@lru_cache(maxsize=64)
+def _array(path: Path, birth: str) -> "zarr.Array":
+    """A variable of a store, to write; to open it takes as long as to write a tile of it."""
+    import zarr
+
+    # Also a chunk that is void: a missing one is a damage.
+    return zarr.open_array(path, mode="r+").with_config({"write_empty_chunks": True})
 
 
 def _check_born(tile: Tile) -> None:
