@@ -1,7 +1,8 @@
 """What does a study lose when it is killed, its disk is full or its files are damaged?
 
     python benchmarks/faults.py                          # every fault, each from the start
-    python benchmarks/faults.py --only kill --kills 20   # one of them: kill, stop, disk, readonly, chunks, writers
+    python benchmarks/faults.py --only kill --kills 20   # one of them: kill, stop, worker, disk, readonly, chunks,
+                                                         # writers
     python benchmarks/faults.py --side 256               # a smaller plane
 
 Each fault befalls `scripts/grid.py` on the (d, kappa) plane of side x side cells. Said are the moments, what the script
@@ -63,9 +64,9 @@ class Scene:
         return random.uniform(0, self.first + _REACH * self.each)
 
 
-def start(side: int, out: Path, **options) -> subprocess.Popen:
+def start(side: int, out: Path, *more: str, **options) -> subprocess.Popen:
     """The script on its way."""
-    plane = ["--d", f"0.05:0.3:{side}", "--kappa", f"3:400:{side}:log", "--out", str(out)]
+    plane = ["--d", f"0.05:0.3:{side}", "--kappa", f"3:400:{side}:log", "--out", str(out), *more]
     command = [sys.executable, "-c", WRAPPER, str(SCRIPT), *plane]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, **options)
 
@@ -138,6 +139,24 @@ def stop(scene: Scene) -> bool:
         print(f"    {which.name}: exit code {end.code}: {end.said}")
         good &= verdict(scene, out, end.began + finish(scene, out).began)
     return good
+
+
+def worker(scene: Scene) -> bool:
+    """SIGKILL of one of two workers of a cluster at a random moment."""
+    out = scene.store("worker")
+    process = start(scene.side, out, "--workers", "2")
+    while process.poll() is None and not done(out):
+        time.sleep(0.1)
+    time.sleep(random.random() * scene.each)
+    before, found = (
+        done(out),
+        subprocess.run(["pgrep", "-P", str(process.pid), "-f", "spawn_main"], capture_output=True),
+    )
+    crew = [int(number) for number in found.stdout.split()]
+    os.kill(random.choice(crew), signal.SIGKILL)
+    end = ended(process)
+    print(f"    one of {len(crew)} killed when {before} tiles were done: exit code {end.code}: {end.said}")
+    return verdict(scene, out)
 
 
 @contextmanager
@@ -235,6 +254,7 @@ def writers(scene: Scene) -> bool:
 FAULTS: dict[str, Callable[[Scene], bool]] = {
     "kill": kill,
     "stop": stop,
+    "worker": worker,
     "disk": full_disk,
     "readonly": readonly,
     "chunks": chunks,

@@ -151,7 +151,7 @@ def door() -> Iterator[None]:
     """What is raised within becomes one line and exit code 2: bad input, before anything runs."""
     try:
         yield
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:
         raise click.UsageError(str(error)) from None
 
 

@@ -74,6 +74,8 @@ def _options() -> list[click.Parameter]:
         ),
         click.Option(["--show"], default="power", show_default=True, help="what the picture shows: power or label"),
         *command.file_options(),
+        click.Option(["--workers"], type=int, help="processes that share the cores and write the store, by Dask"),
+        click.Option(["--scheduler"], metavar="ADDRESS", help="of Dask: its workers, which see the store, write it"),
     ]
 
 
@@ -91,6 +93,8 @@ def power_map(
     tolerance: float | None,
     show: str,
     overwrite: bool,
+    workers: int | None,
+    scheduler: str | None,
     **given: Any,
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
@@ -110,13 +114,32 @@ def power_map(
             planned = _comparison(axes, device, outputs, compare, tolerance, given)
         if plot is not None:
             _check_picture(plot, planned, show)
+        crew = _crew(planned, workers, scheduler, out)
         if compare is None and out is not None:
             _check_store(planned, out, overwrite)
     keep_compiled()
-    dataset, pace = _run(planned, out, overwrite)
+    dataset, pace = _run(planned, out, overwrite, crew)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
     kept = compare is None
     command.finish(dataset, f"{pace}\n{summary}", out, plot, partial(_draw, picture), overwrite, kept)
+
+
+def _crew(
+    planned: "Plan | Comparison", workers: int | None, scheduler: str | None, out: Path | None
+) -> int | str | None:
+    """Who runs the tiles, unless this process does."""
+    from vijax.compare import Comparison
+    from vijax.grid import check_workers
+
+    if workers is not None and scheduler is not None:
+        raise ValueError(f"workers must be left out with scheduler, which has its own; got {workers}")
+    crew = scheduler if workers is None else workers
+    if crew is None:
+        return None
+    if isinstance(planned, Comparison):
+        raise ValueError(f"workers must be left out with compare, which runs in one process; got {crew}")
+    check_workers(planned, crew, out)
+    return crew
 
 
 def _check_store(planned: Any, out: Path, overwrite: bool) -> None:
@@ -207,7 +230,9 @@ def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
 
 
-def _run(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> "tuple[xr.Dataset, str]":
+def _run(
+    planned: "Plan | Comparison", out: Path | None, overwrite: bool, crew: int | str | None
+) -> "tuple[xr.Dataset, str]":
     """The map, and how fast it was made."""
     from vijax import grid
     from vijax.compare import Comparison, run
@@ -221,7 +246,7 @@ def _run(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> "tu
             show(done, total)
 
         began = time.perf_counter()
-        found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite)
+        found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite, crew)
     pace = command.pace(told[-1] - told[0], time.perf_counter() - began)
     return found, f"{pace}, {told[0]:,} were there" if told[0] else pace
 

@@ -141,10 +141,10 @@ def test_a_full_disk_is_one_line_and_what_is_done_stays(folder, capsys, monkeypa
             raise full
         store.write_json(report, path)
 
-    def _files(plane, tile):
-        if tile == 3:
+    def _files(path, dims, place):
+        if place == {"d": 1, "kappa": 1}:  # of tile 3
             raise full
-        return files(plane, tile)
+        return files(path, dims, place)
 
     files = study._files
     with monkeypatch.context() as disk:

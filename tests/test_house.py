@@ -70,7 +70,20 @@ ROOMS: dict[str, set[str]] = {
     "store": set(),
     "study": {"lanes", "model", "axes", "dataset", "store"},
     "refine": {"label"},
-    "grid": {"lanes", "model", "membrane", "method", "axes", "dataset", "store", "study", "refine", "simulate"},
+    "cluster": {"method"},
+    "grid": {
+        "lanes",
+        "model",
+        "membrane",
+        "method",
+        "axes",
+        "dataset",
+        "store",
+        "study",
+        "cluster",
+        "refine",
+        "simulate",
+    },
     "attractor": {"model", "method", "axes", "dataset", "label", "grid"},
     "compare": {"model", "dataset", "label", "grid"},
     "design": {
@@ -106,9 +119,10 @@ ROOMS["__init__"] = set(ROOMS)
 
 ONLY_IN = {
     "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
+    "distributed": {"vijax/cluster.py"},
     "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py", "vijax/blueprint.py"},
 }
-NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax"]
+NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax", "distributed"]
 IMPORT_SECONDS = 1.5
 
 # Built here, so that this line is not what it looks for.

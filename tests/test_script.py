@@ -44,6 +44,12 @@ def started(arguments, folder):
 BAD = [
     (["--r", "1.2"], r"r must lie in \(0, 1\]; got 1.2"),
     (["--d", "0"], "d must be positive"),
+    (["--workers", "0"], "workers must be a whole number of at least 1; got 0"),
+    (["--workers", "2", "--plot", "map.png"], "workers must come with out"),
+    (["--workers", "2", "--scheduler", "10.0.0.1:8786"], "workers must be left out with scheduler"),
+    (["--workers", "2", "--compare", "rigid"], "workers must be left out with compare"),
+    (["--workers", "2", "--out", "map.zarr", "--refine", "2"], "workers must be left out with refine"),
+    (["--scheduler", "somewhere"], "scheduler must be an address"),
     (["--kappa", "inf"], 'wall="rigid"'),
     (["--omega=-1"], "omega must be positive"),
     (["--d", "0.1:0.2:0"], "N in LO:HI:N"),

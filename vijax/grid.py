@@ -7,10 +7,13 @@ import itertools
 import logging
 import math
 import queue
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
 
@@ -19,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from vijax import cluster, simulate, study
 from vijax import method as methods
 from vijax import refine as refinement
-from vijax import simulate, study
 from vijax.axes import Cells, cells
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
 from vijax.lanes import places
@@ -40,6 +43,7 @@ _CHOICES = {
     "wall": ("soft", "rigid"),
     "dtype": ("float64", "float32"),
 }
+_COMPILING = threading.Lock()  # or each thread of a worker would compile the same
 _LOG = logging.getLogger(__name__)
 
 Fields = dict[str, np.ndarray]  # of `Summary`, by name
@@ -81,6 +85,7 @@ def sweep(
     progress: Callable[[int, int], None] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
+    workers: cluster.Workers | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
     """Energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
@@ -124,6 +129,10 @@ def sweep(
             not run yet by their `status`; stopped in whatever way, the same call goes on with what is left of it.
             A refined plane is written when it is whole. Without, everything is in memory.
         overwrite: Begin anew whatever the store holds.
+        workers: With `out`: who runs and writes the tiles, under Dask (extra `cluster`): so many new processes, which
+            share the cores, or the address of a scheduler whose workers see `out` under the same path. A worker runs a
+            tile a thread, on its first device. New processes import the calling script: what it does must stand under
+            `if __name__ == "__main__":`.
 
     Returns:
         A dataset with one dimension per array, every parameter as a coordinate with units, and the variables wanted,
@@ -133,7 +142,9 @@ def sweep(
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
-        OSError: If `out` holds anything else, is being written by another run, or can be written no more.
+        OSError: If `out` holds anything else, is being written by another run, or can be written no more; if no
+            scheduler answers, or its workers are lost.
+        ModuleNotFoundError: With `workers` but without Dask.
 
     Source: Eqs. (36)-(38), corrected.
     """
@@ -154,7 +165,7 @@ def sweep(
         steps=steps,
         refine=refine,
     )
-    return run(planned, progress, out, overwrite)
+    return run(planned, progress, out, overwrite, workers)
 
 
 def plan(
@@ -221,9 +232,12 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
+    workers: cluster.Workers | None = None,
 ) -> "xr.Dataset":
     """The map of a plan, its cells simulated tile by tile on every device; see `sweep`."""
     tell = progress or (lambda done, total: None)
+    if workers is not None:
+        check_workers(planned, workers, out)
     if out is None:
         return _refined(planned, tell) if planned.refine else label(planned, _in_memory(planned, tell))
     if planned.refine:
@@ -232,7 +246,7 @@ def run(
         save(_refined(planned, tell), out, overwrite=overwrite)
         return view(out)
     with study.opened(planned, out, overwrite) as plane:
-        _fill(plane, tell)
+        _fill(plane, tell, workers)
     return view(out)
 
 
@@ -246,6 +260,21 @@ def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
         check_output("out", out, overwrite)
     else:
         study.check(planned, out, overwrite)
+
+
+def check_workers(planned: Plan, workers: cluster.Workers, out: str | Path | None) -> None:
+    """Raise unless such workers can run the plan; starts none.
+
+    Raises:
+        ValueError, OSError, ModuleNotFoundError: As `cluster.check`; ValueError without a store, and with refinement.
+    """
+    if out is None:
+        raise ValueError(f"workers must come with out, the store that they write; got {workers!r} alone")
+    if planned.refine:
+        raise ValueError(
+            f"workers must be left out with refine, which goes on from all that was found; got {workers!r}"
+        )
+    cluster.check(workers)
 
 
 def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
@@ -299,22 +328,54 @@ def _compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None 
             yield done
 
 
-def _fill(plane: study.Study, tell: Callable[[int, int], None]) -> None:
+def _fill(plane: study.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:
     """Simulate and write the tiles of a study that are not done."""
     left = study.left(plane, _LOG.warning)
     total = plane.planned.count
     done = total - sum(map(plane.count, left))
-    rows = _rows(plane.most)
+    tiles = map(plane.tile, left)
     try:
         tell(done, total)
-        tiles = (_Tile(part := plane.cut(tile), np.arange(part.count), rows, tile) for tile in left)
-        for tile, found, seconds in _in_turn(tiles):
-            study.write(plane, tile.number, label(tile.planned, found), seconds)
-            done += tile.cells.size
-            tell(done, total)
+        # Closed at once whatever happens, or workers would go on for as long as somebody holds the error.
+        with closing(_made(tiles, _rows(plane.most), workers)) as made:
+            for tile in made:
+                done += tile.planned.count
+                tell(done, total)
     except (KeyboardInterrupt, OSError) as error:
         error.add_note(f"{done:,} of {total:,} cells are in {plane.path}; the same command goes on from there")
         raise
+
+
+def _made(tiles: Iterable[study.Tile], rows: int, workers: cluster.Workers | None) -> Generator[study.Tile, None, None]:
+    """Tiles as they are done, by whomever."""
+    if workers is None:
+        yield from _here(tiles, rows)
+    else:
+        yield from cluster.done(partial(_make, rows), tiles, workers)
+
+
+def _here(tiles: Iterable[study.Tile], rows: int) -> Iterator[study.Tile]:
+    """Tiles, simulated and written by this process, as they are done."""
+    running: dict[int, study.Tile] = {}
+
+    def calls() -> Iterator[_Tile]:
+        for tile in tiles:
+            running[tile.number] = tile
+            yield _whole(tile, rows)
+
+    with closing(_in_turn(calls())) as ended:
+        for call, found, seconds in ended:
+            study.write(running[call.number], label(call.planned, found), seconds)
+            yield running.pop(call.number)
+
+
+def _make(rows: int, tile: study.Tile) -> None:
+    """Simulate and write a tile, in a worker, on its first device."""
+    call, place = _whole(tile, rows), places()[0]
+    with _COMPILING:
+        _compile(call, place)
+    found, seconds = _simulate(call, place)
+    study.write(tile, label(tile.planned, found), seconds)
 
 
 class _Tile(NamedTuple):
@@ -324,6 +385,11 @@ class _Tile(NamedTuple):
     cells: np.ndarray
     rows: int
     number: int
+
+
+def _whole(tile: study.Tile, rows: int) -> _Tile:
+    """All cells of a tile of a study."""
+    return _Tile(tile.planned, np.arange(tile.planned.count), rows, tile.number)
 
 
 def _rows(cells: int) -> int:
@@ -352,7 +418,7 @@ def _simulate_all(planned: Plan, group: np.ndarray, rows: int) -> Iterator[tuple
         yield tile.cells, found
 
 
-def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
+def _in_turn(tiles: Iterable[_Tile]) -> Generator[tuple[_Tile, Fields, float], None, None]:
     """Tiles, their fields and the seconds they took, as they are done; the next ones run meanwhile."""
     tiles, here = iter(tiles), places()
     free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
@@ -364,7 +430,7 @@ def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
 
     def fill() -> None:
         for tile in itertools.islice(tiles, len(here) + 1 - len(running)):  # one waits, so that nobody does
-            running[pool.submit(_simulate, tile, free)] = tile
+            running[pool.submit(_where_free, tile, free)] = tile
 
     try:
         if len(here) > 1 and (first := next(tiles, None)):
@@ -383,16 +449,22 @@ def _in_turn(tiles: Iterable[_Tile]) -> Iterator[tuple[_Tile, Fields, float]]:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _simulate(tile: _Tile, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
-    """Fields of `Summary` for the cells of a tile, and the seconds it took, on a device that is free."""
-    began, place = time.perf_counter(), free.get()
-    _LOG.info("tile %d begins", tile.number)
-    found: Fields = {}
+def _where_free(tile: _Tile, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
+    """As `_simulate`, on a device that is free."""
+    place = free.get()
     try:
-        for part in _kinds(tile):
-            _put(found, tile.cells.size, part, _summarise(tile, tile.cells[part], part.size, place))
+        return _simulate(tile, place)
     finally:
         free.put(place)
+
+
+def _simulate(tile: _Tile, place: jax.Device) -> tuple[Fields, float]:
+    """Fields of `Summary` for the cells of a tile, and the seconds it took."""
+    began = time.perf_counter()
+    _LOG.info("tile %d begins", tile.number)
+    found: Fields = {}
+    for part in _kinds(tile):
+        _put(found, tile.cells.size, part, _summarise(tile, tile.cells[part], part.size, place))
     return found, time.perf_counter() - began
 
 

@@ -10,10 +10,12 @@ import math
 import os
 import shutil
 import time
+import uuid
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +30,7 @@ from vijax.store import write as write_store
 
 if TYPE_CHECKING:
     import xarray as xr
+    import zarr
 
 # A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
 SMALLEST_TILE, LARGEST_TILE = 1024, 32768
@@ -46,12 +49,14 @@ class Study:
         planned: The whole plane.
         dims: Dimensions of every variable.
         extents: Length of a tile along every dynamic dimension; the last ones may be shorter.
+        birth: Of the store: no other has the same.
     """
 
     path: Path
     planned: Plan
     dims: dict[str, tuple[str, ...]]
     extents: dict[str, int]
+    birth: str
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -86,13 +91,41 @@ class Study:
         """Cells of a tile."""
         return math.prod(part.stop - part.start for part in self.block(tile).values())
 
-    def cut(self, tile: int) -> Plan:
-        """The plan of a tile alone."""
-        return self.planned.cut(self.block(tile))
+    def tile(self, number: int) -> "Tile":
+        """A tile alone."""
+        block, path = self.block(number), self.path.absolute()
+        return Tile(number, path, self.birth, self.planned.cut(block), self.dims, block, self.place(number))
 
     def record(self, tile: int) -> Path:
         """Where it is written that a tile is done."""
-        return self.path / _RECORDS / f"{tile}.json"
+        return _record(self.path, tile)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One tile, as light as its cells: all that who runs and writes it must know, on whatever machine.
+
+    Attributes:
+        number: Which of the study's.
+        path: Of the store, from the root: workers start elsewhere.
+        birth: Of the store.
+        planned: The cells of the tile alone.
+        dims: Dimensions of every variable.
+        block: Where the tile lies in the plane.
+        place: Its number along every dynamic dimension.
+    """
+
+    number: int
+    path: Path
+    birth: str
+    planned: Plan
+    dims: dict[str, tuple[str, ...]]
+    block: dict[str, slice]
+    place: dict[str, int]
+
+
+def _record(path: Path, tile: int) -> Path:
+    return path / _RECORDS / f"{tile}.json"
 
 
 def extents(sizes: dict[str, int], most: int) -> dict[str, int]:
@@ -179,7 +212,16 @@ def _write_blank(planned: Plan, path: Path) -> None:
             attributes=variable.attrs,
         )
     (path / _RECORDS).mkdir()
-    (path / _RECORDS / "lock").touch()
+    _lock(path).write_text(uuid.uuid4().hex, encoding="utf-8")
+
+
+def _lock(path: Path) -> Path:
+    """The file that a writer of the store locks; within, the birth of the store."""
+    return path / _RECORDS / "lock"
+
+
+def _birth(path: Path) -> str:
+    return _lock(path).read_text(encoding="utf-8")
 
 
 def _most(of: Cells) -> int:
@@ -201,7 +243,7 @@ def _found(planned: Plan, path: Path) -> Study:
     with view(path) as store:
         dims = {name: tuple(map(str, store[name].dims)) for name in planned.outputs}
         chunks = store["status"].encoding["chunks"]
-    return Study(path, planned, dims, dict(zip(planned.cells.dynamic, chunks, strict=True)))
+    return Study(path, planned, dims, dict(zip(planned.cells.dynamic, chunks, strict=True)), _birth(path))
 
 
 @contextmanager
@@ -209,7 +251,7 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
     """Alone with a store; the lock ends with its process, however that ends. What was saved whole nobody writes."""
     import fcntl
 
-    lock = path / _RECORDS / "lock"
+    lock = _lock(path)
     if not lock.exists():
         if not overwrite:
             raise FileExistsError(
@@ -273,7 +315,7 @@ def _words(values: "xr.Variable | xr.DataArray | None") -> str:
 def left(study: Study, say: Callable[[str], None]) -> list[int]:
     """Tiles that are not done, and those whose files are no longer what was written; of these is said why."""
     for half_written in study.path.rglob("*.part*"):  # what a killed process was at
-        half_written.unlink()
+        half_written.unlink(missing_ok=True)  # a worker that lost its driver may still be writing
     found = []
     for tile in study.tiles:
         record = study.record(tile)
@@ -289,10 +331,13 @@ def left(study: Study, say: Callable[[str], None]) -> list[int]:
 def _damage(study: Study, tile: int) -> str:
     """What is wrong with the files of a tile, nothing if all are as they were written."""
     try:
-        prints = json.loads(study.record(tile).read_text(encoding="utf-8"))["files"]
+        record = json.loads(study.record(tile).read_text(encoding="utf-8"))
+        birth, prints = record["birth"], record["files"]
     except (ValueError, KeyError, TypeError):
         return "its record cannot be read"
-    for name, file in _files(study, tile):
+    if birth != study.birth:
+        return "its record is of another store"
+    for name, file in _files(study.path, study.dims, study.place(tile)):
         if not file.exists():
             return f"{file.relative_to(study.path)} is missing"
         if _print(file) != prints.get(name):
@@ -300,11 +345,10 @@ def _damage(study: Study, tile: int) -> str:
     return ""
 
 
-def _files(study: Study, tile: int) -> Iterator[tuple[str, Path]]:
-    """The chunk of every variable."""
-    place = study.place(tile)
-    for name, dims in study.dims.items():
-        yield name, study.path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in dims))
+def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, int]) -> Iterator[tuple[str, Path]]:
+    """The chunk of every variable of a tile."""
+    for name, along in dims.items():
+        yield name, path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in along))
 
 
 def _print(file: Path) -> str:
@@ -313,27 +357,48 @@ def _print(file: Path) -> str:
     return f"{len(content)} bytes, CRC-32 {zlib.crc32(content):08x}"
 
 
-def write(study: Study, tile: int, found: "xr.Dataset", seconds: float) -> None:
+def write(tile: Tile, found: "xr.Dataset", seconds: float) -> None:
     """Write the map of a tile, then its record.
 
     Args:
-        study: Where.
         tile: Which.
-        found: The map of `study.cut(tile)`.
+        found: The map of its plan.
         seconds: That it took.
-    """
-    import zarr
 
-    block = study.block(tile)
-    for name, dims in study.dims.items():
-        # Also a chunk that is void: a missing one is a damage.
-        array = zarr.open_array(study.path / name, mode="r+").with_config({"write_empty_chunks": True})
-        array[tuple(block.get(dim, slice(None)) for dim in dims)] = found[name].values
+    Raises:
+        OSError: If the store cannot be written, or is no longer the one that the tile is of.
+    """
+    _check_born(tile)
+    for name, dims in tile.dims.items():
+        array = _array(tile.path / name, tile.birth)
+        array[tuple(tile.block.get(dim, slice(None)) for dim in dims)] = found[name].values
     record = {
-        "cells": study.count(tile),
+        "cells": tile.planned.count,
         "seconds": round(seconds, 3),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         **made_by(),
-        "files": {name: _print(file) for name, file in _files(study, tile)},
+        "birth": tile.birth,
+        "files": {name: _print(file) for name, file in _files(tile.path, tile.dims, tile.place)},
     }
-    write_json(record, study.record(tile))
+    _check_born(tile)
+    write_json(record, _record(tile.path, tile.number))
+
+
+@lru_cache(maxsize=64)
+def _array(path: Path, birth: str) -> "zarr.Array":
+    """A variable of a store, to write; to open it takes as long as to write a tile of it."""
+    import zarr
+
+    # Also a chunk that is void: a missing one is a damage.
+    return zarr.open_array(path, mode="r+").with_config({"write_empty_chunks": True})
+
+
+def _check_born(tile: Tile) -> None:
+    """Raise if another store has taken the place of the tile's.
+
+    The lock is the driver's, and a worker may outlive it: it then writes what the next driver has run again, the same
+    bits if on the same kind of device. Whatever mixture of both is left, no file is half of each, and one that the
+    record does not fit is found and run again. But the next driver may have begun another plane there.
+    """
+    if _birth(tile.path) != tile.birth:
+        raise FileExistsError(f"{tile.path} is no longer the store that tile {tile.number} was run for")

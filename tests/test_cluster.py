@@ -1,0 +1,191 @@
+"""Planes on the workers of a cluster: what a task is, lost workers and drivers, what is refused at the door."""
+
+import itertools
+import os
+import pickle
+import signal
+import socket
+import sys
+from functools import partial
+from pathlib import Path
+
+import dask
+import distributed
+import numpy as np
+import pytest
+import xarray as xr
+from helpers import stand_in
+
+from vijax import cluster, grid, simulate, study
+from vijax.grid import load, sweep
+
+AXES = {"d": np.linspace(0.1, 0.3, 5), "kappa": np.geomspace(3, 400, 4)}
+SETTINGS = {
+    "periods": 400,
+    "until": "attractor",
+    "transient": 0,
+    "wall": "soft",
+    "method": "exact",
+    "dtype": "float64",
+}
+MOST = 6  # cells of a tile, here
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(simulate, "summarise", stand_in)
+    monkeypatch.setattr(study, "LARGEST_TILE", MOST)
+    return tmp_path
+
+
+@pytest.fixture
+def scheduler():
+    """One that leads two threads of this process, which know the stand-in."""
+    options = {"processes": False, "dashboard_address": None, "protocol": "tcp"}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **options) as made:
+        yield made.scheduler_address
+
+
+def nobody() -> str:
+    """An address of this machine where nobody answers."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{free.getsockname()[1]}"
+
+
+# --- in a scheduler's workers ----------------------------------------------------------------------------------------
+
+
+def test_workers_write_what_the_sweep_in_memory_returns_and_go_on_where_it_stopped(folder, scheduler):
+    steps = []
+
+    def stop(done, total):
+        if done >= 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        sweep(**AXES, out="map.zarr", workers=scheduler, progress=stop)
+    assert "of 20 cells are in map.zarr; the same command goes on" in stopped.value.__notes__[0]
+    found = sweep(**AXES, out="map.zarr", workers=scheduler, progress=lambda *step: steps.append(step))
+    xr.testing.assert_identical(found.load(), sweep(**AXES))
+    assert 8 <= steps[0][0] < 20
+    assert steps[-1] == (20, 20)
+    assert sweep(**AXES, out="map.zarr", workers=scheduler, overwrite=True).identical(found)
+
+
+def test_what_a_worker_raises_is_raised_here(folder, scheduler, monkeypatch):
+    def full(tile, found, seconds):
+        raise OSError(28, "No space left on device", "somewhere")
+
+    monkeypatch.setattr(study, "write", full)
+    with pytest.raises(OSError, match="No space left") as error:
+        sweep(**AXES, out="map.zarr", workers=scheduler)
+    assert error.value.filename == "somewhere"
+    assert error.value.__notes__[0].startswith("0 of 20 cells are in map.zarr")
+
+
+def test_tasks_are_taken_as_they_are_needed(scheduler):
+    done = cluster.done(abs, itertools.count(), scheduler)
+    assert len(set(itertools.islice(done, 20))) == 20
+    done.close()
+
+
+# --- a tile that outlives its driver ---------------------------------------------------------------------------------
+
+
+def test_a_tile_is_as_light_as_its_cells(folder, monkeypatch):
+    monkeypatch.setattr(study, "LARGEST_TILE", 1024)
+    side = 10_000
+    planned = grid.plan({"d": np.linspace(0.1, 0.3, side), "kappa": np.geomspace(3, 400, side)}, **SETTINGS)
+    with study.opened(planned, "map.zarr") as plane:
+        sent = pickle.dumps(plane.tile(7))
+    assert len(sent) < 20_000
+    again = pickle.loads(sent)
+    assert again.path.is_absolute()
+    assert again.block == plane.block(7)
+    xr.testing.assert_identical(again.planned.cells.quantities["d"], plane.tile(7).planned.cells.quantities["d"])
+
+
+def test_a_tile_that_is_written_late_does_not_spoil_another_plane(folder):
+    with study.opened(grid.plan(AXES, **SETTINGS), "map.zarr") as plane:
+        late = plane.tile(0)
+    whole = sweep(**AXES, r=0.4, out="map.zarr", overwrite=True).load()
+    with pytest.raises(FileExistsError, match="no longer the store that tile 0"):
+        grid._make(1024, late)
+    xr.testing.assert_identical(load("map.zarr"), whole)
+
+
+def test_a_record_that_came_too_late_counts_for_nothing(folder, caplog):
+    sweep(**AXES, out="map.zarr")
+    record = Path("map.zarr/status/tiles/2.json")
+    late = record.read_text()
+    whole = sweep(**AXES, out="map.zarr", overwrite=True).load()
+    record.write_text(late)
+    xr.testing.assert_identical(sweep(**AXES, out="map.zarr").load(), whole)
+    assert [said.getMessage() for said in caplog.records] == [
+        "tile 2 of map.zarr is run again: its record is of another store"
+    ]
+
+
+# --- processes of this machine ---------------------------------------------------------------------------------------
+
+
+def fragile(folder: Path, lives: int, task: int) -> None:
+    """A task that, the first times it is done, kills who does it."""
+    (folder / f"{task}.{os.getpid()}").touch()
+    if task == 1 and len(list(folder.glob("1.*"))) <= lives:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal there")
+def test_a_lost_worker_is_replaced(tmp_path):
+    assert sorted(cluster.done(partial(fragile, tmp_path, 1), range(6), 2)) == list(range(6))
+    assert len(list(tmp_path.glob("1.*"))) == 2
+    assert str(os.getpid()) not in {path.suffix[1:] for path in tmp_path.iterdir()}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal there")
+def test_a_task_that_nobody_survives_is_given_up(tmp_path):
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        pytest.raises(ChildProcessError, match="1 workers were lost, one after another, at the same tile"),
+    ):
+        list(cluster.done(partial(fragile, tmp_path, 9), range(6), 1))
+
+
+# --- at the door -----------------------------------------------------------------------------------------------------
+
+BAD = [
+    (0, "workers must be a whole number of at least 1; got 0"),
+    (2.5, "workers must be a whole number of at least 1; got 2.5"),
+    ("somewhere", "scheduler must be an address such as tcp://10.0.0.1:8786; got 'somewhere'"),
+    ("http:/x:1", "scheduler must be an address"),
+]
+
+
+@pytest.mark.parametrize(("workers", "say"), BAD, ids=[str(workers) for workers, _ in BAD])
+def test_bad_workers_are_refused(folder, workers, say):
+    with pytest.raises(ValueError, match=say) as error:
+        sweep(**AXES, out="map.zarr", workers=workers)
+    assert "\n" not in str(error.value)
+    assert not list(folder.iterdir())
+
+
+def test_workers_without_a_store_are_refused():
+    with pytest.raises(ValueError, match="workers must come with out, the store that they write; got 2 alone"):
+        sweep(**AXES, workers=2)
+
+
+def test_a_scheduler_that_does_not_answer_is_named(folder, monkeypatch):
+    monkeypatch.setattr(cluster, "_ANSWER", 0.5)
+    with pytest.raises(ConnectionError, match=r"scheduler must answer within 0.5 s; got tcp://127.*, where none did"):
+        sweep(**AXES, out="map.zarr", workers=nobody())
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("workers", [2, "tcp://10.0.0.1:8786"])
+def test_what_must_be_installed_is_said(folder, monkeypatch, workers):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ModuleNotFoundError, match=r"got none; install vijax\[cluster\]"):
+        sweep(**AXES, out="map.zarr", workers=workers)
