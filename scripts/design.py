@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _DEFAULT_FILES = ("design.json", "design.png")
 _POINTS, _NEAR = 320, 160  # of the picture, and of its close view
 _OVER_TOLERANCES = ("mean", "worst")
+_BASINS = 2000  # starts that show what attracts at the optimum
 _STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the last
 
 
@@ -47,6 +48,9 @@ def _options() -> list[click.Parameter]:
         click.Option(
             ["--objective"], default="P", show_default=True, help="P, power, speed; over the tolerances: mean, worst"
         ),
+        click.Option(
+            ["--balls"], type=int, default=8, show_default=True, help="starts of the survey at each of 128 values"
+        ),
         click.Option(["--over"], metavar="NAME=VALUES", help="axis along which to find the best designs"),
         *command.axis_options(**changed),
         *command.device_options(),
@@ -64,6 +68,7 @@ def design(
     bounds: tuple[str, ...],
     tolerance: tuple[str, ...],
     objective: str,
+    balls: int,
     over: str | None,
     constants: tuple[str, ...],
     out: str | None,
@@ -72,7 +77,7 @@ def design(
     **given: Any,
 ) -> None:
     """Find the membrane, and what else is tuned, that harvests most and can be built."""
-    from vijax import blueprint, report
+    from vijax import blueprint, method, report
     from vijax import design as designs
     from vijax.store import write_json
     from vijax.style import check_format
@@ -87,12 +92,15 @@ def design(
         within = _bounds(bounds)
         weighed = scatter if objective in _OVER_TOLERANCES else ()
         designs.check(devices, names, within, objective, weighed)
+        method.whole("balls", balls, 1)
     command.keep_compiled()
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
         show(0, stages)
         began = time.perf_counter()
-        found = designs.optimise_all(devices, tune=names, bounds=within, objective=objective, tolerances=weighed)
+        found = designs.optimise_all(
+            devices, tune=names, bounds=within, objective=objective, tolerances=weighed, balls=balls
+        )
         seconds = time.perf_counter() - began
         show(1, stages)
         diagram = None
@@ -190,7 +198,7 @@ def _judged(found: "Design", scatter: "tuple[Tolerance, ...]", alone: bool) -> d
 
     if found.best is None:
         return {"tolerances": scatter}
-    around = surroundings(found.best) if alone else None
+    around = surroundings(found.best, starts=_BASINS) if alone else None
     return {"tolerances": scatter, "spread": under(found.best, scatter) if scatter else None, "surroundings": around}
 
 

@@ -25,7 +25,7 @@ def kappa(optimum):
 @pytest.fixture(scope="module")
 def found():
     """Both devices in one call."""
-    return design.optimise_all([FAST, PAPER])
+    return design.optimise_all([FAST, PAPER], balls=2)
 
 
 def test_the_small_fast_device(found):
@@ -99,7 +99,7 @@ def test_tolerances_of_a_design(found):
 
 
 def test_what_lies_around(found):
-    around = surroundings(found[0].best, starts=64)
+    around = surroundings(found[0].best, starts=32)
     assert around.below.kind == "fold"
     assert around.below.percent == pytest.approx(-7.81, abs=0.05)
     assert (around.above.kind, around.above.percent) == ("none", pytest.approx(50))
@@ -111,7 +111,7 @@ def test_what_lies_around(found):
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = design.optimise(
-        FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, periods=200
+        FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, balls=1
     ).best
     nominal = found[0].best
     assert robust.height > design.under(nominal, tolerance).worst
@@ -130,6 +130,7 @@ def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
         ({"tune": ("omega0", "k")}, "must name a quantity once"),
         ({"bounds": {"r": (0.1, 0.2)}}, "bounds must be those of a tuned quantity"),
         ({"looks": 1}, "looks must be a whole number of at least 2"),
+        ({"balls": 0}, "balls must be a whole number of at least 1"),
     ],
 )
 def test_bad_input_is_told(settings, words):
@@ -148,8 +149,8 @@ def test_devices_that_cannot_be_designed_are_told():
 
 def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
     nominal = found[0].best
-    best = weighted(found[0], starts=32)
-    around = surroundings(nominal, starts=32)
+    best = weighted(found[0], starts=16)
+    around = surroundings(nominal, starts=16)
     assert best.height >= float(nominal.state.P) * around.share
     assert best.height <= float(best.state.P) * (1 + 1e-9)
     assert int(best.orbit.status[0]) == Status.OK

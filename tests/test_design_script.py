@@ -9,7 +9,8 @@ import pytest
 
 from vijax.store import write_json
 
-SMALL = ["--d", "0.2", "--r", "0.5", "--A", "3", "--omega", "10pi", "--set", "V=1700"]
+FEW = ["--balls", "1"]
+SMALL = ["--d", "0.2", "--r", "0.5", "--A", "3", "--omega", "10pi", "--set", "V=1700", *FEW]
 # Of the reference.
 KAPPA, ENERGY, DEPTH = 4.00713, 57.75761e-6, 6.026e-3
 
@@ -28,6 +29,7 @@ BAD = [
     (["--objective", "most"], "objective must be among"),
     (["--objective", "worst"], "tolerances must be given with objective mean or worst"),
     (["--objective", "worst", "--tolerance", "s=1%:lognormal"], "tolerances of a worst case must be uniform"),
+    (["--balls", "0"], "balls must be a whole number of at least 1; got 0"),
     (["--over", "d"], "over must be NAME=VALUES"),
     (["--over", "u0=0:0.1:3"], "over must be NAME=VALUES"),
     (["--over", "d=0.1:0.2:3", "--d", "0.2"], "d must not be given twice"),
@@ -77,6 +79,7 @@ def test_a_report_is_strict_json_whole_or_not_at_all(folder):
 def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys, monkeypatch):
     monkeypatch.setattr(script, "_POINTS", 12)
     monkeypatch.setattr(script, "_NEAR", 8)
+    monkeypatch.setattr(script, "_BASINS", 100)
     assert script.main([*SMALL, "--tolerance", "omega0=5%"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["design.json", "design.png"]
     report, said = strict(folder / "design.json"), capsys.readouterr().out
@@ -116,7 +119,8 @@ def test_designs_along_an_axis(folder, capsys):
 def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder, capsys, monkeypatch):
     monkeypatch.setattr(script, "_POINTS", 24)
     monkeypatch.setattr(script, "_NEAR", 8)
-    assert script.main(["--d", "0.2", "--out", "paper.json"]) == 0
+    monkeypatch.setattr(script, "_BASINS", 100)
+    assert script.main(["--d", "0.2", "--out", "paper.json", *FEW]) == 0
     report, said = strict(folder / "paper.json"), capsys.readouterr().out
     assert max(report["best"]["penetration"]) == pytest.approx(report["best"]["penetration_limit"], rel=1e-6)
     assert "held by: penetration limit" in said

@@ -38,7 +38,7 @@ _TILE = 64  # starts of one compiled call
 _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
-_STEPS, _BALLS = 128, 8  # values of the first quantity in the survey, and starts of the ball at each
+_STEPS = 128  # values of the first quantity in the survey
 _REACH = 0.49, 0.6  # of the gap that its displacement may take, and its velocity
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
 _NARROW = 0.8  # of the best start's objective: an orbit of many impacts that promises less is not climbed
@@ -121,6 +121,7 @@ def optimise_all(
     tolerances: Iterable[Tolerance] = (),
     samples: int | None = None,
     looks: int = 60,
+    balls: int = 8,
     periods: int = 200,
 ) -> list[Design]:
     """The admissible designs that harvest most, each device's tuned quantities between bounds.
@@ -137,7 +138,9 @@ def optimise_all(
         tolerances: How constants scatter, for "mean" and "worst".
         samples: Random devices for these, in place of a quadrature.
         looks: Evaluations of objective with gradient that a start may take.
-        periods: Forcing periods that the survey looks for an attractor in a cell.
+        balls: Starts from which the survey looks for attractors, at each of 128 values of the first quantity. More of
+            them meet attractors with small basins, which may be the best, and take longer.
+        periods: Forcing periods that each of them may take.
 
     Returns:
         One `Design` a device.
@@ -146,11 +149,11 @@ def optimise_all(
         ValueError: Which argument, what must hold, what came.
     """
     devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
-    looks, periods = whole("looks", looks, 2), whole("periods", periods, 1)
+    looks, balls, periods = whole("looks", looks, 2), whole("balls", balls, 1), whole("periods", periods, 1)
     box = check(devices, tune, bounds or {}, objective, scatter)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    met = _survey(devices, tune, box, periods)
+    met = _survey(devices, tune, box, (balls, periods))
     starts = met.some(_promising(met, objective))
     ends = _climbed(scene, starts, box, looks)
     optima = _optima(scene, starts, ends, devices, looks)
@@ -251,12 +254,13 @@ class _Met(NamedTuple):
         return jax.tree.map(lambda x: x[index], self)
 
 
-def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, periods: int) -> _Met:
+def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: tuple[int, int]) -> _Met:
     """The attractors of every device, along the first quantity that moves the ball at levels of the others."""
+    balls, periods = effort
     first = next((i for i, name in enumerate(tune) if moving(name)), None)
     sides = [(0.5,) if i == first or not moving(name) else _LEVELS for i, name in enumerate(tune)]
     levels, steps = np.array(list(itertools.product(*sides))), _STEPS if first is not None else 1
-    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, _BALLS)))
+    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, balls)))
     parts = levels[level]
     if first is not None:
         parts[:, first] = step / (steps - 1)
