@@ -69,7 +69,7 @@ def test_workers_write_what_the_sweep_in_memory_returns_and_go_on_where_it_stopp
     assert "of 20 cells are in map.zarr; the same command goes on" in stopped.value.__notes__[0]
     found = sweep(**AXES, out="map.zarr", workers=scheduler, progress=lambda *step: steps.append(step))
     xr.testing.assert_identical(found.load(), sweep(**AXES))
-    assert 8 <= steps[0][0] < 20
+    assert 8 <= steps[0][0] <= 20  # the workers may have finished what they were at
     assert steps[-1] == (20, 20)
     assert sweep(**AXES, out="map.zarr", workers=scheduler, overwrite=True).identical(found)
 
@@ -146,6 +146,7 @@ def test_a_lost_worker_is_replaced(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signal there")
+@pytest.mark.slow
 def test_a_task_that_nobody_survives_is_given_up(tmp_path):
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),

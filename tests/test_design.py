@@ -98,6 +98,7 @@ def test_tolerances_of_a_design(found):
     assert wide.worst == 0
 
 
+@pytest.mark.slow
 def test_what_lies_around(found):
     around = surroundings(found[0].best, starts=32)
     assert around.below.kind == "fold"
@@ -108,6 +109,7 @@ def test_what_lies_around(found):
     assert sum(one.share for one in around.attractors) == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = design.optimise(
@@ -147,6 +149,7 @@ def test_devices_that_cannot_be_designed_are_told():
         design.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
 
 
+@pytest.mark.slow
 def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
     nominal = found[0].best
     best = weighted(found[0], starts=16)

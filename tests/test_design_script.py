@@ -76,6 +76,7 @@ def test_a_report_is_strict_json_whole_or_not_at_all(folder):
     assert [path.name for path in folder.iterdir()] == ["one.json"]
 
 
+@pytest.mark.slow
 def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys, monkeypatch):
     monkeypatch.setattr(script, "_POINTS", 12)
     monkeypatch.setattr(script, "_NEAR", 8)
