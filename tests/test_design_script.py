@@ -117,6 +117,7 @@ def test_designs_along_an_axis(folder, capsys):
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder, capsys, monkeypatch):
     monkeypatch.setattr(script, "_POINTS", 24)
     monkeypatch.setattr(script, "_NEAR", 8)

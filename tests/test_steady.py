@@ -58,6 +58,7 @@ def test_derivatives_in_kappa_are_those_of_50_digits(found):
     np.testing.assert_allclose(slopes.kappa[:, 0], wanted, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_in_every_parameter_are_those_of_differences(found):
     guess, slope, slopes, _ = found
     for name in ("d", "kappa", "r", "gamma"):
