@@ -51,6 +51,7 @@ def _options() -> list[click.Parameter]:
         click.Option(
             ["--balls"], type=int, default=8, show_default=True, help="starts of the survey at each of 128 values"
         ),
+        click.Option(["--impacts"], type=int, default=16, show_default=True, help="most impacts of an orbit"),
         click.Option(["--over"], metavar="NAME=VALUES", help="axis along which to find the best designs"),
         *command.axis_options(**changed),
         *command.device_options(),
@@ -69,6 +70,7 @@ def design(
     tolerance: tuple[str, ...],
     objective: str,
     balls: int,
+    impacts: int,
     over: str | None,
     constants: tuple[str, ...],
     out: str | None,
@@ -93,13 +95,14 @@ def design(
         weighed = scatter if objective in _OVER_TOLERANCES else ()
         designs.check(devices, names, within, objective, weighed)
         method.whole("balls", balls, 1)
+        method.whole("impacts", impacts, 1)
     command.keep_compiled()
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
         show(0, stages)
         began = time.perf_counter()
         found = designs.optimise_all(
-            devices, tune=names, bounds=within, objective=objective, tolerances=weighed, balls=balls
+            devices, tune=names, bounds=within, objective=objective, tolerances=weighed, balls=balls, impacts=impacts
         )
         seconds = time.perf_counter() - began
         show(1, stages)

@@ -23,6 +23,14 @@ LONG_PI = np.longdouble("3.14159265358979323846264338327950288")
 TILE, STEPS = 64, 16  # the one shape in which the exact engine is compiled
 HORIZON = 60.0  # a flight longer than that is quiet
 DIGITS = 50
+SETTINGS = {  # of a plan, as a sweep makes it when nothing else is asked
+    "periods": 400,
+    "until": "attractor",
+    "transient": 0,
+    "wall": "soft",
+    "method": "exact",
+    "dtype": "float64",
+}
 
 
 def reference_trajectories() -> list[dict[str, Any]]:

@@ -14,20 +14,12 @@ import distributed
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import stand_in
+from helpers import SETTINGS, stand_in
 
 from vijax import cluster, grid, simulate, study
 from vijax.grid import load, sweep
 
 AXES = {"d": np.linspace(0.1, 0.3, 5), "kappa": np.geomspace(3, 400, 4)}
-SETTINGS = {
-    "periods": 400,
-    "until": "attractor",
-    "transient": 0,
-    "wall": "soft",
-    "method": "exact",
-    "dtype": "float64",
-}
 MOST = 6  # cells of a tile, here
 
 
@@ -146,7 +138,6 @@ def test_a_lost_worker_is_replaced(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signal there")
-@pytest.mark.slow
 def test_a_task_that_nobody_survives_is_given_up(tmp_path):
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),

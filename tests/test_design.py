@@ -1,21 +1,30 @@
-"""Designs: the small fast device's optimum, the admissible one of the paper's, cliffs, tolerances, what is refused."""
+"""Designs, and `scripts/design.py`: optima that are known, cliffs, tolerances, reports, what is refused.
+
+In one file, as the programs compiled for the one serve the other.
+"""
 
 import dataclasses
+import json
 import math
 
+import command
+import design as script
 import jax
 import numpy as np
 import pytest
 
 import vijax
 from vijax import design
+from vijax import surroundings as around
 from vijax.model import Harvester, Status
-from vijax.surroundings import surroundings, weighted
+from vijax.store import write_json
 from vijax.tolerance import Tolerance
 
 FAST = Harvester(A=3.0, omega=10 * math.pi, V=1700.0)
 FAST = dataclasses.replace(FAST, s=0.2 * FAST.length_unit)
 PAPER = Harvester(s=0.2)
+# Of the small fast device, by the reference.
+KAPPA, ENERGY, DEPTH = 4.00713, 57.75761e-6, 6.026e-3
 
 
 def kappa(optimum):
@@ -24,15 +33,15 @@ def kappa(optimum):
 
 @pytest.fixture(scope="module")
 def found():
-    """Both devices in one call."""
-    return design.optimise_all([FAST, PAPER], balls=2)
+    """Both devices in one call; with `impacts` as low as here little is compiled."""
+    return design.optimise_all([FAST, PAPER], balls=2, impacts=2)
 
 
 def test_the_small_fast_device(found):
     best = found[0].best
-    assert kappa(best) == pytest.approx(4.00713, abs=1e-5)
-    assert best.height == pytest.approx(57.75761e-6, rel=1e-7)
-    assert float(best.state.depth.max()) == pytest.approx(6.026e-3, abs=1e-6)
+    assert kappa(best) == pytest.approx(KAPPA, abs=1e-5)
+    assert best.height == pytest.approx(ENERGY, rel=1e-7)
+    assert float(best.state.depth.max()) == pytest.approx(DEPTH, abs=1e-6)
     assert float(best.state.multiplier) == pytest.approx(0.533, abs=1e-3)
     assert (best.stopped, best.active, best.label) == ("maximum", (), "1:1")
     assert abs(best.gradient["omega0"]) < 1e-5
@@ -98,22 +107,10 @@ def test_tolerances_of_a_design(found):
     assert wide.worst == 0
 
 
-@pytest.mark.slow
-def test_what_lies_around(found):
-    around = surroundings(found[0].best, starts=32)
-    assert around.below.kind == "fold"
-    assert around.below.percent == pytest.approx(-7.81, abs=0.05)
-    assert (around.above.kind, around.above.percent) == ("none", pytest.approx(50))
-    assert around.attractors[0].label == "1:1"
-    assert around.share > 0.9
-    assert sum(one.share for one in around.attractors) == pytest.approx(1)
-
-
-@pytest.mark.slow
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = design.optimise(
-        FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, balls=1
+        FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, balls=1, impacts=2
     ).best
     nominal = found[0].best
     assert robust.height > design.under(nominal, tolerance).worst
@@ -133,6 +130,7 @@ def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
         ({"bounds": {"r": (0.1, 0.2)}}, "bounds must be those of a tuned quantity"),
         ({"looks": 1}, "looks must be a whole number of at least 2"),
         ({"balls": 0}, "balls must be a whole number of at least 1"),
+        ({"impacts": 0.5}, "impacts must be a whole number of at least 1"),
     ],
 )
 def test_bad_input_is_told(settings, words):
@@ -149,14 +147,141 @@ def test_devices_that_cannot_be_designed_are_told():
         design.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
 
 
-@pytest.mark.slow
-def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
+def test_weighing_basins_moves_away_from_where_few_starts_lead(found, monkeypatch):
+    monkeypatch.setattr(around, "_POINTS", 5)
     nominal = found[0].best
-    best = weighted(found[0], starts=16)
-    around = surroundings(nominal, starts=16)
-    assert best.height >= float(nominal.state.P) * around.share
+    best = around.weighted(found[0], starts=16)
+    assert best.height >= float(nominal.state.P) * around.surroundings(nominal, starts=16).share
     assert best.height <= float(best.state.P) * (1 + 1e-9)
     assert int(best.orbit.status[0]) == Status.OK
     assert best.label == nominal.label
     low, high = found[0].bounds["omega0"]
     assert low <= best.values["omega0"] <= high
+
+
+# --- the script ------------------------------------------------------------------------------------------------------
+
+FEW = ["--balls", "1", "--impacts", "2"]
+SMALL = ["--r", "0.5", "--A", "3", "--omega", "10pi", "--set", "V=1700"]
+
+BAD = [
+    (["--tune", "mass"], "tune must be among"),
+    (["--tune", "d,s"], "tune must name a quantity once"),
+    (["--bounds", "omega0=20"], "bounds must be NAME=LO:HI"),
+    (["--bounds", "mass=1:2"], "bounds must be NAME=LO:HI"),
+    (["--bounds", "r=0.2:0.4"], "bounds must be those of a tuned quantity"),
+    (["--bounds", "omega0=40:20"], "bounds of omega0 must be two, the lower first"),
+    (["--bounds", "omega0=-1:20"], "omega0 must be positive"),
+    (["--tolerance", "omega0"], "tolerance must be NAME=5%"),
+    (["--tolerance", "omega0=5%:normal"], "tolerances must be uniform or lognormal"),
+    (["--tolerance", "beta=5%"], "tolerances must be those of"),
+    (["--tolerance", "omega0=5%,omega0=2%"], "tolerances must name a constant once"),
+    (["--objective", "most"], "objective must be among"),
+    (["--objective", "worst"], "tolerances must be given with objective mean or worst"),
+    (["--objective", "worst", "--tolerance", "s=1%:lognormal"], "tolerances of a worst case must be uniform"),
+    (["--balls", "0"], "balls must be a whole number of at least 1; got 0"),
+    (["--impacts", "0"], "impacts must be a whole number of at least 1; got 0"),
+    (["--over", "d"], "over must be NAME=VALUES"),
+    (["--over", "u0=0:0.1:3"], "over must be NAME=VALUES"),
+    (["--over", "d=0.1:0.2:3", "--d", "0.2"], "d must not be given twice"),
+    (["--over", "d=0.1:0.2:3", "--s", "0.2"], "d and s give the same quantity"),
+    (["--over", "kappa=4:40:3"], "over must name what is not tuned"),
+    (["--d", "0.2,0.3"], "d must be one number"),
+    (["--set", "V=0"], "V must not be zero"),
+    (["--set", "d=1"], "give --d=1"),
+    (["--r", "2"], "r must lie in (0, 1]; got 2"),
+    (["--out", "design.zarr"], "out must end in .json"),
+    (["--plot", "design.txt"], "plot must end in"),
+]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command, "keep_compiled", lambda: None)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("arguments", "say"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, say):
+    assert script.main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert say in said
+    assert len(said.splitlines()) == 1
+    assert not list(folder.iterdir())
+
+
+def strict(path):
+    """A report; what is no strict JSON raises."""
+    return json.loads(path.read_text(encoding="utf-8"), parse_constant=pytest.fail)
+
+
+def test_a_report_is_strict_json_whole_or_not_at_all(folder):
+    write_json(
+        {"a": np.array([1.0, np.nan]), "b": (np.float64(np.inf), np.bool_(True), None, "c")}, folder / "one.json"
+    )
+    assert strict(folder / "one.json") == {"a": [1.0, None], "b": [None, True, None, "c"]}
+    with pytest.raises(TypeError):
+        write_json({"a": object()}, folder / "two.json")
+    assert [path.name for path in folder.iterdir()] == ["one.json"]
+
+
+def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys, monkeypatch):
+    monkeypatch.setattr(script, "_POINTS", 12)
+    monkeypatch.setattr(script, "_NEAR", 8)
+    monkeypatch.setattr(script, "_BASINS", 100)
+    assert script.main(["--d", "0.2", *SMALL, *FEW, "--tolerance", "omega0=5%"]) == 0
+    assert sorted(path.name for path in folder.iterdir()) == ["design.json", "design.png"]
+    report, said = strict(folder / "design.json"), capsys.readouterr().out
+    best = report["best"]
+    assert best["pair"]["kappa"] == pytest.approx(KAPPA, rel=1e-5)
+    assert best["P"] == pytest.approx(ENERGY, rel=1e-6)
+    assert max(best["penetration"]) == pytest.approx(DEPTH, rel=1e-3)
+    assert (best["label"], best["stopped"], best["active"]) == ("1:1", "maximum", [])
+    assert best["largest_multiplier"] == pytest.approx(0.533, abs=1e-3)
+    assert best["path"][-1] == pytest.approx([best["values"]["omega0"]], rel=1e-6)
+    near = report["surroundings"]
+    assert (near["below"]["kind"], near["below"]["percent"]) == ("fold", pytest.approx(-7.81, abs=0.05))
+    assert (near["above"]["kind"], near["above"]["percent"]) == ("none", pytest.approx(50))
+    assert near["attractors"][0]["label"] == "1:1"
+    assert 0.9 < near["share"] <= 1
+    assert sum(one["share"] for one in near["attractors"]) == pytest.approx(1)
+    spread = report["spread"]
+    assert 0.8 * ENERGY < spread["worst"] < spread["mean"] < ENERGY
+    assert report["tolerances"] == [{"name": "omega0", "spread": 0.05, "kind": "uniform"}]
+    for text in (
+        "P 57.75761 uJ per half period",
+        "an interior optimum",
+        "below, fold 7.8",
+        "wrote design.json, design.png",
+    ):
+        assert text in said
+
+
+def test_designs_along_an_axis(folder, capsys):
+    arguments = [*SMALL, "--over", "d=0.16,0.2", "--balls", "1", "--out", "map.json", "--plot", "map.png"]
+    assert script.main(arguments) == 0
+    report = strict(folder / "map.json")
+    assert report["over"] == {"name": "d", "values": [0.16, 0.2]}
+    assert [one["best"]["pair"]["d"] for one in report["designs"]] == pytest.approx([0.16, 0.2])
+    assert report["designs"][1]["best"]["P"] == pytest.approx(ENERGY, rel=1e-6)
+    assert "d 0.2: omega0 = 40.07126 rad/s, 1:1, P 57.758 uJ, interior" in capsys.readouterr().out
+    assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
+    # Orbits of more impacts than two climb too.
+    found = [one["label"].split("/")[0].split(":") for design in report["designs"] for one in design["others"]]
+    assert max(int(left) + int(right) for left, right in found) > 2
+
+
+def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder, capsys, monkeypatch):
+    monkeypatch.setattr(script, "_POINTS", 24)
+    monkeypatch.setattr(script, "_NEAR", 8)
+    monkeypatch.setattr(script, "_BASINS", 100)
+    assert script.main(["--d", "0.2", "--out", "paper.json", *FEW]) == 0
+    report, said = strict(folder / "paper.json"), capsys.readouterr().out
+    assert max(report["best"]["penetration"]) == pytest.approx(report["best"]["penetration_limit"], rel=1e-6)
+    assert "held by: penetration limit" in said
+    assert not report["highest"]["admissible"]
+    assert report["highest"]["P"] > 100 * report["best"]["P"]
+    assert "not physical: P alone would choose omega0" in said
+    assert not (folder / "design.png").exists()

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import stand_in
+from helpers import SETTINGS, stand_in
 
 from vijax import dataset, grid, simulate
 from vijax.axes import cells, parse_axis
@@ -18,14 +18,6 @@ from vijax.grid import load, save, sweep
 from vijax.membrane import HuntCrossley
 from vijax.model import Harvester, Status
 
-SETTINGS = {
-    "periods": 400,
-    "until": "attractor",
-    "transient": 0,
-    "wall": "soft",
-    "method": "exact",
-    "dtype": "float64",
-}
 LONG = 40  # periods: enough for the 1:1 orbits of these tests
 ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "max_penetration", "max_impact_speed"}
 

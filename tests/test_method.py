@@ -75,7 +75,6 @@ def exact():
     return sweep(**PLANE)
 
 
-@pytest.mark.slow
 def test_attractors_by_steps_are_those_of_the_exact_engine(exact):
     found = sweep(**PLANE, method="ode", solver="Dopri8", rtol=1e-10, atol=1e-12)
     assert set(found) == set(exact)

@@ -58,7 +58,6 @@ def test_derivatives_in_kappa_are_those_of_50_digits(found):
     np.testing.assert_allclose(slopes.kappa[:, 0], wanted, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_derivatives_in_every_parameter_are_those_of_differences(found):
     guess, slope, slopes, _ = found
     for name in ("d", "kappa", "r", "gamma"):
@@ -76,7 +75,6 @@ def test_derivatives_in_every_parameter_are_those_of_differences(found):
         np.testing.assert_allclose(mine, wanted, rtol=2e-6, atol=1e-9, err_msg=name)
 
 
-@pytest.mark.slow
 def test_reverse_is_forward_and_second_derivatives_are_differences_of_first(found):
     guess, slope, slopes, _ = found
     one, pair = guess[1], jax.tree.map(lambda x: x[1], guess.pair)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import stand_in
+from helpers import SETTINGS, stand_in
 
 from vijax import grid, simulate, study
 from vijax.grid import load, sweep
@@ -204,16 +204,6 @@ def test_a_second_writer_is_refused(calls, out, overwrite):
     sweep(**AXES, out=out, overwrite=overwrite)
 
 
-SETTINGS = {
-    "periods": 400,
-    "until": "attractor",
-    "transient": 0,
-    "wall": "soft",
-    "method": "exact",
-    "dtype": "float64",
-}
-
-
 @pytest.mark.parametrize(
     ("sizes", "most", "expected"),
     [
@@ -293,7 +283,6 @@ vijax.sweep(**axes, outputs=["impacts_per_period", "restitution"], out=sys.argv[
 """
 
 
-@pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_devices(tmp_path):
     stores = []
     for number in (1, 2):

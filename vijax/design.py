@@ -32,7 +32,7 @@ from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, moving, tuned, values, variables
 
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
-_WIDTHS = (2, 8, 16)  # impacts that orbits are padded to; orbits of more are not looked for
+_WIDTHS = (2, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _LONGEST = 8  # forcing periods of an orbit
 _TILE = 64  # starts of one compiled call
 _FEW = (16, 256)  # optima of one
@@ -41,7 +41,7 @@ _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
 _STEPS = 128  # values of the first quantity in the survey
 _REACH = 0.49, 0.6  # of the gap that its displacement may take, and its velocity
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
-_NARROW = 0.8  # of the best start's objective: an orbit of many impacts that promises less is not climbed
+_NARROW = 0.8  # of the best start's objective: an orbit of more impacts than 8 that promises less is not climbed
 _HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
 
 
@@ -122,6 +122,7 @@ def optimise_all(
     samples: int | None = None,
     looks: int = 60,
     balls: int = 8,
+    impacts: int = 16,
     periods: int = 200,
 ) -> list[Design]:
     """The admissible designs that harvest most, each device's tuned quantities between bounds.
@@ -140,6 +141,7 @@ def optimise_all(
         looks: Evaluations of objective with gradient that a start may take.
         balls: Starts from which the survey looks for attractors, at each of 128 values of the first quantity. More of
             them meet attractors with small basins, which may be the best, and take longer.
+        impacts: Of an orbit, at most: longer ones are not looked for. Fewer are compiled and climb faster.
         periods: Forcing periods that each of them may take.
 
     Returns:
@@ -149,11 +151,12 @@ def optimise_all(
         ValueError: Which argument, what must hold, what came.
     """
     devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
-    looks, balls, periods = whole("looks", looks, 2), whole("balls", balls, 1), whole("periods", periods, 1)
+    looks, impacts = whole("looks", looks, 2), whole("impacts", impacts, 1)
+    balls, periods = whole("balls", balls, 1), whole("periods", periods, 1)
     box = check(devices, tune, bounds or {}, objective, scatter)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    met = _survey(devices, tune, box, (balls, periods))
+    met = _survey(devices, tune, box, (balls, impacts, periods))
     starts = met.some(_promising(met, objective))
     ends = _climbed(scene, starts, box, looks)
     optima = _optima(scene, starts, ends, devices, looks)
@@ -254,9 +257,9 @@ class _Met(NamedTuple):
         return jax.tree.map(lambda x: x[index], self)
 
 
-def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: tuple[int, int]) -> _Met:
+def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: tuple[int, int, int]) -> _Met:
     """The attractors of every device, along the first quantity that moves the ball at levels of the others."""
-    balls, periods = effort
+    balls, impacts, periods = effort
     first = next((i for i, name in enumerate(tune) if moving(name)), None)
     sides = [(0.5,) if i == first or not moving(name) else _LEVELS for i, name in enumerate(tune)]
     levels, steps = np.array(list(itertools.product(*sides))), _STEPS if first is not None else 1
@@ -272,7 +275,7 @@ def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, ef
     # The same for every device: designs of one do not depend on the others.
     draw = np.random.default_rng(0).uniform(-1, 1, (2, owner.size // len(devices)))
     u0, v0 = (reach * np.tile(x, len(devices)) for reach, x in zip(_REACH, draw, strict=True))
-    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, impacts=_WIDTHS[-1], periods=periods)
+    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, impacts=impacts, periods=periods)
     own = jax.tree.map(lambda x: np.asarray(x)[found.cell], every)
     return _Met(found.orbit, own, *(x[found.cell] for x in (z, owner, level, step)))
 
@@ -298,7 +301,7 @@ def _promising(met: _Met, objective: str) -> np.ndarray:
     most = np.full(met.owner.max(initial=-1) + 1, -np.inf)
     score = _score(met.some(found), objective)
     np.maximum.at(most, met.owner[found], score)
-    few = np.asarray(met.orbit.count)[found] <= _WIDTHS[-2]
+    few = np.asarray(met.orbit.count)[found] <= _WIDTHS[-1]
     return found[few | (score > most[met.owner[found]] + math.log(_NARROW))]
 
 
@@ -381,7 +384,8 @@ def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_E
             )
 
     jobs = []
-    for few, width in itertools.pairwise((0, *_WIDTHS)):
+    most = starts.orbit.sequence.side.shape[1]
+    for few, width in itertools.pairwise((0, *(width for width in _WIDTHS if width < most), most)):
         some = np.flatnonzero((count > few) & (count <= width))
         jobs += [(some, width, tile) for tile in lanes.tiles(some.size, (_TILE,))]
     with ThreadPoolExecutor(lanes.workers()) as pool:
@@ -399,8 +403,8 @@ def _optima(scene: Scene, starts: _Met, ends: list[_End], devices: list[Harveste
     own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
     many = jax.tree.map(lambda *x: jnp.array(x), *own)
     found = _at(starts.orbit[np.array(good)], jax.vmap(lambda d: d.pair())(many), [ends[i].knots for i in good])
-    states = _states(many, found)
-    attracts = (np.asarray(found.status) == Status.OK) & (np.asarray(states.status) == Status.OK)
+    seen = states(own, found)
+    attracts = np.array([found.status[row] == Status.OK == seen[row].status for row in range(len(own))])
     names = orbits.labels(found)
     optima: list[list[Optimum]] = [[] for _ in devices]
     for row in np.flatnonzero(attracts):
@@ -413,7 +417,7 @@ def _optima(scene: Scene, starts: _Met, ends: list[_End], devices: list[Harveste
                 orbit=found[row : row + 1],
                 label=str(names[row]),
                 height=end.height,
-                state=jax.tree.map(lambda x, row=row: np.asarray(x)[row], states),
+                state=seen[row],
                 gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
                 active=_active(scene, end, found.sequence.side[row]),
                 stopped=_reason(end, looks),
@@ -455,13 +459,14 @@ def _compiled_states():
     return jax.jit(jax.vmap(steady), compiler_options=lanes.compiler_options())
 
 
-def _states(devices: Harvester, orbit: Orbit) -> Steady:
-    """The steady states of devices with known orbits, in padded tiles."""
-    given, parts = jax.tree.map(np.asarray, devices), []
+def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
+    """The steady state of every device on its known orbit, in padded tiles."""
+    given, found = jax.tree.map(lambda *x: np.array(x), *devices), []
     for tile in lanes.tiles(len(orbit), _FEW):
-        found = _compiled_states()(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
-        parts.append(jax.tree.map(lambda x, real=tile.real: np.asarray(x)[:real], found))
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        some = _compiled_states()(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
+        some = jax.tree.map(np.asarray, some)
+        found += [jax.tree.map(lambda x, row=row: x[row], some) for row in range(tile.real)]
+    return found
 
 
 def _active(scene: Scene, end: _End, side: Any) -> tuple[str, ...]:

@@ -11,11 +11,10 @@ import numpy as np
 from vijax import branch
 from vijax import orbit as orbits
 from vijax.attractor import basin_fractions
-from vijax.design import Design, Optimum
+from vijax.design import Design, Optimum, states
 from vijax.method import whole
 from vijax.model import Harvester, Status
 from vijax.orbit import Orbit
-from vijax.steady import steady
 from vijax.tuning import tuned, values, variables
 
 _SAME = 1e-6  # relative difference of P within which an attractor is the optimum's own orbit
@@ -155,7 +154,7 @@ def _searched(design: Design, optimum: Optimum, starts: int, reach: float, seed:
         device=device,
         orbit=orbit,
         height=height,
-        state=jax.tree.map(np.asarray, steady(device, orbit[0])),
+        state=states([device], orbit)[0],
         gradient={},
         active=(),
         stopped="weighted",
