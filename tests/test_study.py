@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 from helpers import SETTINGS, stand_in
 
 from vijax import grid, simulate, study
@@ -239,6 +240,20 @@ def test_tiles_stay_as_they_were_made(calls, out, monkeypatch):
     calls.clear()
     xr.testing.assert_identical(sweep(**AXES, out=out).load(), sweep(**AXES))
     assert max(calls[:-1]) <= MOST  # the last call is that of the sweep in memory
+
+
+@pytest.mark.parametrize("axes", [PLANES[name] for name in ("plane", "variants first", "single precision")])
+def test_files_are_those_that_zarr_writes(calls, out, axes):
+    found = sweep(**axes, out=out)
+    for name in found.data_vars:
+        array = zarr.open_array(out / name, mode="r+").with_config({"write_empty_chunks": True})
+        values = array[...]
+        files = {file: file.read_bytes() for file in (out / name / "c").rglob("*") if file.is_file()}
+        for file in files:
+            file.unlink()
+        array[...] = values
+        assert len(files) > 1
+        assert files == {file: file.read_bytes() for file in files}
 
 
 def test_quantities_are_taken_cell_by_cell(calls, out):

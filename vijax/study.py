@@ -15,7 +15,6 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,12 +24,11 @@ from vijax.axes import Cells
 from vijax.dataset import Plan, asked, coordinates, made_by, provenance, specimen
 from vijax.lanes import places
 from vijax.model import Status
-from vijax.store import check_output, compressors, replacing, view, write_json
+from vijax.store import check_output, compressors, encoded, replacing, view, write_json
 from vijax.store import write as write_store
 
 if TYPE_CHECKING:
     import xarray as xr
-    import zarr
 
 # A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
 SMALLEST_TILE, LARGEST_TILE = 1024, 32768
@@ -94,7 +92,9 @@ class Study:
     def tile(self, number: int) -> "Tile":
         """A tile alone."""
         block, path = self.block(number), self.path.absolute()
-        return Tile(number, path, self.birth, self.planned.cut(block), self.dims, block, self.place(number))
+        chunk = {**self.planned.cells.sizes, **self.extents}
+        shapes = {name: tuple(chunk[dim] for dim in along) for name, along in self.dims.items()}
+        return Tile(number, path, self.birth, self.planned.cut(block), self.dims, shapes, self.place(number))
 
     def record(self, tile: int) -> Path:
         """Where it is written that a tile is done."""
@@ -111,7 +111,7 @@ class Tile:
         birth: Of the store.
         planned: The cells of the tile alone.
         dims: Dimensions of every variable.
-        block: Where the tile lies in the plane.
+        shapes: Of a chunk of every variable; the tile may be smaller.
         place: Its number along every dynamic dimension.
     """
 
@@ -120,7 +120,7 @@ class Tile:
     birth: str
     planned: Plan
     dims: dict[str, tuple[str, ...]]
-    block: dict[str, slice]
+    shapes: dict[str, tuple[int, ...]]
     place: dict[str, int]
 
 
@@ -369,28 +369,28 @@ def write(tile: Tile, found: "xr.Dataset", seconds: float) -> None:
         OSError: If the store cannot be written, or is no longer the one that the tile is of.
     """
     _check_born(tile)
-    for name, dims in tile.dims.items():
-        array = _array(tile.path / name, tile.birth)
-        array[tuple(tile.block.get(dim, slice(None)) for dim in dims)] = found[name].values
+    files = dict(_files(tile.path, tile.dims, tile.place))
+    for name, file in files.items():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as part:
+            part.write_bytes(encoded(_filled(name, found[name].values, tile.shapes[name])))
     record = {
         "cells": tile.planned.count,
         "seconds": round(seconds, 3),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         **made_by(),
         "birth": tile.birth,
-        "files": {name: _print(file) for name, file in _files(tile.path, tile.dims, tile.place)},
+        "files": {name: _print(file) for name, file in files.items()},
     }
     _check_born(tile)
     write_json(record, _record(tile.path, tile.number))
 
 
-@lru_cache(maxsize=64)
-def _array(path: Path, birth: str) -> "zarr.Array":
-    """A variable of a store, to write; to open it takes as long as to write a tile of it."""
-    import zarr
-
-    # Also a chunk that is void: a missing one is a damage.
-    return zarr.open_array(path, mode="r+").with_config({"write_empty_chunks": True})
+def _filled(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A chunk of a variable, void where it reaches beyond the plane."""
+    chunk = np.full(shape, _void(name, values.dtype), values.dtype)
+    chunk[tuple(slice(size) for size in values.shape)] = values
+    return chunk
 
 
 def _check_born(tile: Tile) -> None:
