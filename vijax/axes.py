@@ -151,8 +151,10 @@ class Cells:
     def flat(self, quantity: "xr.Variable", index: np.ndarray) -> np.ndarray:
         """Values of a quantity in the cells with the given flat indices; variants at their first point."""
         first = quantity.isel({dim: 0 for dim in self.variant if dim in quantity.dims})
+        if not first.dims:
+            return np.broadcast_to(first.values, index.shape)
         # Never over all dimensions at once: a plane may be larger than memory.
-        places = np.unravel_index(index, [self.sizes[dim] for dim in self.dynamic]) if self.dynamic else ()
+        places = np.unravel_index(index, [self.sizes[dim] for dim in self.dynamic])
         place = dict(zip(self.dynamic, places, strict=True))
         return np.broadcast_to(first.values[tuple(place[str(dim)] for dim in first.dims)], index.shape)
 

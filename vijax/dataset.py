@@ -118,14 +118,20 @@ def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
     """The map from the fields of `Summary`, each [cells] or [cells, variants] in the flat order of the plan."""
     import xarray as xr  # here, as importing vijax must not load it
 
+    return xr.Dataset(variables(planned, fields_found), coords=coordinates(planned.cells), attrs=provenance(planned))
+
+
+def variables(planned: Plan, fields_found: dict[str, np.ndarray]) -> "dict[str, xr.Variable]":
+    """As `label`, without what is the same for every tile of a plane."""
+    import xarray as xr
+
     of = planned.cells
     found = {}
     for name, values in fields_found.items():
         dims = of.dynamic + (of.variant if values.ndim > 1 else ())
         found[name] = xr.Variable(dims, values.reshape([of.sizes[dim] for dim in dims]))
-    variables = {name: _variable(name, found, planned) for name in planned.outputs}
-    variables["status"] = flagged(variables["status"])
-    return xr.Dataset(variables, coords=coordinates(of), attrs=provenance(planned))
+    named = {name: _variable(name, found, planned) for name in planned.outputs}
+    return named | {"status": flagged(named["status"])}
 
 
 def specimen(planned: Plan) -> "xr.Dataset":

@@ -26,7 +26,7 @@ from vijax import cluster, simulate, study
 from vijax import method as methods
 from vijax import refine as refinement
 from vijax.axes import Cells, cells
-from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label
+from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables
 from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester, ImpactPair
@@ -365,7 +365,7 @@ def _here(tiles: Iterable[study.Tile], rows: int) -> Iterator[study.Tile]:
 
     with closing(_in_turn(calls())) as ended:
         for call, found, seconds in ended:
-            study.write(running[call.number], label(call.planned, found), seconds)
+            study.write(running[call.number], variables(call.planned, found), seconds)
             yield running.pop(call.number)
 
 
@@ -375,7 +375,7 @@ def _make(rows: int, tile: study.Tile) -> None:
     with _COMPILING:
         _compile(call, place)
     found, seconds = _simulate(call, place)
-    study.write(tile, label(tile.planned, found), seconds)
+    study.write(tile, variables(tile.planned, found), seconds)
 
 
 class _Tile(NamedTuple):

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 # A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
 SMALLEST_TILE, LARGEST_TILE = 1024, 32768
 _SHARES = 2  # tiles of a small plane for everyone who takes some: blocks do not cost the same
+_ROUNDING = 1.1  # of such a share: halves of odd lengths are rounded up
 _LARGEST_CHUNK = 1 << 21  # numbers: of many variants a tile has fewer cells
 _RECORDS = Path("status", "tiles")
 _SHOWN = 3  # of the settings that differ
@@ -226,7 +227,7 @@ def _birth(path: Path) -> str:
 
 def _most(of: Cells) -> int:
     """Cells of a tile, at most."""
-    share = max(-(-of.count // (_SHARES * len(places()))), SMALLEST_TILE)
+    share = max(math.ceil(_ROUNDING * of.count / (_SHARES * len(places()))), SMALLEST_TILE)
     room = _LARGEST_CHUNK // math.prod(of.sizes[dim] for dim in of.variant)
     return min(share, LARGEST_TILE, max(room, 1))
 
@@ -340,7 +341,7 @@ def _damage(study: Study, tile: int) -> str:
     for name, file in _files(study.path, study.dims, study.place(tile)):
         if not file.exists():
             return f"{file.relative_to(study.path)} is missing"
-        if _print(file) != prints.get(name):
+        if _print(file.read_bytes()) != prints.get(name):
             return f"{file.relative_to(study.path)} is not what was written"
     return ""
 
@@ -351,36 +352,37 @@ def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, 
         yield name, path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in along))
 
 
-def _print(file: Path) -> str:
+def _print(content: bytes) -> str:
     """Length and checksum of a file."""
-    content = file.read_bytes()
     return f"{len(content)} bytes, CRC-32 {zlib.crc32(content):08x}"
 
 
-def write(tile: Tile, found: "xr.Dataset", seconds: float) -> None:
-    """Write the map of a tile, then its record.
+def write(tile: Tile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
+    """Write the variables of a tile, then its record.
 
     Args:
         tile: Which.
-        found: The map of its plan.
+        found: Of its plan; see `dataset.variables`.
         seconds: That it took.
 
     Raises:
         OSError: If the store cannot be written, or is no longer the one that the tile is of.
     """
     _check_born(tile)
-    files = dict(_files(tile.path, tile.dims, tile.place))
-    for name, file in files.items():
+    prints = {}
+    for name, file in _files(tile.path, tile.dims, tile.place):
+        content = encoded(_filled(name, found[name].values, tile.shapes[name]))
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as part:
-            part.write_bytes(encoded(_filled(name, found[name].values, tile.shapes[name])))
+            part.write_bytes(content)
+        prints[name] = _print(content)
     record = {
         "cells": tile.planned.count,
         "seconds": round(seconds, 3),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         **made_by(),
         "birth": tile.birth,
-        "files": {name: _print(file) for name, file in files.items()},
+        "files": prints,
     }
     _check_born(tile)
     write_json(record, _record(tile.path, tile.number))
