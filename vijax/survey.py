@@ -2,7 +2,7 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +16,18 @@ from vijax.record import record
 from vijax.shooting import Sequence
 
 _SMALLEST_TILE, _LARGEST_TILE = 512, 8192  # cells of a call
+_SAME = 1e-6  # relative difference within which attractors of one pair are the same; see `attractor`
 
 
 class Survey(NamedTuple):
-    """Attractors found: verified orbits, and the cell of each, in the order of the cells."""
+    """Attractors found: verified orbits, and the cell that met each first, in the order of the cells."""
 
     orbit: Orbit
     cell: np.ndarray
 
 
 def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, impacts: int, periods: int) -> Survey:
-    """The periodic attractors of cells.
+    """The periodic attractors of cells; of cells that differ in their starts alone each one once.
 
     Args:
         pair: Cells [cell], soft.
@@ -35,42 +36,69 @@ def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, im
         periods: Forcing periods that the search for an attractor may take.
 
     Returns:
-        The orbits; aperiodic and silent cells, and longer orbits, have none.
+        The orbits, of mirror images on level ground one; aperiodic and silent cells, and longer orbits, have none.
     """
     pair = jax.tree.map(np.asarray, pair)
+    ended = _ended(pair, (u0, v0), longest, periods)
+    count = ended.impacts_left + ended.impacts_right
+    fine = np.isin(ended.status, (Status.OK, Status.STICKING)) & (ended.period > 0) & (ended.period <= longest)
+    some = np.flatnonzero(fine & (count > 0) & (count <= impacts))
+    own, ended = jax.tree.map(lambda x: x[some], (pair, ended))
+    once = _distinct(own, ended)
+    cell = some[once]
+    own, ended = jax.tree.map(lambda x: x[once], (own, ended))
+    guess, knots = _recorded(own, ended, longest, impacts)
+    orbits = solve(jax.tree.map(jnp.asarray, own), guess, jnp.asarray(knots))
+    good = np.flatnonzero(np.asarray(orbits.status) == Status.OK)
+    return Survey(orbits[good], cell[good])
+
+
+def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int, periods: int) -> Any:
+    """How every cell ended, a `Summary`, in tiles on every core."""
     cells = pair.d.size
     share = math.ceil(cells / workers())
     size = min(max(1 << (share - 1).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
     number = math.ceil(cells / size)
     # Strided tiles cost the same.
     tiles = [np.arange(first, cells, number) for first in range(number)]
+
+    def part(rows: np.ndarray) -> Any:
+        own, u0, v0 = jax.tree.map(lambda x: jnp.asarray(x[np.resize(rows, size)]), (pair, *starts))
+        summary = simulate.attractors(own, u0, v0, periods=periods, keep=longest, count=rows.size)
+        return jax.tree.map(lambda x: np.asarray(x)[: rows.size], summary)
+
     with ThreadPoolExecutor(workers()) as pool:
-        parts = list(pool.map(lambda rows: _attractors(pair, (u0, v0), rows, size, (longest, impacts, periods)), tiles))
-    every = [np.concatenate(part) for part in zip(*parts, strict=True)]
-    order = np.argsort(every[0])
-    cell, side, span, knots = (part[order] for part in every)
-    sequence = Sequence(jnp.asarray(side), jnp.asarray(span), jnp.zeros(cell.size, bool))
-    orbits = solve(jax.tree.map(lambda x: jnp.asarray(x[cell]), pair), sequence, jnp.asarray(knots))
-    good = np.flatnonzero(np.asarray(orbits.status) == Status.OK)
-    return Survey(orbits[good], cell[good])
+        parts = list(pool.map(part, tiles))
+    order = np.argsort(np.concatenate(tiles))
+    return jax.tree.map(lambda *x: np.concatenate(x)[order], *parts)
 
 
-def _attractors(pair: ImpactPair, starts: tuple, rows: np.ndarray, size: int, limits: tuple[int, int, int]):
-    """Cell, walls, span and knots of every periodic attractor of some cells, padded to a tile."""
-    longest, impacts, periods = limits
-    padded = np.resize(rows, size)
-    own, u0, v0 = jax.tree.map(lambda x: jnp.asarray(x[padded]), (pair, *starts))
-    summary = simulate.attractors(own, u0, v0, periods=periods, keep=longest, count=rows.size)
-    found = jax.tree.map(lambda x: np.asarray(x)[: rows.size], summary)
-    count = found.impacts_left + found.impacts_right
-    fine = np.isin(found.status, (Status.OK, Status.STICKING)) & (found.period > 0) & (found.period <= longest)
-    some = np.flatnonzero(fine & (count > 0) & (count <= impacts))
-    cell, count = rows[some], count[some]
-    u, v, t, n, held = jax.tree.leaves(jax.tree.map(lambda x: x[some], (found.handover.mark, found.handover.held)))
+def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
+    """Indices of the cells that met an attractor of their pair first; by impacts, greatest speed and depth."""
+    left, right = ended.impacts_left, ended.impacts_right
+    swap = (pair.gamma == 0) & (right > left)
+    measures = [np.round(np.log(x) / _SAME) for x in (ended.fastest, ended.deepest)]
+    counts = ended.period, np.where(swap, right, left), np.where(swap, left, right)
+    _, first = np.unique(np.column_stack([*jax.tree.leaves(pair), *counts, *measures]), axis=0, return_index=True)
+    return np.sort(first)
+
+
+def _recorded(pair: ImpactPair, ended: Any, longest: int, impacts: int) -> tuple[Sequence, np.ndarray]:
+    """Walls, span and knots of the last impacts of cells."""
+    u, v, t, n, held = jax.tree.leaves((ended.handover.mark, ended.handover.held))
     mark = State(u, v, t, n.astype(np.int32), held.astype(np.int32))
-    flown = record(jax.tree.map(lambda x: x[cell], pair), mark, longest, np.ones(cell.size, bool)).impacts
-    table = {name: np.pad(x, ((0, 0), (0, impacts)))[:, :impacts] for name, x in flown.items()}
-    real = np.arange(impacts) < count[:, None]
+    cells = u.size
+
+    def part(rows: np.ndarray) -> dict[str, np.ndarray]:
+        own, at = jax.tree.map(lambda x: x[rows], (pair, mark))
+        flown = record(own, at, longest, np.ones(rows.size, bool)).impacts
+        return {name: np.pad(x, ((0, 0), (0, impacts)))[:, :impacts] for name, x in flown.items()}
+
+    with ThreadPoolExecutor(workers()) as pool:
+        parts = list(pool.map(part, np.array_split(np.arange(cells), workers())))
+    table = {name: np.concatenate([one[name] for one in parts]) for name in parts[0]}
+    real = np.arange(impacts) < (ended.impacts_left + ended.impacts_right)[:, None]
     knots = np.stack([2 * table["n"] + table["t"], np.abs(table["v_in"]), table["duration"]], axis=-1)
     side = np.where(real, table["side"], 0).astype(np.int32)
-    return cell, side, 2.0 * found.period[some], np.where(real[..., None], knots, 0.0)
+    sequence = Sequence(jnp.asarray(side), jnp.asarray(2.0 * ended.period), jnp.zeros(cells, bool))
+    return sequence, np.where(real[..., None], knots, 0.0)
