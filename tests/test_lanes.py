@@ -230,3 +230,15 @@ def test_every_device_has_a_place_and_more_where_there_are_cores(monkeypatch, wa
     assert lanes.places() == expected
     with jax.default_device(jax.devices()[0]):
         assert lanes.places() == jax.devices()[:1] * wanted
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "calls"),
+    [(0, 0, 0), (1, 32, 1), (33, 32, 2), (100, 32, 4), (200, 256, 1), (400, 256, 2), (3000, 4096, 1), (9000, 4096, 3)],
+)
+def test_tiles_hold_every_row_once_and_little_padding(count, size, calls):
+    found = lanes.tiles(count, (32, 256, 4096))
+    assert [tile.rows.size for tile in found] == [size] * calls
+    rows = [tile.rows[: tile.real] for tile in found]
+    np.testing.assert_array_equal(np.concatenate([np.zeros(0, int), *rows]), np.arange(count))
+    assert all((tile.rows[tile.real :] == count - 1).all() for tile in found)

@@ -131,7 +131,8 @@ def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb
 
 def _advance(task: _Task, c: Climb) -> Climb:
     """One trial of every start that is on its way."""
-    trial = c.z + c.pace[:, None] * c.step
+    # Who has ended looks where it is, which is soon seen: what its last trial lost would be sought in vain again.
+    trial = c.z + jnp.where(c.going, c.pace, 0.0)[:, None] * c.step
     seen = _view(task, trial, c.z, c.seen.memory)
     better = c.going & seen.there & (_higher(c, seen) | (c.trip == 0))
     turns = _turns(c, seen)

@@ -99,8 +99,11 @@ class Tile(NamedTuple):
 
 
 def tiles(count: int, sizes: tuple[int, ...]) -> list[Tile]:
-    """`count` rows in calls of few sizes, ascending, so that few programs are compiled for every number of rows."""
-    size = next((size for size in sizes if size >= count), sizes[-1])
+    """`count` rows in calls of few sizes, ascending, so that few programs are compiled for every number of rows.
+
+    The largest size at which at most every other row is padding, which costs as much as any.
+    """
+    size = max((size for size in sizes if -(-count // size) * size <= 2 * count), default=sizes[0])
     starts = range(0, count, size)
     return [Tile(np.minimum(np.arange(start, start + size), count - 1), min(size, count - start)) for start in starts]
 
