@@ -96,15 +96,23 @@ def test_without_an_optimum_the_curves_remain():
 
 
 def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
-    held = [report(spread={"worst": 0.2e-6}), report(best=None), report(spread={"worst": 0.2e-6})]
+    worst = {"spread": {"worst": 0.2e-6}}
+    held = [report(**worst), report(best=None), report(**worst), report(**worst)]
     held[0]["best"]["active"] = ["penetration limit at the right wall"]
-    found = {"over": {"name": "d", "values": [0.1, 0.2, 0.3]}, "designs": held}
+    held[3]["best"]["stopped"] = "stalled"
+    found = {"over": {"name": "d", "values": [0.1, 0.2, 0.3, 0.4]}, "designs": held}
     figure = blueprint.design_map(found, tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 0
     upper, lower = figure.axes
-    assert words(figure) == ["penetration limit", "nothing: interior", "worst within the tolerances"]
+    assert words(figure) == [
+        "penetration limit",
+        "a kink, or looks spent",
+        "nothing: interior",
+        "worst within the tolerances",
+    ]
     assert [one.get_xydata().tolist() for one in upper.get_lines() if one.get_xdata().size] == [
         [[0.1, 50]],
+        [[0.4, 50]],
         [[0.3, 50]],
     ]
     interior = line(lower, "nothing: interior")

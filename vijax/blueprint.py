@@ -173,6 +173,7 @@ _HELD = {  # what holds a design, by the words it begins with
     "lower": ("#8c564b", "a bound"),
     "upper": ("#8c564b", "a bound"),
     "supremum": ("#d62728", "end of the orbit"),
+    "unsettled": ("#7f7f7f", "a kink, or looks spent"),
     "": ("#2ca02c", "nothing: interior"),
 }
 
@@ -217,7 +218,9 @@ def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure
 def _holding(best: dict[str, Any]) -> str:
     if best["stopped"] == "supremum":
         return "supremum"
-    return best["active"][0].split()[0] if best["active"] else ""
+    if best["active"]:
+        return best["active"][0].split()[0]
+    return "" if best["stopped"] == "maximum" else "unsettled"
 
 
 def _named(name: str) -> str:
