@@ -48,9 +48,8 @@ def _options() -> list[click.Parameter]:
         click.Option(
             ["--objective"], default="P", show_default=True, help="P, power, speed; over the tolerances: mean, worst"
         ),
-        click.Option(
-            ["--balls"], type=int, default=8, show_default=True, help="starts of the survey at each of 128 values"
-        ),
+        click.Option(["--steps"], type=int, default=128, show_default=True, help="values at which the survey looks"),
+        click.Option(["--balls"], type=int, default=8, show_default=True, help="starts of the survey at each of them"),
         click.Option(["--impacts"], type=int, default=16, show_default=True, help="most impacts of an orbit"),
         click.Option(["--over"], metavar="NAME=VALUES", help="axis along which to find the best designs"),
         *command.axis_options(**changed),
@@ -69,6 +68,7 @@ def design(
     bounds: tuple[str, ...],
     tolerance: tuple[str, ...],
     objective: str,
+    steps: int,
     balls: int,
     impacts: int,
     over: str | None,
@@ -94,15 +94,18 @@ def design(
         within = _bounds(bounds)
         weighed = scatter if objective in _OVER_TOLERANCES else ()
         designs.check(devices, names, within, objective, weighed)
-        method.whole("balls", balls, 1)
-        method.whole("impacts", impacts, 1)
+        effort = {
+            "steps": method.whole("steps", steps, 2),
+            "balls": method.whole("balls", balls, 1),
+            "impacts": method.whole("impacts", impacts, 1),
+        }
     command.keep_compiled()
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
         show(0, stages)
         began = time.perf_counter()
         found = designs.optimise_all(
-            devices, tune=names, bounds=within, objective=objective, tolerances=weighed, balls=balls, impacts=impacts
+            devices, tune=names, bounds=within, objective=objective, tolerances=weighed, **effort
         )
         seconds = time.perf_counter() - began
         show(1, stages)

@@ -130,6 +130,7 @@ def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
         ({"bounds": {"r": (0.1, 0.2)}}, "bounds must be those of a tuned quantity"),
         ({"looks": 1}, "looks must be a whole number of at least 2"),
         ({"balls": 0}, "balls must be a whole number of at least 1"),
+        ({"steps": 1}, "steps must be a whole number of at least 2"),
         ({"impacts": 0.5}, "impacts must be a whole number of at least 1"),
     ],
 )
@@ -180,6 +181,7 @@ BAD = [
     (["--objective", "worst"], "tolerances must be given with objective mean or worst"),
     (["--objective", "worst", "--tolerance", "s=1%:lognormal"], "tolerances of a worst case must be uniform"),
     (["--balls", "0"], "balls must be a whole number of at least 1; got 0"),
+    (["--steps", "1"], "steps must be a whole number of at least 2; got 1"),
     (["--impacts", "0"], "impacts must be a whole number of at least 1; got 0"),
     (["--over", "d"], "over must be NAME=VALUES"),
     (["--over", "u0=0:0.1:3"], "over must be NAME=VALUES"),

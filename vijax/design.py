@@ -38,7 +38,6 @@ _TILE = 16  # starts of one compiled call: those that end soon wait for the othe
 _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
-_STEPS = 128  # values of the first quantity in the survey
 _REACH = 0.49, 0.6  # of the gap that its displacement may take, and its velocity
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
 _NARROW = 0.8  # of the best start's objective: an orbit of more impacts than 8 that promises less is not climbed
@@ -121,6 +120,7 @@ def optimise_all(
     tolerances: Iterable[Tolerance] = (),
     samples: int | None = None,
     looks: int = 60,
+    steps: int = 128,
     balls: int = 8,
     impacts: int = 16,
     periods: int = 200,
@@ -139,8 +139,9 @@ def optimise_all(
         tolerances: How constants scatter, for "mean" and "worst".
         samples: Random devices for these, in place of a quadrature.
         looks: Evaluations of objective with gradient that a start may take.
-        balls: Starts from which the survey looks for attractors, at each of 128 values of the first quantity. More of
-            them meet attractors with small basins, which may be the best, and take longer.
+        steps: Values of the first quantity at which the survey looks for attractors. More of them meet orbits that live
+            in narrow windows, which may be the best, and take longer.
+        balls: Starts from which it looks at each of them; more meet attractors with small basins.
         impacts: Of an orbit, at most: longer ones are not looked for. Fewer are compiled and climb faster.
         periods: Forcing periods that each of them may take.
 
@@ -152,11 +153,11 @@ def optimise_all(
     """
     devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
     looks, impacts = whole("looks", looks, 2), whole("impacts", impacts, 1)
-    balls, periods = whole("balls", balls, 1), whole("periods", periods, 1)
+    effort = _Effort(whole("steps", steps, 2), whole("balls", balls, 1), impacts, whole("periods", periods, 1))
     box = check(devices, tune, bounds or {}, objective, scatter)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    met = _survey(devices, tune, box, (balls, impacts, periods))
+    met = _survey(devices, tune, box, effort)
     starts = met.some(_promising(met, objective))
     ends = _climbed(scene, starts, box, looks)
     optima = _optima(scene, starts, ends, devices, looks)
@@ -257,13 +258,21 @@ class _Met(NamedTuple):
         return jax.tree.map(lambda x: x[index], self)
 
 
-def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: tuple[int, int, int]) -> _Met:
+class _Effort(NamedTuple):
+    """Of a survey: values of the first quantity, starts at each, most impacts of an orbit, periods of a start."""
+
+    steps: int
+    balls: int
+    impacts: int
+    periods: int
+
+
+def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: _Effort) -> _Met:
     """The attractors of every device, along the first quantity that moves the ball at levels of the others."""
-    balls, impacts, periods = effort
     first = next((i for i, name in enumerate(tune) if moving(name)), None)
     sides = [(0.5,) if i == first or not moving(name) else _LEVELS for i, name in enumerate(tune)]
-    levels, steps = np.array(list(itertools.product(*sides))), _STEPS if first is not None else 1
-    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, balls)))
+    levels, steps = np.array(list(itertools.product(*sides))), effort.steps if first is not None else 1
+    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
     parts = levels[level]
     if first is not None:
         parts[:, first] = step / (steps - 1)
@@ -275,7 +284,7 @@ def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, ef
     # The same for every device: designs of one do not depend on the others.
     draw = np.random.default_rng(0).uniform(-1, 1, (2, owner.size // len(devices)))
     u0, v0 = (reach * np.tile(x, len(devices)) for reach, x in zip(_REACH, draw, strict=True))
-    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, impacts=impacts, periods=periods)
+    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, impacts=effort.impacts, periods=effort.periods)
     own = jax.tree.map(lambda x: np.asarray(x)[found.cell], every)
     return _Met(found.orbit, own, *(x[found.cell] for x in (z, owner, level, step)))
 
