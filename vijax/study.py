@@ -227,7 +227,7 @@ def _birth(path: Path) -> str:
 
 def _most(of: Cells) -> int:
     """Cells of a tile, at most."""
-    share = max(math.ceil(_ROUNDING * of.count / (_SHARES * len(places()))), SMALLEST_TILE)
+    share = max(int(_ROUNDING * of.count / (_SHARES * len(places()))), SMALLEST_TILE)
     room = _LARGEST_CHUNK // math.prod(of.sizes[dim] for dim in of.variant)
     return min(share, LARGEST_TILE, max(room, 1))
 
