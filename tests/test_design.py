@@ -34,7 +34,7 @@ def kappa(optimum):
 @pytest.fixture(scope="module")
 def found():
     """Both devices in one call; with `impacts` as low as here little is compiled."""
-    return design.optimise_all([FAST, PAPER], balls=2, impacts=2)
+    return design.optimise_all([FAST, PAPER], steps=128, balls=2, impacts=2)
 
 
 def test_the_small_fast_device(found):
@@ -45,6 +45,13 @@ def test_the_small_fast_device(found):
     assert float(best.state.multiplier) == pytest.approx(0.533, abs=1e-3)
     assert (best.stopped, best.active, best.label) == ("maximum", (), "1:1")
     assert abs(best.gradient["omega0"]) < 1e-5
+
+
+def test_only_the_best_of_a_kind_within_reach_climbs():
+    kind = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [0, 1], [0, 2], [1, 1]])
+    step, score = np.array([0, 3, 4, 20, 20, 3, 3]), np.array([1.0, 3.0, 2.0, 5.0, 6.0, 0.0, 0.0])
+    np.testing.assert_array_equal(design._highest(kind, step, score, 4), [1, 4, 5, 6])
+    np.testing.assert_array_equal(design._highest(kind, step, score, 2), [0, 1, 4, 5, 6])
 
 
 def test_the_papers_device_is_held_by_the_penetration_limit(found):
@@ -110,7 +117,7 @@ def test_tolerances_of_a_design(found):
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = design.optimise(
-        FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, balls=1, impacts=2
+        FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, steps=128, balls=1, impacts=2
     ).best
     nominal = found[0].best
     assert robust.height > design.under(nominal, tolerance).worst
@@ -162,7 +169,7 @@ def test_weighing_basins_moves_away_from_where_few_starts_lead(found, monkeypatc
 
 # --- the script ------------------------------------------------------------------------------------------------------
 
-FEW = ["--balls", "1", "--impacts", "2"]
+FEW = ["--steps", "128", "--balls", "1", "--impacts", "2"]
 SMALL = ["--r", "0.5", "--A", "3", "--omega", "10pi", "--set", "V=1700"]
 
 BAD = [
@@ -262,7 +269,19 @@ def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys, monke
 
 
 def test_designs_along_an_axis(folder, capsys):
-    arguments = [*SMALL, "--over", "d=0.16,0.2", "--balls", "1", "--out", "map.json", "--plot", "map.png"]
+    arguments = [
+        *SMALL,
+        "--over",
+        "d=0.16,0.2",
+        "--steps",
+        "128",
+        "--balls",
+        "1",
+        "--out",
+        "map.json",
+        "--plot",
+        "map.png",
+    ]
     assert script.main(arguments) == 0
     report = strict(folder / "map.json")
     assert report["over"] == {"name": "d", "values": [0.16, 0.2]}

@@ -22,29 +22,40 @@ def found():
     return pair, survey(pair, u0, np.full(d.size, -0.47898), longest=4, impacts=8, periods=400)
 
 
-def test_orbits_are_those_of_a_sweep(found):
+@pytest.fixture(scope="module")
+def orbit(found):
+    """The orbits of what was flown."""
+    _, met = found
+    return orbits.solve(jax.tree.map(jnp.asarray, met.pair), met.sequence(8), jnp.asarray(met.knots))
+
+
+def test_orbits_are_those_of_a_sweep(found, orbit):
     pair, met = found
     # The only attractor at d = 0.2 from kappa 5 on, mirror images aside: nine starts meet it, it is there once.
     here = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] > KAPPA[7]))
     np.testing.assert_array_equal(pair.kappa[met.cell[here]], KAPPA[8:])
     swept = vijax.sweep(d=0.2, kappa=KAPPA[8:], r=0.5, outputs=["P", "period"])
-    np.testing.assert_allclose(orbits.power(met.orbit[here], vijax.Harvester()), swept["P"], rtol=1e-7)
-    np.testing.assert_array_equal(orbits.counts(met.orbit[here]).period, swept["period"])
+    np.testing.assert_allclose(orbits.power(orbit[here], vijax.Harvester()), swept["P"], rtol=1e-7)
+    np.testing.assert_array_equal(orbits.counts(orbit[here]).period, swept["period"])
 
 
-def test_every_orbit_is_verified_attracts_and_stands_at_its_cell(found):
+def test_attractors_are_flown_as_their_orbits_are_and_stand_at_their_cells(found, orbit):
     pair, met = found
-    assert (np.asarray(met.orbit.status) == Status.OK).all()
-    assert (np.abs(np.asarray(met.orbit.multipliers)).max(axis=1) < 1).all()
-    np.testing.assert_array_equal(met.orbit.pair.kappa, pair.kappa[met.cell])
-    np.testing.assert_array_equal(met.orbit.pair.d, pair.d[met.cell])
+    assert (np.asarray(orbit.status) == Status.OK).all()
+    assert (np.abs(np.asarray(orbit.multipliers)).max(axis=1) < 1).all()
+    real = met.side != 0
+    for name in ("depth", "work"):
+        np.testing.assert_array_equal(np.isnan(getattr(met, name)), ~real)
+        np.testing.assert_allclose(getattr(met, name)[real], np.asarray(getattr(orbit, name))[real], rtol=1e-6)
+    np.testing.assert_array_equal(met.pair.kappa, pair.kappa[met.cell])
+    np.testing.assert_array_equal(met.pair.d, pair.d[met.cell])
     assert (np.diff(met.cell) > 0).all()
 
 
-def test_coexisting_attractors_are_met(found):
+def test_coexisting_attractors_are_met(found, orbit):
     pair, met = found
     many = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] == 3.0))
-    power = np.asarray(orbits.power(met.orbit[many], vijax.Harvester()))
+    power = np.asarray(orbits.power(orbit[many], vijax.Harvester()))
     assert np.unique(np.round(1e9 * power)).size == many.size > 1
 
 
@@ -56,9 +67,8 @@ def test_chaos_has_no_orbit(found):
     assert not np.isin(chaos + KAPPA.size * 9, met.cell).any()
 
 
-def test_clearances_are_those_of_the_motion_in_between(found):
-    _, met = found
-    some = met.orbit[np.arange(0, len(met.orbit), 61)]
+def test_clearances_are_those_of_the_motion_in_between(orbit):
+    some = orbit[np.arange(0, len(orbit), 61)]
     sequence, knots = some.sequence, jnp.nan_to_num(some.knots)
     room = jax.jit(jax.vmap(clearance.between))(some.pair, sequence, knots).clearance
     assert (np.stack(room) > 0).all()

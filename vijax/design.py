@@ -22,12 +22,11 @@ from vijax import orbit as orbits
 from vijax.ascent import Box, Climb, ascend, converged
 from vijax.energy import harvested_energy
 from vijax.method import whole
-from vijax.model import Harvester, ImpactPair, Status
+from vijax.model import Harvester, Status
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
-from vijax.shooting import Sequence
 from vijax.steady import Steady, steady
-from vijax.survey import survey
+from vijax.survey import Survey, survey
 from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, moving, tuned, values, variables
 
@@ -40,6 +39,7 @@ _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
 _REACH = 0.49, 0.6  # of the gap that its displacement may take, and its velocity
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
+_BESIDE = 256  # parts of the first quantity's bounds: of attractors of a kind the best climbs as far as one away
 _NARROW = 0.8  # of the best start's objective: an orbit of more impacts than 8 that promises less is not climbed
 _HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
 
@@ -120,8 +120,8 @@ def optimise_all(
     tolerances: Iterable[Tolerance] = (),
     samples: int | None = None,
     looks: int = 60,
-    steps: int = 128,
-    balls: int = 8,
+    steps: int = 1024,
+    balls: int = 4,
     impacts: int = 16,
     periods: int = 200,
 ) -> list[Design]:
@@ -158,7 +158,7 @@ def optimise_all(
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
     met = _survey(devices, tune, box, effort)
-    starts = met.some(_promising(met, objective))
+    starts = met.some(_promising(met, objective, max(1, effort.steps // _BESIDE)))
     ends = _climbed(scene, starts, box, looks)
     optima = _optima(scene, starts, ends, devices, looks)
     return [
@@ -238,15 +238,15 @@ def check(
 
 
 class _Met(NamedTuple):
-    """Attractors on the way: the orbit, its device with what was tuned there, the variables; where they were met.
+    """Attractors on the way: as flown, the device with what was tuned there, the variables; where they were met.
 
     Attributes:
         owner: Which of the devices given.
         level, step: Of the survey's values of the first quantity, and of all others together.
-        device: Leaves [orbit].
+        device: Leaves [attractor].
     """
 
-    orbit: Orbit
+    flown: Survey
     device: Harvester
     z: np.ndarray
     owner: np.ndarray
@@ -286,54 +286,57 @@ def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, ef
     u0, v0 = (reach * np.tile(x, len(devices)) for reach, x in zip(_REACH, draw, strict=True))
     found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, impacts=effort.impacts, periods=effort.periods)
     own = jax.tree.map(lambda x: np.asarray(x)[found.cell], every)
-    return _Met(found.orbit, own, *(x[found.cell] for x in (z, owner, level, step)))
+    return _Met(found, own, *(x[found.cell] for x in (z, owner, level, step)))
 
 
-def _promising(met: _Met, objective: str) -> np.ndarray:
-    """Indices of the attractors to climb from: best of their kind in their cell, and no better one a step away.
+def _promising(met: _Met, objective: str, reach: int) -> np.ndarray:
+    """Indices of the attractors to climb from: the best of their kind as far as so many steps away.
 
     A kind is given by span and impacts; the walls may change places where the tube is level.
     """
-    kind = np.column_stack([np.asarray(met.orbit.sequence.span), *_impacts(met.orbit)])
-    place = np.column_stack([met.owner, met.level, kind, met.step])
-    score = _score(met, objective)
-    order = np.lexsort((-score, *place.T[::-1]))
-    new = np.append(True, (np.diff(place[order], axis=0) != 0).any(axis=1))
-    best = order[new]
-    apart = np.diff(place[best], axis=0)
-    beside = (apart[:, :-1] == 0).all(axis=1) & (apart[:, -1] == 1)
-    score = score[best]
-    behind = np.append(False, beside & (score[:-1] > score[1:]))
-    ahead = np.append(beside & (score[1:] > score[:-1]), False)
-    found = np.sort(best[~behind & ~ahead])
+    counts, score = _impacts(met.flown), _score(met, objective)
+    found = _highest(np.column_stack([met.owner, met.level, met.flown.span, *counts]), met.step, score, reach)
     # Orbits of many impacts live in narrow windows, where no climb leads far.
     most = np.full(met.owner.max(initial=-1) + 1, -np.inf)
-    score = _score(met.some(found), objective)
-    np.maximum.at(most, met.owner[found], score)
-    few = np.asarray(met.orbit.count)[found] <= _WIDTHS[-1]
-    return found[few | (score > most[met.owner[found]] + math.log(_NARROW))]
+    np.maximum.at(most, met.owner[found], score[found])
+    few = np.add(*counts)[found] <= _WIDTHS[-1]
+    return found[few | (score[found] > most[met.owner[found]] + math.log(_NARROW))]
 
 
-def _impacts(orbit: Orbit) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right impacts of orbits; in a level tube the more and the fewer."""
-    side, level = np.asarray(orbit.sequence.side), np.asarray(orbit.pair.gamma) == 0
-    left, right = (side < 0).sum(axis=1), (side > 0).sum(axis=1)
-    swap = level & (right > left)
+def _highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) -> np.ndarray:
+    """Indices of the rows that none of their group beats within so many steps; of one step's rows the first best."""
+    order = np.lexsort((-score, step, *group.T[::-1]))
+    place = np.column_stack([group, step])[order]
+    new = np.append(True, (np.diff(place, axis=0) != 0).any(axis=1))
+    best, place = order[new], place[new]
+    height, top = score[best], np.ones(best.size, bool)
+    for ahead in range(1, reach + 1):
+        apart = place[ahead:] - place[:-ahead]
+        near = (apart[:, :-1] == 0).all(axis=1) & (apart[:, -1] <= reach)
+        top[:-ahead] &= ~near | (height[:-ahead] >= height[ahead:])
+        top[ahead:] &= ~near | (height[ahead:] >= height[:-ahead])
+    return np.sort(best[top])
+
+
+def _impacts(flown: Survey) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right impacts of attractors; in a level tube the more and the fewer."""
+    left, right = ((flown.side == side).sum(axis=1) for side in (-1, 1))
+    swap = (flown.pair.gamma == 0) & (right > left)
     return np.where(swap, right, left), np.where(swap, left, right)
 
 
 def _score(met: _Met, objective: str) -> np.ndarray:
     """What an attractor promises: the logarithm of the objective; far below where a constraint is broken."""
-    device, orbit = met.device, met.orbit
-    deep = np.asarray(orbit.depth) * np.asarray(device.length_unit)[:, None]
+    device, flown = met.device, met.flown
+    deep = flown.depth * np.asarray(device.length_unit)[:, None]
     gained = np.asarray(jax.vmap(harvested_energy)(device, jnp.asarray(deep)))
-    given = np.asarray(orbit.work) * np.asarray(device.m_b * device.speed_unit**2)[:, None]
+    given = flown.work * np.asarray(device.m_b * device.speed_unit**2)[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         lacks = np.minimum(np.log(given / gained), np.log(np.asarray(device.depth_limit)[:, None] / deep))
     lacks = np.nanmin(lacks, axis=1, initial=0.0)
-    value = np.nansum(gained, axis=1) / np.asarray(orbit.sequence.span)
+    value = np.nansum(gained, axis=1) / flown.span
     if objective == "speed":
-        value = np.nanmax(np.asarray(orbit.knots)[..., 1], axis=1)
+        value = flown.knots[..., 1].max(axis=1)
     return np.where(lacks < 0, _HOPELESS + lacks, np.log(value))
 
 
@@ -363,17 +366,14 @@ class _End(NamedTuple):
 
 def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_End]:
     """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
-    count, work = np.asarray(starts.orbit.count), _compiled(looks)
-    given = jax.tree.map(lambda x: np.asarray(x), starts.device)
+    count, work = np.add(*_impacts(starts.flown)), _compiled(looks)
     ends: list[_End | None] = [None] * count.size
 
     def part(some: np.ndarray, width: int, tile: lanes.Tile) -> None:
         rows = some[tile.rows]
-        orbit, (low, high) = starts.orbit[rows], box[starts.owner[rows]].swapaxes(0, 1)
-        side, knots = orbit.sequence.side[:, :width], jnp.nan_to_num(orbit.knots[:, :width])
-        sequence = Sequence(side, orbit.sequence.span, orbit.sequence.mirrored)
-        device = jax.tree.map(lambda x: jnp.asarray(x[rows]), given)
-        end = work(scene, Batch(device, sequence, knots, *(jnp.asarray(x) for x in (starts.z[rows], low, high))))
+        own, bounds = starts.some(rows), box[starts.owner[rows]].swapaxes(0, 1)
+        begun = (jnp.asarray(x) for x in (own.flown.knots[:, :width], own.z, *bounds))
+        end = work(scene, Batch(jax.tree.map(jnp.asarray, own.device), own.flown.sequence(width), *begun))
         seen, lost, settled, taken = (
             jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, converged(end), end.looks)
         )
@@ -393,8 +393,10 @@ def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_E
             )
 
     jobs = []
-    most = starts.orbit.sequence.side.shape[1]
-    for few, width in itertools.pairwise((0, *(width for width in _WIDTHS if width < most), most)):
+    most = starts.flown.side.shape[1]
+    widths = [0, *(width for width in _WIDTHS if width < most), most]
+    # The widest first, for they take longest: no core is left with one of them at the end.
+    for width, few in itertools.pairwise(reversed(widths)):
         some = np.flatnonzero((count > few) & (count <= width))
         jobs += [(some, width, tile) for tile in lanes.tiles(some.size, (_TILE,))]
     with ThreadPoolExecutor(lanes.workers()) as pool:
@@ -411,7 +413,10 @@ def _optima(scene: Scene, starts: _Met, ends: list[_End], devices: list[Harveste
         return [[] for _ in devices]
     own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
     many = jax.tree.map(lambda *x: jnp.array(x), *own)
-    found = _at(starts.orbit[np.array(good)], jax.vmap(lambda d: d.pair())(many), [ends[i].knots for i in good])
+    width = starts.flown.side.shape[1]
+    wide = [np.pad(ends[i].knots, ((0, width - len(ends[i].knots)), (0, 0))) for i in good]
+    sequence = starts.some(np.array(good)).flown.sequence(width)
+    found = orbits.solve(jax.vmap(lambda d: d.pair())(many), sequence, jnp.array(wide))
     seen = states(own, found)
     attracts = np.array([found.status[row] == Status.OK == seen[row].status for row in range(len(own))])
     names = orbits.labels(found)
@@ -454,13 +459,6 @@ def _apart(good: list[int], ends: list[_End], owner: np.ndarray) -> Iterator[lis
             if all(np.abs(ends[i].z - ends[k].z).max() > _SAME for k in kept):
                 kept.append(i)
         yield kept
-
-
-def _at(orbit: Orbit, pair: ImpactPair, knots: list[np.ndarray]) -> Orbit:
-    """The orbits with other parameters and knots, verified."""
-    width = orbit.knots.shape[1]
-    wide = np.stack([np.pad(row, ((0, width - row.shape[0]), (0, 0))) for row in knots])
-    return orbits.solve(pair, orbit.sequence, jnp.asarray(wide))
 
 
 @lru_cache(maxsize=1)

@@ -22,7 +22,7 @@ class Record(NamedTuple):
 
     Attributes:
         impacts: By name, [ball, impact], NaN beyond `filled`: `n` (period, from 0), `t` (phase of the onset), `side`,
-            `v_in`, `v_out` (signed), `duration`, `depth` (of a rigid wall that of kappa = 1).
+            `v_in`, `v_out` (signed), `duration`, `depth` and `work` (of a rigid wall those of kappa = 1).
         filled: Impacts of each ball.
         u, v: The ball at phase 0 of periods 1 ... periods, [ball, period]; NaN of balls that were not flown.
     """
@@ -33,7 +33,7 @@ class Record(NamedTuple):
     v: np.ndarray
 
 
-_KEPT = ("n", "t", "side", "v_in", "v_out", "duration", "depth")
+_KEPT = ("n", "t", "side", "v_in", "v_out", "duration", "depth", "work")
 
 
 class _Step(NamedTuple):

@@ -1,4 +1,4 @@
-"""Which periodic orbits attract in many cells: where designs set out from."""
+"""Which periodic attractors many cells meet: where designs set out from."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,6 @@ import numpy as np
 from vijax import simulate
 from vijax.lanes import workers
 from vijax.model import ImpactPair, State, Status
-from vijax.orbit import Orbit, solve
 from vijax.record import record
 from vijax.shooting import Sequence
 
@@ -20,10 +19,27 @@ _SAME = 1e-6  # relative difference within which attractors of one pair are the 
 
 
 class Survey(NamedTuple):
-    """Attractors found: verified orbits, and the cell that met each first, in the order of the cells."""
+    """Attractors as they were flown, in the order of the cells that met them first; `orbit.solve` makes orbits of them.
 
-    orbit: Orbit
+    Attributes:
+        pair: Parameters of each [attractor].
+        side, knots: Its impacts, [attractor, impact], padded with side 0 and zeros; see `Orbit`.
+        span: Time after which it closes.
+        depth, work: Largest penetration and energy given to the membrane (per unit mass) of each; NaN beyond.
+        cell: Which one met it first.
+    """
+
+    pair: ImpactPair
+    side: np.ndarray
+    knots: np.ndarray
+    span: np.ndarray
+    depth: np.ndarray
+    work: np.ndarray
     cell: np.ndarray
+
+    def sequence(self, width: int) -> Sequence:
+        """Walls and closing of all, of so many impacts."""
+        return Sequence(jnp.asarray(self.side[:, :width]), jnp.asarray(self.span), jnp.zeros(self.span.size, bool))
 
 
 def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, impacts: int, periods: int) -> Survey:
@@ -36,7 +52,7 @@ def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, im
         periods: Forcing periods that the search for an attractor may take.
 
     Returns:
-        The orbits, of mirror images on level ground one; aperiodic and silent cells, and longer orbits, have none.
+        Attractors, of mirror images on level ground one; aperiodic and silent cells, and longer orbits, have none.
     """
     pair = jax.tree.map(np.asarray, pair)
     ended = _ended(pair, (u0, v0), longest, periods)
@@ -47,10 +63,8 @@ def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, im
     once = _distinct(own, ended)
     cell = some[once]
     own, ended = jax.tree.map(lambda x: x[once], (own, ended))
-    guess, knots = _recorded(own, ended, longest, impacts)
-    orbits = solve(jax.tree.map(jnp.asarray, own), guess, jnp.asarray(knots))
-    good = np.flatnonzero(np.asarray(orbits.status) == Status.OK)
-    return Survey(orbits[good], cell[good])
+    flown = _recorded(own, ended, impacts)
+    return Survey(pair=own, span=2.0 * ended.period, cell=cell, **flown)
 
 
 def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int, periods: int) -> Any:
@@ -83,22 +97,29 @@ def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
     return np.sort(first)
 
 
-def _recorded(pair: ImpactPair, ended: Any, longest: int, impacts: int) -> tuple[Sequence, np.ndarray]:
-    """Walls, span and knots of the last impacts of cells."""
+def _recorded(pair: ImpactPair, ended: Any, impacts: int) -> dict[str, np.ndarray]:
+    """Walls, knots, depths and works of the last impacts of cells."""
     u, v, t, n, held = jax.tree.leaves((ended.handover.mark, ended.handover.held))
     mark = State(u, v, t, n.astype(np.int32), held.astype(np.int32))
-    cells = u.size
+    table = {
+        name: np.full((u.size, impacts), np.nan) for name in ("n", "t", "side", "v_in", "duration", "depth", "work")
+    }
 
-    def part(rows: np.ndarray) -> dict[str, np.ndarray]:
+    def part(rows: np.ndarray) -> None:
         own, at = jax.tree.map(lambda x: x[rows], (pair, mark))
-        flown = record(own, at, longest, np.ones(rows.size, bool)).impacts
-        return {name: np.pad(x, ((0, 0), (0, impacts)))[:, :impacts] for name, x in flown.items()}
+        flown = record(own, at, int(ended.period[rows[0]]), np.ones(rows.size, bool)).impacts
+        for name, column in table.items():
+            width = min(flown[name].shape[1], impacts)
+            column[rows, :width] = flown[name][:, :width]
 
+    alike = [np.flatnonzero(ended.period == period) for period in np.unique(ended.period)]
+    parts = [rows for some in alike for rows in np.array_split(some, min(workers(), some.size))]
     with ThreadPoolExecutor(workers()) as pool:
-        parts = list(pool.map(part, np.array_split(np.arange(cells), workers())))
-    table = {name: np.concatenate([one[name] for one in parts]) for name in parts[0]}
+        list(pool.map(part, parts))
     real = np.arange(impacts) < (ended.impacts_left + ended.impacts_right)[:, None]
     knots = np.stack([2 * table["n"] + table["t"], np.abs(table["v_in"]), table["duration"]], axis=-1)
-    side = np.where(real, table["side"], 0).astype(np.int32)
-    sequence = Sequence(jnp.asarray(side), jnp.asarray(2.0 * ended.period), jnp.zeros(cells, bool))
-    return sequence, np.where(real[..., None], knots, 0.0)
+    return {
+        "side": np.where(real, table["side"], 0).astype(np.int32),
+        "knots": np.where(real[..., None], knots, 0.0),
+        **{name: np.where(real, table[name], np.nan) for name in ("depth", "work")},
+    }
