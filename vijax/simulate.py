@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax import exact, lanes, quick, relay, trips
+from vijax import exact, lanes, quick, relay, traced, trips
 from vijax.cell import TRANSIENT_SHARE, Cell, Plan, Settings, blank_tally
 from vijax.method import Method, Ode
 from vijax.model import Harvester, ImpactPair
@@ -92,14 +92,13 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
 
 
 @lru_cache(maxsize=32)
-def _compiled(plan: Plan, width: int):
-    """The jitted program of a plan: a whole tile of cells in one call."""
+def _compiled(plan: Plan, width: int) -> traced.Program:
+    """The program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
-        table = lanes.run(_program(plan, settings), cells, count, columns(plan), width)
-        return unpack(plan, table)
+        return lanes.run(_program(plan, settings), cells, count, columns(plan), width)
 
-    return jax.jit(tile, compiler_options=lanes.compiler_options())
+    return traced.Program(tile, f"{tile.__qualname__} {plan} {width}")
 
 
 def _width(cells: int, level: bool) -> int:
@@ -178,7 +177,8 @@ def summarise(
     )
     number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
     given = cells, number, settings
-    return _compiled(plan, _width(pair.d.shape[0], plan.level))(*(given if on is None else jax.device_put(given, on)))
+    given = given if on is None else jax.device_put(given, on)
+    return unpack(plan, np.asarray(_compiled(plan, _width(pair.d.shape[0], plan.level))(*given)))
 
 
 def blank(count: int, variants: int, dtype: str) -> Summary:
@@ -194,7 +194,7 @@ def blank(count: int, variants: int, dtype: str) -> Summary:
         tangent=True,
         variants=variants,
     )
-    return unpack(plan, jnp.zeros((count, columns(plan)), dtype))
+    return unpack(plan, np.zeros((count, columns(plan)), dtype))
 
 
 def attractors(
@@ -222,9 +222,8 @@ def attractors(
     cells = jnp.stack([pair.d, pair.kappa, pair.r, pair.gamma, one, one, u0, v0, zero], axis=1)
     plan = _chained(pair)
     number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
-    return _compiled(plan, _width(pair.d.shape[0], plan.level))(
-        cells, number, _chained_settings(pair, Harvester(), periods, keep)
-    )
+    settings = _chained_settings(pair, Harvester(), periods, keep)
+    return unpack(plan, np.asarray(_compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)))
 
 
 def _chained(pair: ImpactPair) -> Plan:
@@ -285,18 +284,16 @@ def _start(plan: Plan, rows: Float[Array, "lane in"], u, v, t) -> Float[Array, "
 
 
 @lru_cache(maxsize=32)
-def _compiled_chains(plan: Plan):
-    """The jitted program of chains: all their links in one call."""
+def _compiled_chains(plan: Plan) -> traced.Program:
+    """The program of chains: all their links in one call."""
 
     def follow(links, starts, count, length, settings):
         first = _start(plan, links[:, 0], starts.u, starts.v, starts.t)
         links = links.at[:, 0].set(first)
         succeed = partial(_succeed, plan, settings)
-        table = lanes.chain(_program(plan, settings), succeed, links, count, length, columns(plan))
-        flat = unpack(plan, table.reshape(-1, table.shape[-1]))
-        return jax.tree.map(lambda x: x.reshape(table.shape[:2] + x.shape[1:]), flat)
+        return lanes.chain(_program(plan, settings), succeed, links, count, length, columns(plan))
 
-    return jax.jit(follow, compiler_options=lanes.compiler_options())
+    return traced.Program(follow, f"{follow.__qualname__} {plan}")
 
 
 def follow(
@@ -332,5 +329,7 @@ def follow(
     rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, length, speed, growth.u, growth.v, zero], axis=2)
     chains, most = pair.d.shape
     number, long = (jnp.asarray(x, jnp.int32) for x in (count or chains, links or most))
-    settings = _chained_settings(pair, device, periods, keep)
-    return _compiled_chains(_chained(pair))(rows, starts, number, long, settings)
+    settings, plan = _chained_settings(pair, device, periods, keep), _chained(pair)
+    table = np.asarray(_compiled_chains(plan)(rows, starts, number, long, settings))
+    flat = unpack(plan, table.reshape(-1, table.shape[-1]))
+    return jax.tree.map(lambda x: x.reshape(table.shape[:2] + x.shape[1:]), flat)

@@ -1,10 +1,12 @@
 """What is kept of a cell that has ended, and its row in the table of results."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vijax.cell import TANGENT_SCALE, Cell, Lane, Mask, Plan, Settings, batch_length, last_period
@@ -134,17 +136,17 @@ def pack(summary: Summary) -> Float[Array, "row out"]:
     return jnp.concatenate([(x if x.ndim == 2 else x[:, None]).astype(dtype) for x in leaves], axis=1)
 
 
-def unpack(plan: Plan, table: Float[Array, "cell out"]) -> Summary:
-    """The table of `pack` as a summary again, counts and codes as integers."""
+def unpack(plan: Plan, table: Float[np.ndarray, "cell out"]) -> Summary:
+    """The table of `pack` as a summary again, of numpy arrays; counts and codes as integers."""
     column = 0
 
-    def take(width: int | None):
+    def take(width: int | None) -> Any:
         nonlocal column
         column += width or 1
         return table[:, column - 1] if width is None else table[:, column - width : column]
 
-    def whole():
-        return take(None).astype(jnp.int32)
+    def whole() -> Any:
+        return take(None).astype(np.int32)
 
     wide = plan.variants
     return Summary(

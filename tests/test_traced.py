@@ -1,0 +1,98 @@
+"""A program is traced once: kept with what it depends on, read back bit for bit, traced anew where that fails."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vijax import traced
+
+X = jnp.linspace(0.1, 2.0, 7)
+
+
+class Work:
+    """A function of a dictionary that counts how often it is traced."""
+
+    def __init__(self):
+        self.traced = 0
+
+    def __call__(self, given):
+        """A wave."""
+        self.traced += 1
+        return jnp.sin(given["x"]) / given["y"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    place = tmp_path / "compiled"
+    monkeypatch.setattr(traced, "_folder", lambda: place)
+    return place
+
+
+def called(name="wave", x=X):
+    """The result of a fresh program, as a new process would make it, and how often that traced."""
+    work = Work()
+    program = traced.Program(work, name)
+    given = {"x": x, "y": jnp.asarray(3.0, x.dtype)}
+    first = np.asarray(program(given))
+    np.testing.assert_array_equal(program(given), first)
+    np.testing.assert_allclose(first, np.sin(np.asarray(x)) / 3.0, rtol=1e-6 if x.dtype == "float32" else 1e-15)
+    return first, work.traced
+
+
+def test_the_second_process_does_not_trace(folder):
+    first, times = called()
+    again, none = called()
+    assert (times, none) == (1, 0)
+    np.testing.assert_array_equal(again, first)
+    assert len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize("changed", [{"name": "tide"}, {"x": X[:5]}, {"x": X.astype("float32")}])
+def test_another_program_or_shape_is_another_one(folder, changed):
+    called()
+    assert called(**changed)[1] == 1
+    assert called(**changed)[1] == 0
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_other_sources_are_other_programs(folder, monkeypatch):
+    called()
+    monkeypatch.setattr(traced, "_sources", lambda: "other")
+    assert called()[1] == 1
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[:-9], lambda content: content[:-1] + b"?", lambda _: b""])
+def test_a_damaged_file_is_written_anew(folder, damage):
+    called()
+    (path,) = folder.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    assert called()[1] == 1
+    assert called()[1] == 0
+    assert [one.name for one in folder.iterdir()] == [path.name]
+
+
+def test_where_nothing_can_be_kept_it_is_traced_every_time(tmp_path, monkeypatch):
+    taken = tmp_path / "file"
+    taken.touch()
+    for place in (taken, None):
+        monkeypatch.setattr(traced, "_folder", lambda place=place: place)
+        assert called()[1] == called()[1] == 1
+    assert taken.read_bytes() == b""
+
+
+def test_the_folder_is_that_of_compiled_programs(tmp_path):
+    before = {name: jax.config.values[name] for name in ("jax_compilation_cache_dir", "jax_enable_compilation_cache")}
+    try:
+        for asked, kept, expected in ((str(tmp_path), True, tmp_path), (str(tmp_path), False, None)):
+            jax.config.update("jax_compilation_cache_dir", asked)
+            jax.config.update("jax_enable_compilation_cache", kept)
+            assert traced._folder() == expected
+        jax.config.update("jax_enable_compilation_cache", True)
+        for asked in (None, "gs://bucket/compiled"):
+            jax.config.update("jax_compilation_cache_dir", asked)
+            assert traced._folder() is None
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
