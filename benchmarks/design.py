@@ -111,7 +111,7 @@ def random_cells() -> Orbit:
     kappa = np.exp(draw.uniform(math.log(3), math.log(400), shape))
     columns = draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt
     rest, speed = np.zeros(shape), np.full(shape, 0.25)
-    flown = survey(ImpactPair(*map(jnp.asarray, columns)), rest, speed, longest=4, impacts=8, periods=400)
+    flown = survey(ImpactPair(*map(jnp.asarray, columns)), rest, speed, longest=4, periods=400).orbits(8)
     found = orbits.solve(jax.tree.map(jnp.asarray, flown.pair), flown.sequence(8), jnp.asarray(flown.knots))
     return found[np.asarray(found.status) == Status.OK]
 

@@ -48,8 +48,8 @@ def _options() -> list[click.Parameter]:
         click.Option(
             ["--objective"], default="P", show_default=True, help="P, power, speed; over the tolerances: mean, worst"
         ),
-        click.Option(["--steps"], type=int, default=1024, show_default=True, help="values at which the survey looks"),
-        click.Option(["--balls"], type=int, default=4, show_default=True, help="starts of the survey at each of them"),
+        click.Option(["--steps"], type=int, default=256, show_default=True, help="values at which the survey looks"),
+        click.Option(["--balls"], type=int, default=8, show_default=True, help="starts of the survey at each of them"),
         click.Option(["--impacts"], type=int, default=16, show_default=True, help="most impacts of an orbit"),
         click.Option(["--over"], metavar="NAME=VALUES", help="axis along which to find the best designs"),
         *command.axis_options(**changed),

@@ -47,13 +47,6 @@ def test_the_small_fast_device(found):
     assert abs(best.gradient["omega0"]) < 1e-5
 
 
-def test_only_the_best_of_a_kind_within_reach_climbs():
-    kind = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [0, 1], [0, 2], [1, 1]])
-    step, score = np.array([0, 3, 4, 20, 20, 3, 3]), np.array([1.0, 3.0, 2.0, 5.0, 6.0, 0.0, 0.0])
-    np.testing.assert_array_equal(design._highest(kind, step, score, 4), [1, 4, 5, 6])
-    np.testing.assert_array_equal(design._highest(kind, step, score, 2), [0, 1, 4, 5, 6])
-
-
 def test_the_papers_device_is_held_by_the_penetration_limit(found):
     best = found[1].best
     assert kappa(best) == pytest.approx(64.669, abs=1e-3)

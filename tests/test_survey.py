@@ -19,18 +19,19 @@ def found():
     """Along kappa at d = 0.2, and at d = 0.12, where chaos is; more cells than a tile holds."""
     d, kappa, u0 = (x.ravel() for x in np.broadcast_arrays(*np.ix_([0.2, 0.12], KAPPA, np.linspace(-0.05, 0.05, 9))))
     pair = ImpactPair(d, kappa, np.full(d.size, 0.5), np.zeros(d.size))
-    return pair, survey(pair, u0, np.full(d.size, -0.47898), longest=4, impacts=8, periods=400)
+    ran = survey(pair, u0, np.full(d.size, -0.47898), longest=4, periods=400)
+    return pair, ran, ran.orbits(8)
 
 
 @pytest.fixture(scope="module")
 def orbit(found):
     """The orbits of what was flown."""
-    _, met = found
+    *_, met = found
     return orbits.solve(jax.tree.map(jnp.asarray, met.pair), met.sequence(8), jnp.asarray(met.knots))
 
 
 def test_orbits_are_those_of_a_sweep(found, orbit):
-    pair, met = found
+    pair, _, met = found
     # The only attractor at d = 0.2 from kappa 5 on, mirror images aside: nine starts meet it, it is there once.
     here = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] > KAPPA[7]))
     np.testing.assert_array_equal(pair.kappa[met.cell[here]], KAPPA[8:])
@@ -40,7 +41,7 @@ def test_orbits_are_those_of_a_sweep(found, orbit):
 
 
 def test_attractors_are_flown_as_their_orbits_are_and_stand_at_their_cells(found, orbit):
-    pair, met = found
+    pair, _, met = found
     assert (np.asarray(orbit.status) == Status.OK).all()
     assert (np.abs(np.asarray(orbit.multipliers)).max(axis=1) < 1).all()
     real = met.side != 0
@@ -53,18 +54,38 @@ def test_attractors_are_flown_as_their_orbits_are_and_stand_at_their_cells(found
 
 
 def test_coexisting_attractors_are_met(found, orbit):
-    pair, met = found
+    pair, _, met = found
     many = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] == 3.0))
     power = np.asarray(orbits.power(orbit[many], vijax.Harvester()))
     assert np.unique(np.round(1e9 * power)).size == many.size > 1
 
 
 def test_chaos_has_no_orbit(found):
-    _, met = found
-    swept = vijax.sweep(d=0.12, kappa=KAPPA, u0=np.linspace(-0.05, 0.05, 9), r=0.5, outputs=["period"])
-    chaos = np.flatnonzero(swept["period"].values.ravel() == 0)
+    _, _, met = found
+    chaos = np.flatnonzero(swept_period() == 0)
     assert chaos.size
     assert not np.isin(chaos + KAPPA.size * 9, met.cell).any()
+
+
+def swept_period():
+    return vijax.sweep(d=0.12, kappa=KAPPA, u0=np.linspace(-0.05, 0.05, 9), r=0.5, outputs=["period"])[
+        "period"
+    ].values.ravel()
+
+
+def test_unrest_is_one_motion_of_every_pair_that_has_some(found):
+    pair, ran, met = found
+    motion = ran.unrest(8)
+    chaos = np.flatnonzero(swept_period() == 0) + KAPPA.size * 9
+    assert set(pair.kappa[chaos]) <= set(pair.kappa[motion.cell][pair.d[motion.cell] == 0.12])
+    assert np.unique(np.column_stack([motion.pair.d, motion.pair.kappa]), axis=0).shape[0] == motion.cell.size
+    assert not np.isin(motion.cell, met.cell).any()
+    assert (motion.span == 8).all()
+    # Four periods of each, impact by impact: as many as it has on average, each with what it gives.
+    real = motion.side != 0
+    assert (np.abs(real.sum(axis=1) / 4 - ran.ended.impacts_per_period[motion.cell]) < 1).all()
+    assert (motion.work[real] > 0).all()
+    assert (np.diff(motion.knots[..., 0], axis=1)[real[:, 1:]] > 0).all()
 
 
 def test_clearances_are_those_of_the_motion_in_between(orbit):

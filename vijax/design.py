@@ -1,11 +1,10 @@
 """The best membrane: designs climb, by exact gradients, from the attractors of a coarse survey to admissible optima.
 
-`optimise` is the line: survey of attractors -> starts -> one jitted ascent of all of them -> distinct optima, verified.
+`optimise` is the line: starts -> one jitted ascent of all of them -> distinct optima, verified.
 Where a trial leaves its branch, loses stability or breaks a constraint, it is cut back (`ascent`).
 """
 
 import itertools
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,28 +19,21 @@ from vijax import lanes
 from vijax import objective as aims
 from vijax import orbit as orbits
 from vijax.ascent import Box, Climb, ascend, converged
-from vijax.energy import harvested_energy
 from vijax.method import whole
 from vijax.model import Harvester, Status
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
+from vijax.starts import Effort, Met, find
 from vijax.steady import Steady, steady
-from vijax.survey import Survey, survey
 from vijax.tolerance import Tolerance, check_tolerances, nodes
-from vijax.tuning import check_names, limits, moving, tuned, values, variables
+from vijax.tuning import check_names, limits, tuned, values, variables
 
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
 _WIDTHS = (2, 8)  # impacts that orbits are padded to, those of more to the most there may be
-_LONGEST = 8  # forcing periods of an orbit
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
 _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
-_REACH = 0.49, 0.6  # of the gap that its displacement may take, and its velocity
-_LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities in the survey, in parts of their bounds
-_BESIDE = 256  # parts of the first quantity's bounds: of attractors of a kind the best climbs as far as one away
-_NARROW = 0.8  # of the best start's objective: an orbit of more impacts than 8 that promises less is not climbed
-_HOPELESS = -1e3  # score of a start that breaks a constraint, before what it lacks
 
 
 @dataclass(frozen=True)
@@ -120,8 +112,8 @@ def optimise_all(
     tolerances: Iterable[Tolerance] = (),
     samples: int | None = None,
     looks: int = 60,
-    steps: int = 1024,
-    balls: int = 4,
+    steps: int = 256,
+    balls: int = 8,
     impacts: int = 16,
     periods: int = 200,
 ) -> list[Design]:
@@ -139,8 +131,8 @@ def optimise_all(
         tolerances: How constants scatter, for "mean" and "worst".
         samples: Random devices for these, in place of a quadrature.
         looks: Evaluations of objective with gradient that a start may take.
-        steps: Values of the first quantity at which the survey looks for attractors. More of them meet orbits that live
-            in narrow windows, which may be the best, and take longer.
+        steps: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself, where
+            chaos promises more than the best orbit so far: there the best orbit may live in a narrow window.
         balls: Starts from which it looks at each of them; more meet attractors with small basins.
         impacts: Of an orbit, at most: longer ones are not looked for. Fewer are compiled and climb faster.
         periods: Forcing periods that each of them may take.
@@ -153,12 +145,11 @@ def optimise_all(
     """
     devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
     looks, impacts = whole("looks", looks, 2), whole("impacts", impacts, 1)
-    effort = _Effort(whole("steps", steps, 2), whole("balls", balls, 1), impacts, whole("periods", periods, 1))
+    effort = Effort(whole("steps", steps, 2), whole("balls", balls, 1), impacts, whole("periods", periods, 1))
     box = check(devices, tune, bounds or {}, objective, scatter)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    met = _survey(devices, tune, box, effort)
-    starts = met.some(_promising(met, objective, max(1, effort.steps // _BESIDE)))
+    starts, met = find(devices, tune, box, objective, effort)
     ends = _climbed(scene, starts, box, looks)
     optima = _optima(scene, starts, ends, devices, looks)
     return [
@@ -168,7 +159,7 @@ def optimise_all(
             bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, box[owner])).T.tolist()), strict=True)),
             objective=objective,
             tolerances=scatter,
-            attractors=int((met.owner == owner).sum()),
+            attractors=int(met[owner]),
             starts=int((starts.owner == owner).sum()),
         )
         for owner in range(len(devices))
@@ -237,109 +228,6 @@ def check(
     return np.array([variables(tune, limits(tune, bounds, device)) for device in devices])
 
 
-class _Met(NamedTuple):
-    """Attractors on the way: as flown, the device with what was tuned there, the variables; where they were met.
-
-    Attributes:
-        owner: Which of the devices given.
-        level, step: Of the survey's values of the first quantity, and of all others together.
-        device: Leaves [attractor].
-    """
-
-    flown: Survey
-    device: Harvester
-    z: np.ndarray
-    owner: np.ndarray
-    level: np.ndarray
-    step: np.ndarray
-
-    def some(self, index: np.ndarray) -> "_Met":
-        """Those with the given indices."""
-        return jax.tree.map(lambda x: x[index], self)
-
-
-class _Effort(NamedTuple):
-    """Of a survey: values of the first quantity, starts at each, most impacts of an orbit, periods of a start."""
-
-    steps: int
-    balls: int
-    impacts: int
-    periods: int
-
-
-def _survey(devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: _Effort) -> _Met:
-    """The attractors of every device, along the first quantity that moves the ball at levels of the others."""
-    first = next((i for i, name in enumerate(tune) if moving(name)), None)
-    sides = [(0.5,) if i == first or not moving(name) else _LEVELS for i, name in enumerate(tune)]
-    levels, steps = np.array(list(itertools.product(*sides))), effort.steps if first is not None else 1
-    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
-    parts = levels[level]
-    if first is not None:
-        parts[:, first] = step / (steps - 1)
-    low, high = box[owner].swapaxes(0, 1)
-    z = low + parts * (high - low)
-    given = jax.tree.map(lambda *x: np.array(x, float)[owner], *devices)
-    every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(given, z)
-    pair = jax.tree.map(np.asarray, jax.vmap(lambda device: device.pair())(every))
-    # The same for every device: designs of one do not depend on the others.
-    draw = np.random.default_rng(0).uniform(-1, 1, (2, owner.size // len(devices)))
-    u0, v0 = (reach * np.tile(x, len(devices)) for reach, x in zip(_REACH, draw, strict=True))
-    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, impacts=effort.impacts, periods=effort.periods)
-    own = jax.tree.map(lambda x: np.asarray(x)[found.cell], every)
-    return _Met(found, own, *(x[found.cell] for x in (z, owner, level, step)))
-
-
-def _promising(met: _Met, objective: str, reach: int) -> np.ndarray:
-    """Indices of the attractors to climb from: the best of their kind as far as so many steps away.
-
-    A kind is given by span and impacts; the walls may change places where the tube is level.
-    """
-    counts, score = _impacts(met.flown), _score(met, objective)
-    found = _highest(np.column_stack([met.owner, met.level, met.flown.span, *counts]), met.step, score, reach)
-    # Orbits of many impacts live in narrow windows, where no climb leads far.
-    most = np.full(met.owner.max(initial=-1) + 1, -np.inf)
-    np.maximum.at(most, met.owner[found], score[found])
-    few = np.add(*counts)[found] <= _WIDTHS[-1]
-    return found[few | (score[found] > most[met.owner[found]] + math.log(_NARROW))]
-
-
-def _highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) -> np.ndarray:
-    """Indices of the rows that none of their group beats within so many steps; of one step's rows the first best."""
-    order = np.lexsort((-score, step, *group.T[::-1]))
-    place = np.column_stack([group, step])[order]
-    new = np.append(True, (np.diff(place, axis=0) != 0).any(axis=1))
-    best, place = order[new], place[new]
-    height, top = score[best], np.ones(best.size, bool)
-    for ahead in range(1, reach + 1):
-        apart = place[ahead:] - place[:-ahead]
-        near = (apart[:, :-1] == 0).all(axis=1) & (apart[:, -1] <= reach)
-        top[:-ahead] &= ~near | (height[:-ahead] >= height[ahead:])
-        top[ahead:] &= ~near | (height[ahead:] >= height[:-ahead])
-    return np.sort(best[top])
-
-
-def _impacts(flown: Survey) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right impacts of attractors; in a level tube the more and the fewer."""
-    left, right = ((flown.side == side).sum(axis=1) for side in (-1, 1))
-    swap = (flown.pair.gamma == 0) & (right > left)
-    return np.where(swap, right, left), np.where(swap, left, right)
-
-
-def _score(met: _Met, objective: str) -> np.ndarray:
-    """What an attractor promises: the logarithm of the objective; far below where a constraint is broken."""
-    device, flown = met.device, met.flown
-    deep = flown.depth * np.asarray(device.length_unit)[:, None]
-    gained = np.asarray(jax.vmap(harvested_energy)(device, jnp.asarray(deep)))
-    given = flown.work * np.asarray(device.m_b * device.speed_unit**2)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        lacks = np.minimum(np.log(given / gained), np.log(np.asarray(device.depth_limit)[:, None] / deep))
-    lacks = np.nanmin(lacks, axis=1, initial=0.0)
-    value = np.nansum(gained, axis=1) / flown.span
-    if objective == "speed":
-        value = flown.knots[..., 1].max(axis=1)
-    return np.where(lacks < 0, _HOPELESS + lacks, np.log(value))
-
-
 @lru_cache(maxsize=8)
 def _compiled(looks: int):
     def climb(scene: Scene, batch: Batch) -> Climb:
@@ -364,9 +252,9 @@ class _End(NamedTuple):
     heights: np.ndarray
 
 
-def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_End]:
+def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[_End]:
     """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
-    count, work = np.add(*_impacts(starts.flown)), _compiled(looks)
+    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(looks)
     ends: list[_End | None] = [None] * count.size
 
     def part(some: np.ndarray, width: int, tile: lanes.Tile) -> None:
@@ -404,7 +292,7 @@ def _climbed(scene: Scene, starts: _Met, box: np.ndarray, looks: int) -> list[_E
     return [end for end in ends if end is not None]
 
 
-def _optima(scene: Scene, starts: _Met, ends: list[_End], devices: list[Harvester], looks: int) -> list[list[Optimum]]:
+def _optima(scene: Scene, starts: Met, ends: list[_End], devices: list[Harvester], looks: int) -> list[list[Optimum]]:
     """What was reached for every device: admissible, verified, each optimum once, the best first."""
     owner = starts.owner
     good = [i for i, end in enumerate(ends) if end.margins.min() >= 0 and np.isfinite(end.height)]

@@ -1,4 +1,4 @@
-"""Which periodic attractors many cells meet: where designs set out from."""
+"""Which attractors many cells meet, impact by impact."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -15,17 +15,18 @@ from vijax.record import record
 from vijax.shooting import Sequence
 
 _SMALLEST_TILE, _LARGEST_TILE = 512, 8192  # cells of a call
+_SETTLED = Status.OK, Status.STICKING
 _SAME = 1e-6  # relative difference within which attractors of one pair are the same; see `attractor`
 
 
-class Survey(NamedTuple):
-    """Attractors as they were flown, in the order of the cells that met them first; `orbit.solve` makes orbits of them.
+class Flown(NamedTuple):
+    """Motions as they were flown, in the order of the cells that met them first.
 
     Attributes:
-        pair: Parameters of each [attractor].
-        side, knots: Its impacts, [attractor, impact], padded with side 0 and zeros; see `Orbit`.
-        span: Time after which it closes.
-        depth, work: Largest penetration and energy given to the membrane (per unit mass) of each; NaN beyond.
+        pair: Parameters of each [motion].
+        side, knots: Its impacts, [motion, impact], padded with side 0 and zeros; see `Orbit`.
+        span: Time after which an orbit closes; how long another motion was looked at.
+        depth, work: Largest penetration and energy given to the membrane (per unit mass) of each impact; NaN beyond.
         cell: Which one met it first.
     """
 
@@ -38,33 +39,65 @@ class Survey(NamedTuple):
     cell: np.ndarray
 
     def sequence(self, width: int) -> Sequence:
-        """Walls and closing of all, of so many impacts."""
+        """Walls and closing of all orbits, of so many impacts: with the knots what `orbit.solve` takes."""
         return Sequence(jnp.asarray(self.side[:, :width]), jnp.asarray(self.span), jnp.zeros(self.span.size, bool))
 
 
-def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, impacts: int, periods: int) -> Survey:
-    """The periodic attractors of cells; of cells that differ in their starts alone each one once.
+class Survey(NamedTuple):
+    """How cells ended.
+
+    Attributes:
+        pair: The cells.
+        ended: A `Summary` of each.
+        longest: Most forcing periods of an orbit that is wanted.
+    """
+
+    pair: ImpactPair
+    ended: Any
+    longest: int
+
+    def orbits(self, impacts: int) -> Flown:
+        """The periodic attractors of at most so many impacts, of mirror images on level ground one.
+
+        Of cells that differ in their starts alone each one once.
+        """
+        some = np.flatnonzero(self._closing(impacts))
+        own, ended = jax.tree.map(lambda x: x[some], (self.pair, self.ended))
+        once = _distinct(own, ended)
+        own, ended = jax.tree.map(lambda x: x[once], (own, ended))
+        # A period more, lest rounding moves an impact at phase 0 out of it.
+        table = _recorded(own, ended.handover, ended.period + 1, impacts)
+        count = ended.impacts_left + ended.impacts_right
+        return _flown(own, 2.0 * ended.period, table, np.arange(impacts) < count[:, None], some[once])
+
+    def unrest(self, impacts: int) -> Flown:
+        """What is no such orbit: chaos, and what is not settled or too long; one motion of every pair."""
+        going = np.isin(self.ended.status, (*_SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
+        some = np.flatnonzero(going & ~self._closing(impacts))
+        _, first = np.unique(np.column_stack(jax.tree.leaves(self.pair))[some], axis=0, return_index=True)
+        some = some[np.sort(first)]
+        own, handover = jax.tree.map(lambda x: x[some], (self.pair, self.ended.handover))
+        table = _recorded(own, handover, np.full(some.size, self.longest), None)
+        return _flown(own, np.full(some.size, 2.0 * self.longest), table, np.isfinite(table["n"]), some)
+
+    def _closing(self, impacts: int) -> np.ndarray:
+        """Which cells ended on an orbit that is wanted."""
+        ended, count = self.ended, self.ended.impacts_left + self.ended.impacts_right
+        some = (ended.period > 0) & (ended.period <= self.longest) & (count > 0) & (count <= impacts)
+        return np.isin(ended.status, _SETTLED) & some
+
+
+def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, periods: int) -> Survey:
+    """Run soft cells until their attractors are certain.
 
     Args:
-        pair: Cells [cell], soft.
+        pair: Cells [cell].
         u0, v0: Where each starts, at phase 0.
-        longest, impacts: Most forcing periods, and most impacts, of an orbit that is wanted.
+        longest: Most forcing periods of an orbit that will be wanted.
         periods: Forcing periods that the search for an attractor may take.
-
-    Returns:
-        Attractors, of mirror images on level ground one; aperiodic and silent cells, and longer orbits, have none.
     """
     pair = jax.tree.map(np.asarray, pair)
-    ended = _ended(pair, (u0, v0), longest, periods)
-    count = ended.impacts_left + ended.impacts_right
-    fine = np.isin(ended.status, (Status.OK, Status.STICKING)) & (ended.period > 0) & (ended.period <= longest)
-    some = np.flatnonzero(fine & (count > 0) & (count <= impacts))
-    own, ended = jax.tree.map(lambda x: x[some], (pair, ended))
-    once = _distinct(own, ended)
-    cell = some[once]
-    own, ended = jax.tree.map(lambda x: x[once], (own, ended))
-    flown = _recorded(own, ended, impacts)
-    return Survey(pair=own, span=2.0 * ended.period, cell=cell, **flown)
+    return Survey(pair, _ended(pair, (u0, v0), longest, periods), longest)
 
 
 def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int, periods: int) -> Any:
@@ -97,29 +130,42 @@ def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
     return np.sort(first)
 
 
-def _recorded(pair: ImpactPair, ended: Any, impacts: int) -> dict[str, np.ndarray]:
-    """Walls, knots, depths and works of the last impacts of cells."""
-    u, v, t, n, held = jax.tree.leaves((ended.handover.mark, ended.handover.held))
+_COLUMNS = "n", "t", "side", "v_in", "duration", "depth", "work"
+
+
+def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int | None) -> dict[str, np.ndarray]:
+    """The first impacts of the last periods of cells by name, [cell, impact], NaN beyond; all unless so many."""
+    u, v, t, n, held = jax.tree.leaves((handover.mark, handover.held))
     mark = State(u, v, t, n.astype(np.int32), held.astype(np.int32))
-    table = {
-        name: np.full((u.size, impacts), np.nan) for name in ("n", "t", "side", "v_in", "duration", "depth", "work")
-    }
 
-    def part(rows: np.ndarray) -> None:
+    def part(rows: np.ndarray) -> dict[str, np.ndarray]:
         own, at = jax.tree.map(lambda x: x[rows], (pair, mark))
-        flown = record(own, at, int(ended.period[rows[0]]), np.ones(rows.size, bool)).impacts
-        for name, column in table.items():
-            width = min(flown[name].shape[1], impacts)
-            column[rows, :width] = flown[name][:, :width]
+        return record(own, at, int(periods[rows[0]]), np.ones(rows.size, bool)).impacts
 
-    alike = [np.flatnonzero(ended.period == period) for period in np.unique(ended.period)]
+    alike = [np.flatnonzero(periods == number) for number in np.unique(periods)]
     parts = [rows for some in alike for rows in np.array_split(some, min(workers(), some.size))]
     with ThreadPoolExecutor(workers()) as pool:
-        list(pool.map(part, parts))
-    real = np.arange(impacts) < (ended.impacts_left + ended.impacts_right)[:, None]
+        found = list(pool.map(part, parts))
+    width = max((one["n"].shape[1] for one in found), default=0) if impacts is None else impacts
+    table = {name: np.full((u.size, width), np.nan) for name in _COLUMNS}
+    for rows, one in zip(parts, found, strict=True):
+        for name, column in table.items():
+            some = one[name][:, :width]
+            column[rows, : some.shape[1]] = some
+    return table
+
+
+def _flown(
+    pair: ImpactPair, span: np.ndarray, table: dict[str, np.ndarray], real: np.ndarray, cell: np.ndarray
+) -> Flown:
+    """Motions from the table of their impacts, of which some are meant."""
     knots = np.stack([2 * table["n"] + table["t"], np.abs(table["v_in"]), table["duration"]], axis=-1)
-    return {
-        "side": np.where(real, table["side"], 0).astype(np.int32),
-        "knots": np.where(real[..., None], knots, 0.0),
-        **{name: np.where(real, table[name], np.nan) for name in ("depth", "work")},
-    }
+    return Flown(
+        pair=pair,
+        side=np.where(real, table["side"], 0).astype(np.int32),
+        knots=np.where(real[..., None], knots, 0.0),
+        span=span,
+        depth=np.where(real, table["depth"], np.nan),
+        work=np.where(real, table["work"], np.nan),
+        cell=cell,
+    )

@@ -1,0 +1,69 @@
+"""Designs set out from the best of every kind, from narrow windows in chaos, and from orbits just beyond a limit."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from vijax import design, starts
+from vijax.model import Harvester
+from vijax.starts import Effort
+
+
+def device(d, r, A, omega):
+    unit = Harvester(A=A, omega=omega, r=r)
+    return dataclasses.replace(unit, s=d * unit.length_unit)
+
+
+# Their best orbits by a scan of 2,000 kappa: 3:3/2T from kappa 22.83 to 22.95 in chaos; 4:7/4T, within the penetration
+# limit from kappa 51.8 on, to its flip soon after.
+IN_CHAOS = device(0.073195, 0.854762, 2.460536, 9.218106)
+BEYOND = device(0.123487, 0.510445, 2.045754, 4.755139)
+
+
+def found(given, low, high, steps, balls):
+    """What `find` finds between two kappa: the starts, their kinds (period, more and fewer impacts), their kappa."""
+    bounds = {"kappa": (low, high)}
+    box = design.check([given], ("kappa",), bounds, "P", ())
+    met, count = starts.find([given], ("kappa",), box, "P", Effort(steps, balls, 16, 200))
+    left, right = ((met.flown.side == side).sum(axis=1) for side in (-1, 1))
+    kinds = np.column_stack([met.flown.span / 2, np.maximum(left, right), np.minimum(left, right)]).astype(int)
+    assert count[0] >= len(kinds)
+    return met, kinds, np.asarray(met.flown.pair.kappa)
+
+
+def test_a_narrow_window_in_chaos_is_met():
+    low, high, steps = 20.0, 26.0, 8
+    assert not ((np.geomspace(low, high, steps) > 22.8) & (np.geomspace(low, high, steps) < 23)).any()
+    _, kinds, kappa = found(IN_CHAOS, low, high, steps, 8)
+    window = (kinds == (2, 3, 3)).all(axis=1)
+    assert (np.abs(kappa[window] - 22.89) < 0.07).any()
+
+
+def test_a_long_orbit_just_beyond_a_limit_is_climbed_from():
+    met, kinds, kappa = found(BEYOND, 48.5, 64.0, 5, 4)
+    depth = np.nanmax(met.flown.depth, axis=1) * BEYOND.length_unit / BEYOND.depth_limit
+    long = (kinds == (4, 7, 4)).all(axis=1)
+    assert (long & (depth > 1)).any()
+    assert (depth[~long] < 1).any()
+    assert (kappa[long] < 51.9).all()
+
+
+@pytest.mark.parametrize(("reach", "chosen"), [(4, [1, 4, 5, 6]), (2, [0, 1, 4, 5, 6])])
+def test_only_the_best_of_a_kind_within_reach_climbs(reach, chosen):
+    kind = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [0, 1], [0, 2], [1, 1]])
+    step, score = np.array([0, 3, 4, 20, 20, 3, 3]), np.array([1.0, 3.0, 2.0, 5.0, 6.0, 0.0, 0.0])
+    np.testing.assert_array_equal(starts.highest(kind, step, score, reach), chosen)
+
+
+def test_designs_of_one_device_do_not_depend_on_the_others():
+    def of(devices):
+        box = design.check(devices, ("kappa",), {"kappa": (20.0, 26.0)}, "P", ())
+        met, count = starts.find(devices, ("kappa",), box, "P", Effort(8, 4, 16, 200))
+        own = met.owner == len(devices) - 1
+        return np.asarray(met.flown.pair.kappa)[own], met.flown.knots[own], count[-1]
+
+    alone, beside = of([IN_CHAOS]), of([BEYOND, IN_CHAOS])
+    assert len(alone[0])
+    for one, other in zip(alone, beside, strict=True):
+        np.testing.assert_array_equal(one, other)
