@@ -219,45 +219,68 @@ def first_return(
     return jnp.where(found.running, jnp.nan, jnp.where(found.bracketed, exact, found.s))
 
 
-def deepest_time(
-    m: Membrane, force: Force, w0: Scalar, z0: Scalar, end: Scalar, wanted: Flag, patience: int | Array = PATIENCE
-) -> Scalar:
-    """When w is largest on [0, end]: every extremum is visited (they are zeros of w', which obeys the same equation).
+class _Visit(eqx.Module):
+    """A contact on its way: the exit first, then every extremum of w up to it, in order; s is the last one's time."""
 
-    Once the oscillation has decayed to rounding, what remains is the steady response, whose crest is known. NaN if
-    `patience` extrema do not get there.
+    number: Array
+    exit: Scalar
+    s: Scalar
+    sign: Scalar  # of w' just after s
+    crest: Scalar
+    highest: Scalar
+    going: Flag
+    lost: Flag
+
+
+def exit_and_crest(
+    m: Membrane, force: Force, w0: Scalar, z0: Scalar, wanted: Flag, patience: int | Array = PATIENCE
+) -> tuple[Scalar, Scalar]:
+    """The first return of w to zero (see `first_return`), and when w is largest before.
+
+    Every extremum is visited: they are zeros of w', which obeys the same equation, so that one compiled search finds
+    them and the exit. Once the oscillation has decayed to rounding, what remains is the steady response, whose crest is
+    known. NaN for the crest if `patience` extrema do not get there, or if there is no telling the exit.
     """
     steady = flow.steady_response(m, force)
     eps = jnp.finfo(w0.dtype).eps
     slope = force.slope()
-    zero = jnp.zeros_like(w0)
-
-    def visit(carry):
-        """From s, where sign w' is about to be positive (sign = +1: w rises), on to the next zero of w'."""
-        cycle, s, sign, best, best_w, _, _ = carry
-        w, z = flow.oscillate(m, force, w0, z0, s)
-        settled = _amplitude(m, steady, w, z, s) <= eps * (jnp.abs(steady.c) + jnp.abs(steady.q) + jnp.abs(w))
-        better = (w > best_w) & (s > 0)
-        best, best_w = jnp.where(better, s, best), jnp.where(better, w, best_w)
-        going = wanted & ~settled
-        rate = force.later(s).at(zero) - m.mu * z - m.kappa * m.kappa * w
-        jerk = slope.later(s)
-        jerk = Force(sign * jerk.c, sign * jerk.q, sign * jerk.g)
-        z = jnp.where(s == 0, z, 0.0)  # at an extremum w' is zero, not its rounding error
-        ahead = s + first_return(m, jerk, sign * z, sign * rate, going, patience, end - s)
-        lost = going & jnp.isnan(ahead)
-        going = going & (ahead < end)
-        return cycle + 1, jnp.where(going, ahead, s), -sign, best, best_w, going, lost
-
+    zero, no = jnp.zeros_like(w0), jnp.zeros_like(wanted)
     # A start at rest or already falling inside the wall is deepest where it begins.
     rising = (z0 > 0) | ((z0 == 0) & (force.at(zero) > m.kappa * m.kappa * w0))
-    start = (jnp.int32(0), zero, jnp.ones_like(w0), zero, w0, wanted & rising, jnp.zeros_like(wanted))
-    _, _, _, best, best_w, left, lost = lax.while_loop(lambda c: c[5] & (c[0] < patience), visit, start)
-    crest = -jnp.arctan2(steady.q, steady.c) / PI
-    crest = jnp.where(crest < 0, crest + 2, crest)
-    known = jnp.isfinite(crest) & (crest < end)
-    w, _ = flow.oscillate(m, force, w0, z0, jnp.where(known, crest, 0.0))
-    return jnp.where(left | lost, jnp.nan, jnp.where(known & (w > best_w), crest, best))
+
+    def visit(v: _Visit) -> _Visit:
+        first, s = v.number == 0, v.s
+        w, z = flow.oscillate(m, force, w0, z0, s)
+        settled = _amplitude(m, steady, w, z, s) <= eps * (jnp.abs(steady.c) + jnp.abs(steady.q) + jnp.abs(w))
+        better = (w > v.highest) & (s > 0)
+        seeking = v.going & (first | ~settled)
+        rate = force.later(s).at(zero) - m.mu * z - m.kappa * m.kappa * w
+        z = jnp.where(s == 0, z, 0.0)  # at an extremum w' is zero, not its rounding error
+        later = slope.later(s)
+        sought = jax.tree.map(lambda x, slope: jnp.where(first, x, v.sign * slope), (force, w0, z0), (later, z, rate))
+        limit = jnp.where(first, jnp.inf, v.exit - s)
+        ahead = s + first_return(m, *sought, seeking, patience, limit)
+        lost = seeking & jnp.isnan(ahead)
+        going = jnp.where(first, seeking & rising & ~lost, seeking & (ahead < v.exit))
+        return _Visit(
+            number=v.number + 1,
+            exit=jnp.where(first, ahead, v.exit),
+            s=jnp.where(going & ~first, ahead, s),
+            sign=jnp.where(first, v.sign, -v.sign),
+            crest=jnp.where(better, s, v.crest),
+            highest=jnp.where(better, w, v.highest),
+            going=going,
+            lost=lost,
+        )
+
+    start = _Visit(jnp.int32(0), zero, zero, jnp.ones_like(w0), zero, w0, wanted, no)
+    seen = lax.while_loop(lambda v: v.going & (v.number <= patience), visit, start)
+    known = -jnp.arctan2(steady.q, steady.c) / PI
+    known = jnp.where(known < 0, known + 2, known)
+    there = jnp.isfinite(known) & (known < seen.exit)
+    w, _ = flow.oscillate(m, force, w0, z0, jnp.where(there, known, 0.0))
+    crest = jnp.where(there & (w > seen.highest), known, seen.crest)
+    return seen.exit, jnp.where(seen.going | seen.lost, jnp.nan, crest)
 
 
 # --- the next wall crossing of a flight -----------------------------------------------------------
@@ -361,13 +384,15 @@ def _soft_contact(
     force = flow.contact_force(pair.gamma, side, t)
     args = (wall, force, w0, z0)
     frozen = lax.stop_gradient(args)
-    duration = first_return(*frozen, wanted, patience)
+    if deep:
+        duration, when = exit_and_crest(*frozen, wanted, patience)
+    else:
+        duration, when = first_return(*frozen, wanted, patience), jnp.zeros_like(t)
     ends = wanted & jnp.isfinite(duration)
     duration = jnp.where(ends, implicit_root(_penetration, jnp.where(ends, duration, 1.0), args), duration)
     _, z = flow.oscillate(*args, jnp.where(ends, duration, 0.0))
     if not deep:
         return duration, -z, jnp.full_like(z, jnp.nan)
-    when = deepest_time(*frozen, lax.stop_gradient(jnp.where(jnp.isnan(duration), 0.0, duration)), wanted, patience)
     turned = wanted & (when > 0)
     when = jnp.where(turned, implicit_root(_penetration_rate, jnp.where(turned, when, 1.0), args), when)
     depth, _ = flow.oscillate(*args, when)

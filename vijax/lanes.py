@@ -248,9 +248,10 @@ def run(
         queue = lax.while_loop(to_refill, refill, queue)
         return queue._replace(carry=round_trip(queue.cell, queue.carry))
 
-    # Every cell is loaded by `refill`, the first ones too: another compiled copy of `load` may round otherwise.
+    # Every cell is loaded by `refill`, the first ones too; until then its lane holds zeros.
+    fresh = jax.eval_shape(program.load, jax.ShapeDtypeStruct((lanes, cells.shape[1]), cells.dtype))
     queue = _Queue(
-        carry=program.load(jnp.broadcast_to(cells[0], (lanes, cells.shape[1]))),
+        carry=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh),
         cell=jnp.full(lanes, -1, jnp.int32),
         waiting=jnp.asarray(0, jnp.int32),
         results=jnp.zeros((cells.shape[0], outputs), cells.dtype),
