@@ -97,10 +97,11 @@ def _plan(
 
 
 def _check_picture(path: Path, planned: "Plan") -> None:
-    from vijax import plot as pictures
+    from vijax.panels import layout_of_kinds
+    from vijax.style import check_format
 
-    pictures.check_format(path)
-    pictures.layout_of_kinds({dim: size for dim, size in planned.cells.sizes.items() if dim != "start"})
+    check_format(path)
+    layout_of_kinds({dim: size for dim, size in planned.cells.sizes.items() if dim != "start"})
 
 
 def _draw(dataset: "xr.Dataset", path: Path) -> None:

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,6 +164,11 @@ def keep_compiled() -> None:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(cache / "vijax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def import_beside(module: str) -> None:
+    """Import what will be wanted at the end while XLA compiles or loads, which needs no Python."""
+    threading.Thread(target=import_module, args=(module,), daemon=True).start()
 
 
 @contextmanager

@@ -118,6 +118,8 @@ def power_map(
         if compare is None and out is not None:
             _check_store(planned, out, overwrite)
     keep_compiled()
+    if plot is not None:
+        command.import_beside("vijax.plot")
     dataset, pace = _run(planned, out, overwrite, crew)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
     kept = compare is None
@@ -211,20 +213,20 @@ def _membrane(name: str | None, chi: float | None, exponent: float | None) -> An
 
 
 def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
-    from vijax import plot as pictures
+    from vijax import panels
     from vijax.compare import Comparison
     from vijax.style import check_format
 
     check_format(path)
     if isinstance(planned, Comparison):
-        pictures.layout(planned.soft.cells.sizes)
+        panels.layout(planned.soft.cells.sizes)
         return
     sizes = planned.cells.sizes
     if show == "label":
-        pictures.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
+        panels.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
     else:
-        pictures.layout(sizes)
-    needs = pictures.LABEL_NEEDS if show == "label" else pictures.NEEDS
+        panels.layout(sizes)
+    needs = panels.LABEL_NEEDS if show == "label" else panels.NEEDS
     missing = [name for name in needs if name not in planned.outputs]
     if missing:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")

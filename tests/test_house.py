@@ -126,7 +126,8 @@ ROOMS: dict[str, set[str]] = {
     "report": {"model", "energy", "design", "objective", "surroundings", "tolerance", "tuning"},
     "chart": {"store", "style"},
     "blueprint": {"report", "store", "style", "tuning"},
-    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style"},
+    "panels": set(),
+    "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style", "panels"},
 }
 ROOMS["__init__"] = set(ROOMS)
 

@@ -10,6 +10,7 @@ from vijax import plot
 from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.model import Status
+from vijax.panels import layout
 
 SYMBOLS = {
     "d": ("d", "1"),
@@ -63,7 +64,7 @@ def words(figure) -> str:
     ],
 )
 def test_layout(sizes, panels):
-    assert plot.layout(sizes) == panels
+    assert layout(sizes) == panels
 
 
 @pytest.mark.parametrize(
@@ -77,7 +78,7 @@ def test_layout(sizes, panels):
 )
 def test_what_no_picture_holds_says_what_to_fix(sizes, say):
     with pytest.raises(ValueError, match=say):
-        plot.layout(sizes)
+        layout(sizes)
 
 
 def test_power_map_explains_itself(tmp_path):

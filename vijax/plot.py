@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -20,15 +20,12 @@ from matplotlib.ticker import EngFormatter
 from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.label import label
+from vijax.panels import LABEL_NEEDS, NEEDS, layout, layout_of_kinds
 from vijax.store import replacing
 from vijax.style import STYLE, axis_label, check_format, equations, title
 
 if TYPE_CHECKING:
     import xarray as xr
-
-NEEDS = ("P", "period", "admissible")
-LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
-MOST_PANELS = 36
 
 # A wider scale would say more about its faintest cells than about those worth building.
 _DECADES = 4
@@ -61,37 +58,6 @@ _NO_ORBIT = {
 }
 _GREYS = LinearSegmentedColormap.from_list("greys", ["0.8", "black"])
 _VEIL: dict[str, Any] = {"facecolor": (1, 1, 1, 0.55), "edgecolor": "0.3", "hatch": "/////", "linewidth": 0}
-
-
-def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
-    """Rows and columns of panels for a map whose dimensions are, in order, x, y, columns and rows.
-
-    Args:
-        sizes: Length of every dimension of P; those of length one are not drawn.
-
-    Raises:
-        ValueError: If no picture can be made of it: why, and what to take away.
-    """
-    drawn = {dim: size for dim, size in sizes.items() if size > 1}
-    if not drawn:
-        raise ValueError("plot must have an axis of more than one value; got a single cell")
-    if len(drawn) > 4:
-        raise ValueError(f"plot must have at most 4 axes; got {', '.join(drawn)}; keep some of them at one value")
-    panels = dict(itertools.islice(drawn.items(), 2, None))
-    count = math.prod(panels.values())
-    if count > MOST_PANELS:
-        got = " x ".join(f"{size} values of {dim}" for dim, size in panels.items())
-        raise ValueError(f"plot must have at most {MOST_PANELS} panels; got {got}; give the two longest axes first")
-    columns = min(count, 3) if len(panels) < 2 else next(iter(panels.values()))
-    return math.ceil(count / columns), columns
-
-
-def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
-    """`layout` for a map of labels or basins, which a curve cannot show."""
-    drawn = [dim for dim, size in sizes.items() if size > 1]
-    if len(drawn) == 1:
-        raise ValueError(f"plot must have two axes of more than one value; got {drawn[0]} alone")
-    return layout(sizes)
 
 
 class _Mark(NamedTuple):
