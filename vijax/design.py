@@ -29,7 +29,7 @@ from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, tuned, values, variables
 
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
-_WIDTHS = (2, 8)  # impacts that orbits are padded to, those of more to the most there may be
+_WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
 _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
