@@ -10,15 +10,17 @@ import math
 import command
 import design as script
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import vijax
-from vijax import design
+from vijax import design, objective
 from vijax import surroundings as around
 from vijax.model import Harvester, Status
+from vijax.objective import Batch, Scene
 from vijax.store import write_json
-from vijax.tolerance import Tolerance
+from vijax.tolerance import Tolerance, nodes
 
 FAST = Harvester(A=3.0, omega=10 * math.pi, V=1700.0)
 FAST = dataclasses.replace(FAST, s=0.2 * FAST.length_unit)
@@ -45,6 +47,24 @@ def test_the_small_fast_device(found):
     assert float(best.state.multiplier) == pytest.approx(0.533, abs=1e-3)
     assert (best.stopped, best.active, best.label) == ("maximum", (), "1:1")
     assert abs(best.gradient["omega0"]) < 1e-5
+
+
+def test_a_device_that_loses_its_orbit_does_not_widen_the_margins(found):
+    best = found[0].best
+    cloud, none = nodes((Tolerance("omega0", 0.05),), None), jnp.zeros((1, 1))
+    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), ("omega0",), cloud.names, "mean")
+    device = jax.tree.map(lambda x: jnp.array([x], float), best.device)
+    here = jnp.log(jnp.array([[best.values["omega0"]]]))
+    batch = Batch(device, best.orbit.sequence, best.orbit.knots, here, none, none)
+    # A device 5 % softer than this one is beyond the fold.
+    beside = here + math.log(3.8 / KAPPA)
+    seen = jax.jit(objective.look)(scene, batch, beside, here, objective.begin(scene, batch))
+    kept = np.asarray(seen.memory.there)[0]
+    margins = np.asarray(seen.margins).reshape(kept.size, -1)
+    assert kept[0]
+    assert not kept.all()
+    np.testing.assert_array_equal(margins[~kept], np.broadcast_to(margins[0], margins[~kept].shape))
+    assert (margins[kept] != margins[0]).any()
 
 
 def test_the_papers_device_is_held_by_the_penetration_limit(found):

@@ -140,12 +140,15 @@ def look(scene: Scene, batch: Batch, z, near, known: Known) -> Look:
         value, share = jax.nn.logsumexp(parts, axis=1), jax.nn.softmax(parts, axis=1)
         there = fine[:, 0]
     rise = jnp.where((fine & counts)[..., None], slopes.value, 0.0)
+    # A lost device is held as the nominal one is: wide margins would make the barrier reward the loss.
+    margins = jnp.where(fine[..., None], seen.margins, seen.margins[:, :1])
+    steep = jnp.where(fine[..., None, None], slopes.margins, slopes.margins[:, :1])
     flat = (z.shape[0], -1)
     return Look(
         value=value,
         gradient=(share[..., None] * rise).sum(axis=1),
-        margins=jnp.where(fine[..., None], seen.margins, _MOST).reshape(flat),
-        slopes=jnp.where(fine[..., None, None], slopes.margins, 0.0).reshape(*flat, z.shape[1]),
+        margins=margins.reshape(flat),
+        slopes=steep.reshape(*flat, z.shape[1]),
         there=there & jnp.isfinite(value),
         memory=Known(seen.knots, slopes.knots, fine),
     )
