@@ -4,6 +4,7 @@ import json
 import logging
 import subprocess
 import sys
+import threading
 import warnings
 from pathlib import Path
 
@@ -53,8 +54,13 @@ def stopped_after(cells, out, **axes):
         if done >= cells:
             raise Stop
 
+    before = set(threading.enumerate())
     with pytest.raises(Stop):
         sweep(**axes, out=out, progress=stop)
+    # Tiles that run end by themselves, which is soon.
+    for thread in set(threading.enumerate()) - before:
+        if thread.name.startswith("ThreadPoolExecutor"):
+            thread.join(timeout=60)
 
 
 def records(out) -> list[Path]:
