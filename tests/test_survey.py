@@ -1,5 +1,7 @@
 """A survey finds the attractors that a sweep finds, as verified orbits, and leaves out what is none."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,6 +69,7 @@ def test_chaos_has_no_orbit(found):
     assert not np.isin(chaos + KAPPA.size * 9, met.cell).any()
 
 
+@functools.cache
 def swept_period():
     return vijax.sweep(d=0.12, kappa=KAPPA, u0=np.linspace(-0.05, 0.05, 9), r=0.5, outputs=["period"])[
         "period"
