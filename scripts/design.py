@@ -79,7 +79,7 @@ def design(
     **given: Any,
 ) -> None:
     """Find the membrane, and what else is tuned, that harvests most and can be built."""
-    from vijax import blueprint, method, report
+    from vijax import blueprint, report, starts
     from vijax import design as designs
     from vijax.store import write_json
     from vijax.style import check_format
@@ -94,18 +94,21 @@ def design(
         within = _bounds(bounds)
         weighed = scatter if objective in _OVER_TOLERANCES else ()
         designs.check(devices, names, within, objective, weighed)
-        effort = {
-            "steps": method.whole("steps", steps, 2),
-            "balls": method.whole("balls", balls, 1),
-            "impacts": method.whole("impacts", impacts, 1),
-        }
+        starts.effort(steps, balls, impacts)
     command.keep_compiled()
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
         show(0, stages)
         began = time.perf_counter()
         found = designs.optimise_all(
-            devices, tune=names, bounds=within, objective=objective, tolerances=weighed, **effort
+            devices,
+            tune=names,
+            bounds=within,
+            objective=objective,
+            tolerances=weighed,
+            steps=steps,
+            balls=balls,
+            impacts=impacts,
         )
         seconds = time.perf_counter() - began
         show(1, stages)

@@ -23,7 +23,7 @@ from vijax.method import whole
 from vijax.model import Harvester, Status
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
-from vijax.starts import Effort, Met, find
+from vijax.starts import Met, effort, find
 from vijax.steady import Steady, steady
 from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, tuned, values, variables
@@ -144,12 +144,11 @@ def optimise_all(
         ValueError: Which argument, what must hold, what came.
     """
     devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
-    looks, impacts = whole("looks", looks, 2), whole("impacts", impacts, 1)
-    effort = Effort(whole("steps", steps, 2), whole("balls", balls, 1), impacts, whole("periods", periods, 1))
+    looks, far = whole("looks", looks, 2), effort(steps, balls, impacts, periods)
     box = check(devices, tune, bounds or {}, objective, scatter)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    starts, met = find(devices, tune, box, objective, effort)
+    starts, met = find(devices, tune, box, objective, far)
     ends = _climbed(scene, starts, box, looks)
     optima = _optima(scene, starts, ends, devices, looks)
     return [

@@ -305,7 +305,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
             count=chains,
             links=links,
         )
-        part = jax.tree.map(lambda x, links=links: np.asarray(x)[:chains, :links], summary)
+        part = jax.tree.map(lambda x, links=links: x[:chains, :links], summary)
         end = part.handover
         state = (end.u[:, -1], end.v[:, -1], end.t[:, -1])
         parts.append(part)

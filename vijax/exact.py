@@ -387,7 +387,7 @@ def _soft_contact(
     if deep:
         duration, when = exit_and_crest(*frozen, wanted, patience)
     else:
-        duration, when = first_return(*frozen, wanted, patience), jnp.zeros_like(t)
+        duration = first_return(*frozen, wanted, patience)
     ends = wanted & jnp.isfinite(duration)
     duration = jnp.where(ends, implicit_root(_penetration, jnp.where(ends, duration, 1.0), args), duration)
     _, z = flow.oscillate(*args, jnp.where(ends, duration, 0.0))

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.energy import harvested_energy
+from vijax.method import whole
 from vijax.model import Harvester
-from vijax.survey import Flown, survey
+from vijax.survey import Flown, Survey, survey
 from vijax.tuning import moving, tuned
 
 _LONGEST = 8  # forcing periods of an orbit
@@ -34,6 +35,13 @@ class Effort(NamedTuple):
     balls: int
     impacts: int
     periods: int
+
+
+def effort(steps: int, balls: int, impacts: int, periods: int = 200) -> Effort:
+    """How far to look, with whole numbers that can be; ValueError else."""
+    return Effort(
+        whole("steps", steps, 2), whole("balls", balls, 1), whole("impacts", impacts, 1), whole("periods", periods, 1)
+    )
 
 
 class Met(NamedTuple):
@@ -88,16 +96,20 @@ def find(
     steps = 1 if first is None else effort.steps
     owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
     scene = _Scene(devices, tune, box, effort)
-    cells = owner.size // len(devices)
+    cells = owner.size // len(devices)  # of a device
+    # The same for every device, whatever the others are: designs of one do not depend on them.
+    draws = np.random.default_rng(0).uniform(-1, 1, (2, cells)), np.random.default_rng(1).uniform(-1, 1, (2, cells))
     places = _Places(owner, level, step / max(steps - 1, 1), np.arange(owner.size) % cells)
-    met, unrest = _survey(scene, places, closer=False)
+    seen = _look(scene, places, draws[0])
+    met = seen.met(seen.found.orbits(effort.impacts))
     if first is not None:
-        most = _most(met, objective, len(devices))
-        again = _closer(unrest, most, objective, effort, cells)
+        most = _most(_promise(met, objective), met.owner, len(devices))
+        again = _closer(seen.met(seen.found.unrest(effort.impacts)), most, objective, effort, cells)
         if again.owner.size:
-            more, _ = _survey(scene, again, closer=True)
+            closer = _look(scene, again, draws[1])
+            more = closer.met(closer.found.orbits(effort.impacts))
             met = jax.tree.map(lambda *x: np.concatenate(x), met, more)
-    chosen = _promising(met, _most(met, objective, len(devices)), objective, max(1, steps // _BESIDE))
+    chosen = _promising(met, objective, len(devices), max(1, steps // _BESIDE))
     return met.some(chosen), np.bincount(met.owner, minlength=len(devices))
 
 
@@ -123,8 +135,23 @@ def _levels(tune: tuple[str, ...]) -> np.ndarray:
     )
 
 
-def _survey(scene: _Scene, places: _Places, closer: bool) -> tuple[Met, Met]:
-    """The attractors at some places, and the motions that are none (not in a closer look)."""
+class _Seen(NamedTuple):
+    """A survey at some places: the device and the variables of every cell."""
+
+    found: Survey
+    device: Harvester
+    z: np.ndarray
+    places: _Places
+    step: np.ndarray
+
+    def met(self, flown: Flown) -> Met:
+        """Some motions of the survey, with where they were met."""
+        device, z, places, step = jax.tree.map(lambda x: x[flown.cell], self[1:])
+        return Met(flown, device, z, places.owner, places.level, step)
+
+
+def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
+    """Survey some places, the ball of each starting where its number's draw says."""
     devices, tune, box, effort = scene
     first, parts = _first(tune), _levels(tune)[places.level]
     if first is not None:
@@ -134,18 +161,10 @@ def _survey(scene: _Scene, places: _Places, closer: bool) -> tuple[Met, Met]:
     given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
     every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(given, z)
     pair = jax.tree.map(np.asarray, jax.vmap(lambda device: device.pair())(every))
-    # The same for every device: designs of one do not depend on the others.
-    draw = np.random.default_rng(int(closer)).uniform(-1, 1, (2, places.number.max() + 1))
     u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
     found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, periods=effort.periods)
     step = np.round(places.part * (effort.steps - 1)).astype(int)
-
-    def met(flown: Flown) -> Met:
-        own = jax.tree.map(lambda x: np.asarray(x)[flown.cell], every)
-        return Met(flown, own, *(x[flown.cell] for x in (z, places.owner, places.level, step)))
-
-    orbits = met(found.orbits(effort.impacts))
-    return orbits, orbits.some(np.zeros(0, int)) if closer else met(found.unrest(effort.impacts))
+    return _Seen(found, jax.tree.map(np.asarray, every), z, places, step)
 
 
 def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, cells: int) -> _Places:
@@ -153,8 +172,7 @@ def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, cells
 
     Cells of a device, so many at most, are spread evenly over these steps, and over each of them.
     """
-    value, lacks = _promise(unrest, objective)
-    good = value + lacks > most[unrest.owner] + math.log(_NARROW)
+    good = _promise(unrest, objective).total > most[unrest.owner] + math.log(_NARROW)
     owner, level, step = np.unique(np.column_stack([unrest.owner, unrest.level, unrest.step])[good], axis=0).T
     places = [_Places(*np.zeros((4, 0), int))]
     for one in np.unique(owner):
@@ -166,17 +184,18 @@ def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, cells
     return jax.tree.map(lambda *x: np.concatenate(x), *places)
 
 
-def _promising(met: Met, most: np.ndarray, objective: str, reach: int) -> np.ndarray:
+def _promising(met: Met, objective: str, devices: int, reach: int) -> np.ndarray:
     """Indices of the attractors to climb from: the best of their kind as far as so many steps away.
 
     A kind is given by span and impacts; the walls may change places where the tube is level.
     """
-    value, lacks = _promise(met, objective)
-    score, (left, right) = np.where(lacks < 0, _HOPELESS + lacks, value), _impacts(met.flown)
+    promise = _promise(met, objective)
+    score = np.where(promise.lacks < 0, _HOPELESS + promise.lacks, promise.value)
+    left, right = _impacts(met.flown)
     kind = np.column_stack([met.owner, met.level, met.flown.span, left, right])
     found = highest(kind, met.step, score, reach)
-    enough = (value + lacks)[found] > most[met.owner[found]] + math.log(_NARROW)
-    return found[enough | ((left + right)[found] <= _MANY)]
+    enough = promise.total > _most(promise, met.owner, devices)[met.owner] + math.log(_NARROW)
+    return found[(enough | (left + right <= _MANY))[found]]
 
 
 def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) -> np.ndarray:
@@ -207,8 +226,19 @@ def _impacts(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
     return np.where(swap, right, left), np.where(swap, left, right)
 
 
-def _promise(met: Met, objective: str) -> tuple[np.ndarray, np.ndarray]:
-    """The logarithm of the objective, and what is lacking to the worst constraint, a logarithm too: 0 if nothing."""
+class _Promise(NamedTuple):
+    """Of every motion the logarithm of the objective, and what is lacking to the worst constraint: 0 if nothing."""
+
+    value: np.ndarray
+    lacks: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """What may be left where no constraint is broken any more."""
+        return self.value + self.lacks
+
+
+def _promise(met: Met, objective: str) -> _Promise:
     device, flown = met.device, met.flown
     deep = flown.depth * np.asarray(device.length_unit)[:, None]
     gained = np.asarray(jax.vmap(harvested_energy)(device, jnp.asarray(deep)))
@@ -218,12 +248,11 @@ def _promise(met: Met, objective: str) -> tuple[np.ndarray, np.ndarray]:
         value = np.log(np.nansum(gained, axis=1) / flown.span)
     if objective == "speed":
         value = np.log(flown.knots[..., 1].max(axis=1, initial=0.0))
-    return value, np.nanmin(lacks, axis=1, initial=0.0)
+    return _Promise(value, np.nanmin(lacks, axis=1, initial=0.0))
 
 
-def _most(met: Met, objective: str, devices: int) -> np.ndarray:
+def _most(promise: _Promise, owner: np.ndarray, devices: int) -> np.ndarray:
     """What the best admissible attractor of every device promises; -inf where there is none."""
-    value, lacks = _promise(met, objective)
     most = np.full(devices, -np.inf)
-    np.maximum.at(most, met.owner, np.where(lacks < 0, -np.inf, value))
+    np.maximum.at(most, owner, np.where(promise.lacks < 0, -np.inf, promise.value))
     return most

@@ -112,7 +112,7 @@ def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int
     def part(rows: np.ndarray) -> Any:
         own, u0, v0 = jax.tree.map(lambda x: jnp.asarray(x[np.resize(rows, size)]), (pair, *starts))
         summary = simulate.attractors(own, u0, v0, periods=periods, keep=longest, count=rows.size)
-        return jax.tree.map(lambda x: np.asarray(x)[: rows.size], summary)
+        return jax.tree.map(lambda x: x[: rows.size], summary)
 
     with ThreadPoolExecutor(workers()) as pool:
         parts = list(pool.map(part, tiles))
