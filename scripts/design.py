@@ -79,7 +79,7 @@ def design(
     **given: Any,
 ) -> None:
     """Find the membrane, and what else is tuned, that harvests most and can be built."""
-    from vijax import blueprint, report, starts
+    from vijax import blueprint, report
     from vijax import design as designs
     from vijax.store import write_json
     from vijax.style import check_format
@@ -94,7 +94,7 @@ def design(
         within = _bounds(bounds)
         weighed = scatter if objective in _OVER_TOLERANCES else ()
         designs.check(devices, names, within, objective, weighed)
-        starts.effort(steps, balls, impacts)
+        designs.effort(steps, balls, impacts)
     command.keep_compiled()
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:

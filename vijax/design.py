@@ -23,7 +23,7 @@ from vijax.method import whole
 from vijax.model import Harvester, Status
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
-from vijax.starts import Met, effort, find
+from vijax.starts import Effort, Met, find
 from vijax.steady import Steady, steady
 from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, tuned, values, variables
@@ -198,6 +198,12 @@ def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None
     orbit = optimum.orbit
     batch = Batch(device, orbit.sequence, jnp.nan_to_num(orbit.knots), none, none, none)
     return Spread(*(float(x[0]) for x in aims.spread(scene, batch)))
+
+
+def effort(steps: int, balls: int, impacts: int, periods: int = 200) -> Effort:
+    """How far a survey looks; raises ValueError as `optimise_all` does."""
+    values, starts = whole("steps", steps, 2), whole("balls", balls, 1)
+    return Effort(values, starts, whole("impacts", impacts, 1), whole("periods", periods, 1))
 
 
 def check(

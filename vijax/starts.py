@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.energy import harvested_energy
-from vijax.method import whole
 from vijax.model import Harvester
 from vijax.survey import Flown, Survey, survey
 from vijax.tuning import moving, tuned
@@ -35,13 +34,6 @@ class Effort(NamedTuple):
     balls: int
     impacts: int
     periods: int
-
-
-def effort(steps: int, balls: int, impacts: int, periods: int = 200) -> Effort:
-    """How far to look, with whole numbers that can be; ValueError else."""
-    return Effort(
-        whole("steps", steps, 2), whole("balls", balls, 1), whole("impacts", impacts, 1), whole("periods", periods, 1)
-    )
 
 
 class Met(NamedTuple):
