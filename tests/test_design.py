@@ -287,7 +287,7 @@ def test_designs_along_an_axis(folder, capsys):
         "--over",
         "d=0.16,0.2",
         *FEW[:-1],
-        "8",
+        "4",
         "--out",
         "map.json",
         "--plot",

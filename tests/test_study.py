@@ -25,11 +25,11 @@ MOST = 6  # cells of a tile, here
 
 @pytest.fixture
 def calls(monkeypatch):
-    """A stand-in for the engine and small tiles; the list tells the cells of every call."""
+    """A stand-in for the engine and small tiles; the list tells the cells of every call but those that only compile."""
     made = []
 
     def summarise(*args, count, **settings):
-        made.append(count)
+        made.extend([count] if count else [])
         return stand_in(*args, count=count, **settings)
 
     monkeypatch.setattr(simulate, "summarise", summarise)
@@ -91,6 +91,24 @@ def test_a_study_holds_what_the_sweep_in_memory_returns(calls, out, axes):
         found = sweep(**axes, out=out)
         xr.testing.assert_identical(found.load(), sweep(**axes))
         xr.testing.assert_identical(load(out), found)
+
+
+def test_what_the_tiles_need_is_compiled_while_their_store_is_made(out, monkeypatch):
+    compiling, opened = threading.Event(), study.opened
+
+    def summarise(*args, count, **settings):
+        if not count:
+            compiling.set()
+        return stand_in(*args, count=count, **settings)
+
+    def opened_meanwhile(*args):
+        assert compiling.wait(timeout=20)
+        return opened(*args)
+
+    monkeypatch.setattr(simulate, "summarise", summarise)
+    monkeypatch.setattr(study, "opened", opened_meanwhile)
+    sweep(**AXES, out=out)
+    assert len(records(out)) == 1
 
 
 def test_every_chunk_is_a_tile_and_every_tile_has_a_record(calls, out):

@@ -1,5 +1,7 @@
 """Derivatives of impacts against 50-digit differences, stroboscopic states, and errors at the door."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -32,11 +34,17 @@ def events(rigid: bool):
     return run
 
 
+@cache
+def marched(case):
+    """The impacts of a case in as many digits as are in force, and guesses for its neighbours."""
+    return mp_march(case, IMPACTS)
+
+
 def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
     """First and second derivative along a direction by central differences in 50 digits, [impact, name]."""
     with mp.workdps(DIGITS):
         h = mp.mpf(H)
-        middle, guesses = mp_march(case, IMPACTS)
+        middle, guesses = marched(case)
 
         def at(factor):
             moved = [

@@ -245,8 +245,9 @@ def run(
         # Which cells are computed depends on all that were: no part of it could be gone on with.
         save(_refined(planned, tell), out, overwrite=overwrite)
         return view(out)
+    ahead = None if workers is not None or Path(out).exists() else _compile_ahead(planned)
     with study.opened(planned, out, overwrite) as plane:
-        _fill(plane, tell, workers)
+        _fill(plane, tell, workers, ahead)
     return view(out)
 
 
@@ -328,14 +329,24 @@ def _compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None 
             yield done
 
 
-def _fill(plane: study.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:
-    """Simulate and write the tiles of a study that are not done."""
+def _compile_ahead(planned: Plan) -> Future[None]:
+    """What the tiles of a new store need is compiled while it is made: XLA needs no Python, importing zarr a core."""
+    most = math.prod(study.blocks(planned.cells).values())
+    tile = _Tile(planned, np.arange(min(most, planned.count)), _rows(most), 0)
+    return ThreadPoolExecutor(1).submit(_compile, tile, places()[0])
+
+
+def _fill(
+    plane: study.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None, ahead: Future[None] | None
+) -> None:
+    """Simulate and write the tiles of a study that are not done, once what they need is compiled."""
     left = study.left(plane, _LOG.warning)
     total = plane.planned.count
     done = total - sum(map(plane.count, left))
     tiles = map(plane.tile, left)
     try:
         tell(done, total)
+        wait([ahead] if ahead else [])
         # Closed at once whatever happens, or workers would go on for as long as somebody holds the error.
         with closing(_made(tiles, _rows(plane.most), workers)) as made:
             for tile in made:

@@ -138,6 +138,11 @@ def extents(sizes: dict[str, int], most: int) -> dict[str, int]:
     return found
 
 
+def blocks(of: Cells) -> dict[str, int]:
+    """Lengths of the tiles of a new store."""
+    return extents({dim: of.sizes[dim] for dim in of.dynamic}, _most(of))
+
+
 # --- who may write ---------------------------------------------------------------------------------------------------
 
 
@@ -200,7 +205,7 @@ def _write_blank(planned: Plan, path: Path) -> None:
     of = planned.cells
     write_store(xr.Dataset(coords=coordinates(of), attrs=provenance(planned)), path)
     group = zarr.open_group(path, mode="r+")
-    tile = extents({dim: of.sizes[dim] for dim in of.dynamic}, _most(of))
+    tile = blocks(of)
     for name, variable in specimen(planned).data_vars.items():
         group.create_array(
             str(name),
