@@ -240,8 +240,8 @@ def run(
         check_workers(planned, workers, out)
     if out is None:
         return _refined(planned, tell) if planned.refine else label(planned, _in_memory(planned, tell))
+    check(planned, out, overwrite)
     if planned.refine:
-        check(planned, out, overwrite)
         # Which cells are computed depends on all that were: no part of it could be gone on with.
         save(_refined(planned, tell), out, overwrite=overwrite)
         return view(out)
