@@ -201,7 +201,8 @@ def _fly(half: Lane, lane: Lanes) -> _Flight:
     p = flip * PI * lane.v - sine
     u, t, p, cosine = share((u, t, p, cosine))
     inside = jnp.clip(p, -1.0, 1.0)
-    angle, swing = share((arcsine(inside) * (1 / PI), jnp.sqrt((1 - inside) * (1 + inside)) * (1 / PI**2)))
+    angle = arcsine(inside) * (1 / PI)
+    swing = jnp.sqrt((1 - inside) * (1 + inside)) * (1 / PI**2)
     drift = p * (1 / PI)
     centre = jnp.where(t < 0.5, -0.5, 1.5)
     u_centre = u + drift * (centre - t) + cosine * (1 / PI**2)
@@ -215,7 +216,6 @@ def _fly(half: Lane, lane: Lanes) -> _Flight:
     short = jnp.where(drift > 0, half - highest, slow_point + half)  # still to climb or sink, period by period
     periods = jnp.ceil(short / jnp.maximum(jnp.abs(2 * drift), jnp.finfo(half.dtype).tiny))
     periods = jnp.where((right & ~left) | (left & ~falls), 0.0, jnp.maximum(periods, 0.0))
-    up, periods = share((up, periods))
     # An extremum within rounding of the wall may be a graze or a miss: not for here.
     margin = 512 * eps
     lift = 2 * drift * periods
@@ -384,7 +384,7 @@ def _guess(wall: Wall, entry: _Entry) -> _Guess:
     snap = -(PI**2) * entry.force_cos - 2 * wall.zeta * jerk - square * push
     fifth = PI**3 * entry.force_sin - 2 * wall.zeta * snap - square * jerk
     sixth = PI**4 * entry.force_cos - 2 * wall.zeta * fifth - square * snap
-    hop, derivatives = share((hop, (speed, push, jerk, snap, fifth, sixth)))
+    derivatives = (speed, push, jerk, snap, fifth, sixth)
     value = _taylor(derivatives, 1, hop) * hop
     slope = _taylor(derivatives, 0, hop)
     hop = jnp.where(slope < 0, hop - value / slope, hop)
@@ -546,7 +546,7 @@ def quick_step(
     side = flight.flip * flight.wall
     onset = lane.t + flight.elapsed
     passed = jnp.floor(0.5 * onset)
-    onset_t, onset_n = share((onset - 2 * passed, lane.n + passed))
+    onset_t, onset_n = onset - 2 * passed, lane.n + passed
     v_in = side * flight.speed
     depth = work = contact = None
     if wall.kappa is None:
@@ -564,7 +564,7 @@ def quick_step(
         sure = sure & flight.sure
         leave = onset_t + duration
         passed = jnp.floor(0.5 * leave)
-        leave_t, leave_n = share((leave - 2 * passed, onset_n + passed))
+        leave_t, leave_n = leave - 2 * passed, onset_n + passed
         if deep:
             work = energy.membrane_work(wall.kappa, 2 * wall.zeta, gamma, side, onset_t, duration, v_in, -side * out)
         if tangent:
