@@ -1,9 +1,13 @@
 """A program is traced once: kept with what it depends on, read back bit for bit, traced anew where that fails."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import monitoring
 
 from vijax import traced
 
@@ -54,6 +58,31 @@ def test_another_program_or_shape_is_another_one(folder, changed):
     assert called(**changed)[1] == 1
     assert called(**changed)[1] == 0
     assert len(list(folder.iterdir())) == 2
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
+    monkeypatch.setattr(traced, "_folder", lambda: tmp_path if kept else None)
+    program = traced.Program(lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop")
+    compiled, ready = [], threading.Barrier(4)
+
+    def count(event, *_, fun_name="", **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(fun_name)
+
+    def call(_):
+        ready.wait()
+        return np.asarray(program(X))
+
+    monitoring.register_event_duration_secs_listener(count)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(call, range(4)))
+    finally:
+        monitoring.unregister_event_duration_listener(count)
+    assert len(compiled) == 1
+    for one in found:
+        np.testing.assert_array_equal(one, found[0])
 
 
 def test_other_sources_are_other_programs(folder, monkeypatch):

@@ -7,7 +7,6 @@ import itertools
 import logging
 import math
 import queue
-import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -43,7 +42,6 @@ _CHOICES = {
     "wall": ("soft", "rigid"),
     "dtype": ("float64", "float32"),
 }
-_COMPILING = threading.Lock()  # or each thread of a worker would compile the same
 _LOG = logging.getLogger(__name__)
 
 Fields = dict[str, np.ndarray]  # of `Summary`, by name
@@ -245,9 +243,10 @@ def run(
         # Which cells are computed depends on all that were: no part of it could be gone on with.
         save(_refined(planned, tell), out, overwrite=overwrite)
         return view(out)
-    ahead = None if workers is not None or Path(out).exists() else _compile_ahead(planned)
+    if workers is None and not Path(out).exists():
+        _compile_ahead(planned)
     with study.opened(planned, out, overwrite) as plane:
-        _fill(plane, tell, workers, ahead)
+        _fill(plane, tell, workers)
     return view(out)
 
 
@@ -329,24 +328,21 @@ def _compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None 
             yield done
 
 
-def _compile_ahead(planned: Plan) -> Future[None]:
-    """What the tiles of a new store need is compiled while it is made: XLA needs no Python, importing zarr a core."""
+def _compile_ahead(planned: Plan) -> None:
+    """Begin to compile what the tiles of a new store need: XLA needs no Python, and importing zarr a core."""
     most = math.prod(study.blocks(planned.cells).values())
     tile = _Tile(planned, np.arange(min(most, planned.count)), _rows(most), 0)
-    return ThreadPoolExecutor(1).submit(_compile, tile, places()[0])
+    ThreadPoolExecutor(1).submit(_compile, tile, places()[0])
 
 
-def _fill(
-    plane: study.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None, ahead: Future[None] | None
-) -> None:
-    """Simulate and write the tiles of a study that are not done, once what they need is compiled."""
+def _fill(plane: study.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:
+    """Simulate and write the tiles of a study that are not done."""
     left = study.left(plane, _LOG.warning)
     total = plane.planned.count
     done = total - sum(map(plane.count, left))
     tiles = map(plane.tile, left)
     try:
         tell(done, total)
-        wait([ahead] if ahead else [])
         # Closed at once whatever happens, or workers would go on for as long as somebody holds the error.
         with closing(_made(tiles, _rows(plane.most), workers)) as made:
             for tile in made:
@@ -383,8 +379,7 @@ def _here(tiles: Iterable[study.Tile], rows: int) -> Iterator[study.Tile]:
 def _make(rows: int, tile: study.Tile) -> None:
     """Simulate and write a tile, in a worker, on its first device."""
     call, place = _whole(tile, rows), places()[0]
-    with _COMPILING:
-        _compile(call, place)
+    _compile(call, place)
     found, seconds = _simulate(call, place)
     study.write(tile, variables(tile.planned, found), seconds)
 
@@ -445,7 +440,7 @@ def _in_turn(tiles: Iterable[_Tile]) -> Generator[tuple[_Tile, Fields, float], N
 
     try:
         if len(here) > 1 and (first := next(tiles, None)):
-            # All threads at once would each compile what they share.
+            # Or the first tiles' seconds would hold it.
             wait([pool.submit(_compile, first, place) for place in set(here)])
             tiles = itertools.chain([first], tiles)
         fill()
@@ -480,7 +475,7 @@ def _simulate(tile: _Tile, place: jax.Device) -> tuple[Fields, float]:
 
 
 def _compile(tile: _Tile, place: jax.Device) -> None:
-    """What the tile needs, without running a cell."""
+    """What the tile needs, without running a cell. Threads that ask for the same wait for one of them, by `jax.jit`."""
     for part in _kinds(tile):
         _summarise(tile, tile.cells[part], 0, place)
 
@@ -525,4 +520,4 @@ def _summarise(tile: _Tile, index: np.ndarray, count: int, place: jax.Device) ->
         count=count,
         on=place,
     )
-    return {name: np.asarray(getattr(summary, name))[:count] for name in needs}
+    return {name: getattr(summary, name)[:count] for name in needs}
