@@ -31,7 +31,7 @@ def both(request):
     def program(pair, lane):
         return quick.quick_step(quick.prepare(pair), jnp.zeros_like(lane.u), lane, deep=True, tangent=True)
 
-    hit, sure, never = jax.tree.map(np.asarray, jax.jit(program)(pair, lane))
+    hit, _, sure, never = jax.tree.map(np.asarray, jax.jit(program)(pair, lane))
     return request.param, flat, hit, sure, never
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.method import Method, Passage
 from vijax.model import Harvester, ImpactPair
-from vijax.quick import Hit, Lanes, Wall
+from vijax.quick import Arrival, Hit, Lanes, Wall
 
 Lane = Float[Array, "lane"]
 Mask = Bool[Array, "lane"]
@@ -125,6 +125,7 @@ class Cell(eqx.Module):
     running: Mask
     declined: Mask
     hard: Mask  # declined by sampling too
+    arrival: Arrival | None  # the end of the flight as the last trip found it
     done: Mask
     status: Int[Array, "lane"]
     count: Lane  # impacts so far

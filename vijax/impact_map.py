@@ -34,10 +34,17 @@ class Next(eqx.Module):
 
 def _quick_answer(plan: Plan, request: trips.Request) -> trips.Answer:
     """By the quick step, of level cells."""
-    wall = quick.prepare(request.pair)
-    hit, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
+    hit, _, sure, never = quick.quick_step(quick.prepare(request.pair), request.pair.gamma, request.ball, deep=True)
     no = jnp.zeros_like(sure)
     return trips.Answer(Event(hit, sure, never, no, no), no, sure | never)
+
+
+def _sampled_answer(plan: Plan, request: trips.Request) -> trips.Answer:
+    """By certified sampling; of a contact alone where the quick step knows the flight."""
+    if trips.knows_arrival(plan):
+        known = quick.quick_step(quick.prepare(request.pair), request.pair.gamma, request.ball).arrival
+        request = eqx.tree_at(lambda r: r.arrival, request, known, is_leaf=lambda x: x is None)
+    return trips.sampled_answer(plan, request)
 
 
 @lru_cache(maxsize=16)
@@ -93,7 +100,7 @@ def next_impacts(
     ball = Lanes(0.5 * side * pair.d, -side * speed, t, zero)
     requests = trips.Request(pair, ball, zero, zero + _HORIZON)
     # What one step is not sure of is left to the next, which costs several times as much.
-    steps = [trips.sampled_answer, trips.careful_answer]
+    steps = [_sampled_answer, trips.careful_answer]
     found, sure = _answered(_compiled(_quick_answer if level else steps.pop(0), plan), requests)
     for step in steps:
         rest = np.flatnonzero(~sure)

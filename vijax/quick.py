@@ -524,26 +524,25 @@ class Arrival(NamedTuple):
     sure: Bool[Array, "lane"]
 
 
-def arrive(half: Lane, lane: Lanes) -> Arrival:
-    """The end of a level flight in a gap of twice `half`."""
-    flight = _fly(half, lane)
-    return Arrival(flight.elapsed, flight.speed, flight.flip * flight.wall, flight.sure & ~flight.never)
+class Quick(NamedTuple):
+    """What the quick step made of every lane."""
+
+    hit: Hit
+    arrival: Arrival
+    sure: Bool[Array, "lane"]  # of all of the hit
+    never: Bool[Array, "lane"]  # will meet no wall again
 
 
-def quick_step(
-    wall: Wall, gamma: Lane, lane: Lanes, *, deep: bool = False, tangent: bool = False
-) -> tuple[Hit, Bool[Array, "lane"], Bool[Array, "lane"]]:
+def quick_step(wall: Wall, gamma: Lane, lane: Lanes, *, deep: bool = False, tangent: bool = False) -> Quick:
     """One impact of every lane by the regular path; gamma must be 0.
 
     Args:
         deep: Also find the greatest depth and the work given to the membrane.
         tangent: Also give the tangent map of the step, flight and saltations included.
-
-    Returns:
-        The hit, for which lanes it is certain, and which lanes will never meet a wall again.
     """
     flight = _fly(wall.half, lane)
     side = flight.flip * flight.wall
+    arrival = Arrival(flight.elapsed, flight.speed, side, flight.sure & ~flight.never)
     onset = lane.t + flight.elapsed
     passed = jnp.floor(0.5 * onset)
     onset_t, onset_n = onset - 2 * passed, lane.n + passed
@@ -552,7 +551,7 @@ def quick_step(
     if wall.kappa is None:
         out, duration = wall.r * flight.speed, jnp.zeros_like(onset)
         leave_t, leave_n = onset_t, onset_n
-        sure = flight.sure & (out > 10 * stick_speed(out.dtype))
+        sure = out > 10 * stick_speed(out.dtype)
         if deep:
             depth, work = wall.chi * flight.speed, energy.membrane_work_rigid(v_in, wall.r)
         if tangent:
@@ -561,7 +560,6 @@ def quick_step(
     else:
         left, depth, sure = _touch(wall, flight, deep)
         duration, out = left.duration, left.speed
-        sure = sure & flight.sure
         leave = onset_t + duration
         passed = jnp.floor(0.5 * leave)
         leave_t, leave_n = leave - 2 * passed, onset_n + passed
@@ -574,4 +572,4 @@ def quick_step(
     matrix = None if contact is None else through(contact, flight.elapsed)
     after = Lanes(side * wall.half, -side * out, leave_t, leave_n)
     hit = Hit(onset_t, onset_n, side, v_in, -side * out, flight.elapsed, duration, after, depth, work, matrix)
-    return hit, sure & ~flight.never, flight.never & flight.sure
+    return Quick(hit, arrival, sure & arrival.sure, flight.never & flight.sure)

@@ -7,7 +7,8 @@ it that has to converge, which makes it several times cheaper than the careful s
 """
 
 from collections.abc import Callable
-from functools import reduce
+from functools import partial, reduce
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -24,6 +25,7 @@ from vijax.quick import Arrival, Hit, Lanes, converged_step, householder, throug
 Lane = Float[Array, "lane"]
 Mask = Bool[Array, "lane"]
 Samples = Float[Array, "sample lane"]
+Zeros = Float[Array, "zero lane"]  # the exit, and the crest where it is asked for
 
 _SAMPLES = 32  # of one pass
 _PASSES = 6  # before a lane is declined
@@ -203,25 +205,28 @@ def _state(c: _Contact, turned: tuple[Lane, Lane, Force]) -> tuple[Lane, Lane]:
     return share((w, c.m.omega1 * across - c.m.zeta * along - PI * steady.q))
 
 
-def _step(c: _Contact, s: Lane, w: Lane, z: Lane, order: int) -> tuple[Lane, tuple[Lane, ...]]:
-    """Fourth-order step towards a zero of w (order 0) or w' (order 1), and the derivatives it is made of."""
+def _step(c: _Contact, s: Zeros, w: Zeros, z: Zeros) -> tuple[Zeros, tuple[Zeros, ...]]:
+    """Fourth-order step towards a zero of w (first row) or w' (second row), and the derivatives it is made of."""
     later, square = c.force.later(s), c.m.kappa * c.m.kappa
     push = later.c - later.g - c.m.mu * z - square * w
     jerk = -PI * later.q - c.m.mu * push - square * z
     snap = -(PI**2) * later.c - c.m.mu * jerk - square * push
     derivatives = share((w, z, push, jerk, snap))
-    return share((householder(*derivatives[order : order + 4]), derivatives))
+    crest = jnp.arange(s.shape[0])[:, None] == 1
+    ours = (jnp.where(crest, after, f) for f, after in pairwise(derivatives))
+    return share((householder(*ours), derivatives))
 
 
-def _polish(c: _Contact, s: Lane, order: int) -> tuple[Lane, Lane, tuple[Lane, ...]]:
-    """A zero of w or w' near s, the last step towards it, and the derivatives of w before that step.
+def _polish(c: _Contact, s: Zeros) -> tuple[Zeros, Zeros, tuple[Zeros, ...]]:
+    """The exit, a zero of w, near the first row of s, and the crest, a zero of w', near its second, if it has one.
 
-    The second trip's closed form is the careful one, which loses nothing in short contacts and at resonance.
+    With the last step towards each, and the derivatives of w before that step. The second trip's closed form is the
+    careful one, which loses nothing in short contacts and at resonance.
     """
     w, z = _state(c, _turned(c, s))
-    s = share(s + _step(c, s, w, z, order)[0])
+    s = share(s + _step(c, s, w, z)[0])
     w, z = flow.oscillate(c.m, c.force, jnp.zeros_like(s), c.speed, s)
-    step, derivatives = _step(c, s, w, z, order)
+    step, derivatives = _step(c, s, w, z)
     return s + step, step, derivatives
 
 
@@ -245,9 +250,10 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
         finest = _FINEST * at.zoom * jnp.minimum(1.0, PI / m.omega1)
         h = share(jnp.minimum(finest, 0.5 * _safe(jnp.maximum(w, 0.0), z, bend)))
         decay, turn = jnp.exp(-m.zeta * h), m.omega1 * h
-        re, im = _powers(*share((decay * jnp.cos(turn), decay * jnp.sin(turn))))
         drive_sine, drive_cosine, _, _ = flow.half_turn(h)
-        drive_re, drive_im = _powers(drive_cosine, drive_sine)
+        turns = jnp.stack([decay * jnp.cos(turn), drive_cosine]), jnp.stack([decay * jnp.sin(turn), drive_sine])
+        real, imaginary = _powers(*share(turns))
+        (re, drive_re), (im, drive_im) = share((real[:, 0], real[:, 1])), share((imaginary[:, 0], imaginary[:, 1]))
         held = share(steady.c * drive_re - steady.q * drive_im)
         w = share(along * re + across * im + held - steady.g)
         along, across = share((stiff * along - twist * across, stiff * across + twist * along))
@@ -260,18 +266,24 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
         return _next(at, s, h, crossing, jnp.ones_like(h), w, crest)
 
     found = _search(advance, speed)
-    duration, step, (_, z, push, jerk, _) = _polish(c, _chord(found), 0)
+    polished = share(_polish(c, jnp.stack([_chord(found), found.crest.when] if deep else [_chord(found)])))
+    duration, step, (_, z, push, jerk, _) = jax.tree.map(lambda rows: rows[0], polished)
     out = -(z + step * (push + step * (0.5 * jerk)))
     sharp = jnp.maximum(m.omega1, jnp.abs(push / z))
     sure = (found.side != 0) & (sharp * jnp.abs(step) < converged_step(eps)) & (out > 0)
     if not deep:
         return (*share((duration, out)), None, share(sure))
-    when, step, (w, z, push, jerk, snap) = _polish(c, found.crest.when, 1)
+    when, step, (w, z, push, jerk, snap) = jax.tree.map(lambda rows: rows[1], polished)
     depth = w + step * (z + step * (0.5 * push + step * (jerk / 6 + step * snap / 24)))
     sharp = jnp.maximum(m.omega1, jnp.abs(jerk / push))
     sure = sure & (sharp * jnp.abs(step) < 16 * converged_step(eps)) & (push < 0)
     sure = sure & (jnp.abs(when - found.crest.when) < found.crest.step) & (depth > found.crest.rival) & (when > 0)
     return share((duration, out, depth, sure))
+
+
+def _higher_of(one: tuple[Lane, Lane], other: tuple[Lane, Lane]) -> tuple[Lane, Lane]:
+    """The higher of two samples with its time, the first of equals: heights may differ in rounding where they recur."""
+    return jax.tree.map(partial(jnp.where, other[0] > one[0]), other, one)
 
 
 def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: Lane, last: Lane) -> _Crest:
@@ -281,10 +293,9 @@ def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: L
     """
     order = jnp.arange(_SAMPLES, dtype=w.dtype)[:, None]
     seen = share(jnp.where(order <= last, w, -jnp.inf))
-    top = -_least(-seen)
+    top, when = share(reduce(_higher_of, zip(seen, s, strict=True)))
     former = at.crest
     better = share(top > former.height)
-    when = _at(s, _least(jnp.where(seen == top, order, _NONE)))
     when, height = share((jnp.where(better, when, former.when), jnp.where(better, top, former.height)))
     around = (jnp.abs(s - when) < 2.5 * h) & (push + change < 0)
     hidden = seen + 0.125 * h * h * (jnp.abs(push) + change)

@@ -54,6 +54,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
         running=~no,
         declined=no,
         hard=no,
+        arrival=quick.Arrival(zero, zero, zero, no) if trips.knows_arrival(plan) else None,
         done=no,
         status=jnp.zeros(d.shape, jnp.int32),
         count=zero,

@@ -12,7 +12,7 @@ from vijax import exact, flow, quick, sampled
 from vijax.cell import Cell, Course, Event, Lane, Mask, Plan, Settings, choose, last_period
 from vijax.fold import fold
 from vijax.model import ImpactPair, State, Status
-from vijax.quick import Hit, Lanes
+from vijax.quick import Arrival, Hit, Lanes
 from vijax.recurrence import review
 
 _QUIET = 64  # periods beyond the last one in which the end of a flight is still looked for
@@ -23,8 +23,9 @@ _STEPS = 20_000  # steps per period before a cell of a stepping engine is stoppe
 def trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """One impact of every lane: by the quick step on level cells, by certified sampling with gravity."""
     pair, ball = cell.pair, cell.ball
+    arrival = None
     if plan.level:
-        hit, sure, never = quick.quick_step(cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
+        hit, arrival, sure, never = quick.quick_step(cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
     else:
         hit, sure = sampled.sampled_step(pair, ball, deep=plan.deep, tangent=plan.tangent)
         never = jnp.zeros_like(sure)
@@ -35,7 +36,15 @@ def trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     declined = active & ~(free & (sure | never))
     hard = cell.hard | declined if not plan.level else cell.hard  # sampling will not do better a second time
     cell = eqx.tree_at(lambda c: (c.declined, c.hard), cell, (cell.declined | declined, hard))
+    if knows_arrival(plan):
+        # A lane that is declined stays where it is: until it is served every trip finds the same arrival.
+        cell = eqx.tree_at(lambda c: c.arrival, cell, arrival)
     return fold(plan, settings, cell, event)
+
+
+def knows_arrival(plan: Plan) -> bool:
+    """Whether a declined lane's flight is known: it is nearly always the contact, of soft walls, that is declined."""
+    return plan.level and not plan.rigid and plan.stepping is None
 
 
 class Request(eqx.Module):
@@ -45,6 +54,7 @@ class Request(eqx.Module):
     ball: Lanes
     held: Lane
     end: Lane  # last period
+    arrival: Arrival | None = None  # where the flight ends, if that is known
 
 
 class Answer(eqx.Module):
@@ -57,14 +67,12 @@ class Answer(eqx.Module):
 
 def request(plan: Plan, settings: Settings, cell: Cell) -> Request:
     """What serving each lane would need."""
-    return Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell.since))
+    return Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell.since), cell.arrival)
 
 
 def sampled_answer(plan: Plan, request: Request) -> Answer:
-    """By certified sampling; of level cells with soft walls the quick step declines the contact, nearly always."""
-    known = plan.level and not plan.rigid
-    arrival = quick.arrive(0.5 * request.pair.d, request.ball) if known else None
-    hit, sure = sampled.sampled_step(request.pair, request.ball, arrival, deep=plan.deep, tangent=plan.tangent)
+    """By certified sampling."""
+    hit, sure = sampled.sampled_step(request.pair, request.ball, request.arrival, deep=plan.deep, tangent=plan.tangent)
     no = jnp.zeros_like(sure)
     sure = sure & (request.held == 0)
     return Answer(Event(hit, sure, no, no, no), no, sure)
