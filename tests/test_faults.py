@@ -20,7 +20,7 @@ import pytest
 import xarray as xr
 from helpers import SCRIPTS, stand_in
 
-from vijax import grid, simulate, store, study
+from vijax import calls, simulate, store, study
 from vijax.grid import load, sweep
 
 AXES = {"d": np.linspace(0.1, 0.3, 8), "kappa": np.geomspace(3, 400, 6)}
@@ -35,7 +35,7 @@ def slow_engine(*args, **settings):
 
 def prepare():
     """The stand-in and small tiles, in this process."""
-    simulate.summarise, study.LARGEST_TILE, grid.places = slow_engine, MOST, lambda: jax.devices()[:1]
+    simulate.summarise, study.LARGEST_TILE, calls.places = slow_engine, MOST, lambda: jax.devices()[:1]
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(simulate, "summarise", stand_in)
     monkeypatch.setattr(study, "LARGEST_TILE", MOST)
-    monkeypatch.setattr(grid, "places", lambda: jax.devices()[:1])
+    monkeypatch.setattr(calls, "places", lambda: jax.devices()[:1])
     return tmp_path
 
 

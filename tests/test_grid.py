@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from helpers import SETTINGS, stand_in
 
-from vijax import dataset, grid, simulate
+from vijax import calls, dataset, grid, simulate
 from vijax.axes import cells, parse_axis
 from vijax.grid import load, save, sweep
 from vijax.membrane import HuntCrossley
@@ -214,8 +214,8 @@ def test_an_unknown_axis_is_named(no_engine):
 
 
 def test_every_cell_lands_in_its_place(engine, monkeypatch):
-    monkeypatch.setattr(grid, "SMALLEST_TILE", 4)
-    monkeypatch.setattr(grid, "LARGEST_TILE", 8)
+    monkeypatch.setattr(calls, "SMALLEST_TILE", 4)
+    monkeypatch.setattr(calls, "LARGEST_TILE", 8)
     axes = {"A": [1.0, 2.0, 5.0], "kappa": [3.0, 30.0, 300.0], "gamma": [0.1, 0.0], "d": np.linspace(0.1, 0.3, 11)}
     steps = []
     here = threading.current_thread()
@@ -290,8 +290,8 @@ def test_admissible_asks_for_energy_and_depth(monkeypatch):
 
 
 def test_ctrl_c_drops_the_waiting_tiles(engine, monkeypatch):
-    monkeypatch.setattr(grid, "SMALLEST_TILE", 2)
-    monkeypatch.setattr(grid, "LARGEST_TILE", 2)
+    monkeypatch.setattr(calls, "SMALLEST_TILE", 2)
+    monkeypatch.setattr(calls, "LARGEST_TILE", 2)
     slow = simulate.summarise
 
     def summarise(*args, **settings):

@@ -34,7 +34,7 @@ def calls(monkeypatch):
 
     monkeypatch.setattr(simulate, "summarise", summarise)
     monkeypatch.setattr(study, "LARGEST_TILE", MOST)
-    monkeypatch.setattr(grid, "places", lambda: jax.devices()[:1])
+    monkeypatch.setattr("vijax.calls.places", lambda: jax.devices()[:1])
     return made
 
 
@@ -313,9 +313,9 @@ import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
 import vijax
-from vijax import grid, lanes
+from vijax import calls, lanes
 assert set(lanes.places()) == set(jax.devices())
-grid.SMALLEST_TILE = 128
+calls.SMALLEST_TILE = 128
 vijax.study.LARGEST_TILE = 128
 axes = dict(d=np.linspace(0.2, 0.3, 17), r=np.linspace(0.3, 0.7, 21), wall="rigid", periods=12, until="window")
 vijax.sweep(**axes, outputs=["impacts_per_period", "restitution"], out=sys.argv[2])

@@ -7,7 +7,8 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from vijax.attractor import basin_fractions, basins, lyapunov, survival
+from vijax.attractor import basin_fractions, basins
+from vijax.chaos import lyapunov, survival
 from vijax.compare import compare
 from vijax.design import optimise
 from vijax.diagram import orbit_diagram

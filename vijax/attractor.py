@@ -1,4 +1,4 @@
-"""Coexisting attractors: their basins, what share of all starts each one takes, Lyapunov exponents, long transients.
+"""Coexisting attractors: their basins, and what share of all starts each one takes.
 
 All of it is the one line of a sweep over many starts; here the cells that ended on the same attractor are found, by
 what was measured on it.
@@ -7,7 +7,7 @@ what was measured on it.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import ArrayLike
@@ -15,7 +15,6 @@ from jaxtyping import ArrayLike
 from vijax import grid
 from vijax.axes import cells
 from vijax.dataset import Plan
-from vijax.grid import Axes
 from vijax.label import FAILED, label, ordered
 from vijax.method import whole
 from vijax.model import Harvester, Status
@@ -23,7 +22,7 @@ from vijax.model import Harvester, Status
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["basin_fractions", "basins", "label", "lyapunov", "survival"]
+__all__ = ["basin_fractions", "basins", "label"]
 
 SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
 _START_POINTS = 256
@@ -45,13 +44,6 @@ _TEXTS = {
 # What stands past the last attractor of a cell, by kind of value and for those that are counts.
 _BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "O": ""}
 _NONE = {"starts": 0, "fraction": 0.0, "fraction_stderr": 0.0}
-# Its growth from the identity is no stretching along the motion: the difference to a longer window is.
-_WARM_UP = 100
-# How survival looks: so often, so long; growth of the tangent map in powers of e; impacts per period.
-_INSTANTS, _WATCHED, _GROWN, _RARE = 8, 200, 7.0, 0.1
-_SURVIVAL = ("part of all starts still chaotic", "mean lifetime of chaos, forcing periods", "its standard error")
-_SPREADS = ("its standard error", "the lowest of the ensemble", "the highest of the ensemble")
-_NEAR = 0.01  # spread of an ensemble around its start, in parts of the gap and of the unit of velocity
 
 
 def basins(
@@ -187,9 +179,9 @@ def plan_fractions(
             raise TypeError(f"{name} must be left out where starts are drawn; got {axes[name]!r}")
     if not 0 < speed < np.inf:
         raise ValueError(f"speed must be positive and finite; got {speed!r}")
-    place = _spread(whole("starts", starts, 1), seed)
+    place = spread(whole("starts", starts, 1), seed)
     planned = _plan(axes, device, merge_mirrors, settings)
-    return _started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
+    return started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
 
 
 def _plan(axes: Mapping[str, Any], device: Harvester | None, merge_mirrors: bool, settings: dict[str, Any]) -> Plan:
@@ -208,8 +200,8 @@ def _middles(count: int) -> np.ndarray:
     return (np.arange(count) + 0.5) / count - 0.5
 
 
-def _spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
-    """Points spread uniformly over the unit square around 0, along the dimension `start`."""
+def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
+    """Points spread uniformly over the unit square around 0, along the dimension `start`; drawn at random by a seed."""
     import xarray as xr  # here, as importing vijax must not load it
 
     if seed is None:
@@ -222,7 +214,7 @@ def _spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
     return xr.Variable("start", first), xr.Variable("start", second)
 
 
-def _started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:
+def started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:
     """A plan whose cells have one more dimension, `start`, on which their starts depend."""
     of = planned.cells
     laid = replace(
@@ -320,15 +312,15 @@ def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
     group = _group(cell, measured, merge_mirrors, _SAME)
     groups = _groups(cell, group)
     basin = groups.rank[group].reshape(*shape, *(found.sizes[dim] for dim in over)).astype(np.int32)
-    variables = {"basin": xr.Variable((*dims, *over), basin, _described("place of the start's attractor in the table"))}
+    variables = {"basin": xr.Variable((*dims, *over), basin, described("place of the start's attractor in the table"))}
     variables["basin"] = variables["basin"].transpose(*found["period"].dims)
     for name, values in _entries(measured, groups, merge_mirrors, starts).items():
         further = [dim for dim in found[name].dims if dim not in (*dims, *over)] if name in found else []
-        attributes = found[name].attrs if name in found else _described(_TEXTS[name])
+        attributes = found[name].attrs if name in found else described(_TEXTS[name])
         table = _laid_out(values, groups, shape, _NONE.get(name, _BLANK[values.dtype.kind]))
         variables[name] = xr.Variable((*further, *dims, "attractor"), table, attributes)
     variables["attractors"] = (variables["period"] >= 0).sum("attractor")
-    variables["attractors"].attrs = _described("attractors found; aperiodic motions are one, undecided starts none")
+    variables["attractors"].attrs = described("attractors found; aperiodic motions are one, undecided starts none")
     attributes = found.attrs | {"title": "Basins of attraction", "merge_mirrors": int(merge_mirrors)}
     return xr.Dataset(variables, coords=found.coords, attrs=attributes)
 
@@ -373,136 +365,6 @@ def _laid_out(values: np.ndarray, groups: _Groups, shape: tuple[int, ...], blank
     return table.reshape(*values.shape[:-1], *shape, -1)
 
 
-def _described(text: str) -> dict[str, Any]:
+def described(text: str) -> dict[str, Any]:
+    """Attributes of a variable without units."""
     return {"units": "1", "long_name": text}
-
-
-# --- chaos, and what only looks like it -------------------------------------------------------------------------------
-
-
-def lyapunov(
-    *,
-    starts: int = 64,
-    periods: int = 2000,
-    transient: int = 500,
-    wall: str = "soft",
-    device: Harvester | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    **axes: Unpack[Axes],
-) -> "xr.Dataset":
-    """Largest Lyapunov exponent per forcing period of the motion from a start, with its standard error.
-
-    The exact tangent map is multiplied up along an ensemble of motions from starts around the given one, u0 up to 1 %
-    nearer to the middle and v0 up to 0.005 off. The map starts from the identity, which biases the exponent of a window
-    by some 1.7/periods: the growth in 100 periods before the window, when it turns to the most unstable direction, is
-    taken off.
-
-    Args:
-        starts: Size of the ensemble, at least 2.
-        periods: Forcing periods over which the growth is measured, for every start.
-        transient: Forcing periods to drop first: long enough to reach the attractor, and for the starts to part.
-        wall, device, progress, axes: As in `sweep`.
-
-    Returns:
-        Over the axes `lyapunov` [per forcing period], `lyapunov_stderr`, and `lyapunov_lowest` and `lyapunov_highest`
-        of the ensemble: where these lie many standard errors times sqrt(starts) apart, the starts have ended on
-        different attractors. NaN where the motion leaves the walls for ever.
-
-    Raises:
-        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
-    """
-    import xarray as xr  # here, as importing vijax must not load it
-
-    periods = whole("periods", periods, 1)
-    place = _spread(whole("starts", starts, 2), None)
-    settings = {"until": "window", "transient": transient, "wall": wall, "method": "exact", "dtype": "float64"}
-    growths = []
-    for done, window in enumerate((_WARM_UP, _WARM_UP + periods)):
-        planned = grid.plan(axes, ("lyapunov",), device, periods=window, **settings)
-        of = planned.cells.quantities
-        near = _started(planned, of["u0"] * (1 - _NEAR * (0.5 + place[0])), of["v0"] + _NEAR * place[1])
-        tell = _share_of(progress, done, 2)
-        run = grid.run(near, tell)
-        growths.append(run["lyapunov"] * window)
-    first, last = growths
-    # What sticks to a wall forgets its start altogether.
-    exponent = ((last - first) / periods).where(last > -np.inf, -np.inf).where(last.notnull())
-    error = exponent.std("start", ddof=1) / starts**0.5
-    found = {
-        "lyapunov": exponent.mean("start"),
-        "lyapunov_stderr": error,
-        "lyapunov_lowest": exponent.min("start", skipna=False),
-        "lyapunov_highest": exponent.max("start", skipna=False),
-    }
-    for values, text in zip(found.values(), ("largest Lyapunov exponent per forcing period", *_SPREADS), strict=True):
-        values.attrs = _described(text)
-    return xr.Dataset(found, attrs=run.attrs | {"title": "Largest Lyapunov exponents", "periods": periods})
-
-
-def _share_of(progress: Callable[[int, int], None] | None, done: int, runs: int) -> Callable[[int, int], None] | None:
-    """The progress of one of several equal runs, `done` of them over, as that of all."""
-    return progress and (lambda now, total: progress(done * total + now, runs * total))
-
-
-def survival(
-    *,
-    starts: int = 1000,
-    speed: float = SPEED,
-    seed: int | None = None,
-    periods: int = 10_000,
-    wall: str = "soft",
-    device: Harvester | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    **axes: Any,
-) -> "xr.Dataset":
-    """How long chaos lasts: chaos that ends is a transient, however much it looked like an attractor.
-
-    At eight instants up to `periods` every motion is watched for 200 periods: it is chaotic still if its tangent map
-    grows by e^7 and it meets a wall in one period of ten. What creeps towards motions that touch no wall meets ever
-    fewer, without an end; chaos of an exponent below 0.035 is not counted. Of those chaotic at one instant, the part
-    that are so at the next gives the mean lifetime by an exponential law.
-
-    Args:
-        starts, speed, seed, axes: As in `basin_fractions`.
-        periods: Forcing periods to look, at least 8.
-        wall, device, progress: As in `sweep`.
-
-    Returns:
-        Over the axes: `survival` over `after` [forcing periods], the part of all starts that are still chaotic;
-        `lifetime` [forcing periods] and `lifetime_stderr`, infinite where no chaos ended, NaN where there was none.
-
-    Raises:
-        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
-
-    Source: `tests/test_attractor.py` recovers a known lifetime.
-    """
-    import xarray as xr  # here, as importing vijax must not load it
-
-    step = whole("periods", periods, _INSTANTS) // _INSTANTS
-    after = step * np.arange(1, _INSTANTS + 1)
-    planned = plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, periods=_WATCHED, wall=wall)
-    alive = []
-    for done, instant in enumerate(after):
-        settings = planned.settings | {"until": "window", "transient": int(instant)}
-        watched = replace(planned, settings=settings, outputs=("impacts_per_period", "lyapunov", "status"))
-        found = grid.run(watched, _share_of(progress, done, _INSTANTS))
-        alive.append((found["lyapunov"] * _WATCHED > _GROWN) & (found["impacts_per_period"] > _RARE))
-    chaotic = xr.concat(alive, xr.Variable("after", after, _described("forcing periods")))
-    before, still = chaotic.isel(after=slice(None, -1)).values, chaotic.isel(after=slice(1, None)).values
-    result = _lifetime(before.sum((0, -1)), (before & still).sum((0, -1)), step)
-    cells = [dim for dim in chaotic.dims if dim not in ("after", "start")]
-    variables = {"survival": chaotic.mean("start").transpose(..., "after")}
-    variables |= {name: xr.DataArray(values, dims=cells) for name, values in result.items()}
-    for values, text in zip(variables.values(), _SURVIVAL, strict=True):
-        values.attrs = _described(text)
-    return xr.Dataset(variables, attrs=found.attrs | {"title": "Survival of chaos"})
-
-
-def _lifetime(before: np.ndarray, still: np.ndarray, step: int) -> dict[str, np.ndarray]:
-    """Mean lifetime and its standard error, of so many chaotic motions so many of which are so a step later."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        part = still / before
-        rate = abs(np.log(part)) / step
-        error = np.sqrt((1 - part) / (part * before)) / (rate * rate * step)
-        lifetime = 1 / rate
-    return {"lifetime": lifetime, "lifetime_stderr": np.where(part == 1, np.inf, error)}

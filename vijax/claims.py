@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vijax import evidence
-from vijax.attractor import survival
 from vijax.branch import Branch
 from vijax.cached import branches, diagram, orbits
+from vijax.chaos import survival
 from vijax.diagram import orbit_diagram
 from vijax.model import Harvester
 from vijax.paper import (

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vijax.attractor import basin_fractions, lyapunov
+from vijax.attractor import basin_fractions
 from vijax.branch import Branch
 from vijax.cached import diagram
+from vijax.chaos import lyapunov
 from vijax.label import label
 from vijax.model import Harvester
 from vijax.orbit import Orbit

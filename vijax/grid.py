@@ -1,36 +1,31 @@
-"""Sweeps: axes -> cells -> tiles on every device and core -> a labelled map, in memory or on disk.
+"""Sweeps: axes -> cells -> calls on every device and core -> a labelled map, in memory or on disk.
 
 `plan` checks everything that can be wrong and starts nothing, `run` does the work, `sweep` is both.
 """
 
-import itertools
 import logging
 import math
-import queue
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax import cluster, simulate, study
+from vijax import calls, cluster, study
 from vijax import method as methods
 from vijax import refine as refinement
 from vijax.axes import Cells, cells
+from vijax.calls import Call, Fields
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables
 from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
-from vijax.model import Harvester, ImpactPair
+from vijax.model import Harvester
 from vijax.store import check_output, load, save, view
-from vijax.study import LARGEST_TILE, SMALLEST_TILE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -43,8 +38,6 @@ _CHOICES = {
     "dtype": ("float64", "float32"),
 }
 _LOG = logging.getLogger(__name__)
-
-Fields = dict[str, np.ndarray]  # of `Summary`, by name
 
 
 class Axes(TypedDict, total=False):
@@ -281,7 +274,7 @@ def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
     count = planned.count
     tell(0, count)
     found: Fields = {}
-    for done in _compute(planned, np.arange(count), found):
+    for done in calls.compute(planned, np.arange(count), found):
         tell(done, count)
     return found
 
@@ -299,7 +292,7 @@ def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
     for cells_wanted in refinement.rounds(mesh, found, level_ground):
         tell(past, past + cells_wanted.size)
         # The tile of the whole plane for all rounds: one program to compile, and the one of the plane in full.
-        for done in _compute(asked, cells_wanted, found, _share(of.count)):
+        for done in calls.compute(asked, cells_wanted, found, calls.rows_each(of.count)):
             tell(past + done, past + cells_wanted.size)
         computed[cells_wanted] = True
         past += cells_wanted.size
@@ -316,23 +309,11 @@ def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
     return dataset
 
 
-def _compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
-    """Compute cells, given by flat indices, into fields over all cells; yields how many are done."""
-    of, done = planned.cells, 0
-    gamma = of.flat(of.quantities["gamma"], wanted)
-    # Level cells have a faster program, and one cell with gravity in a tile would keep all of it from that.
-    for group in (wanted[gamma == 0], wanted[gamma != 0]):
-        for index, part in _simulate_all(planned, group, rows or _share(group.size)):
-            _put(found, of.count, index, part)
-            done += index.size
-            yield done
-
-
 def _compile_ahead(planned: Plan) -> None:
     """Begin to compile what the tiles of a new store need: XLA needs no Python, and importing zarr a core."""
     most = math.prod(study.blocks(planned.cells).values())
-    tile = _Tile(planned, np.arange(min(most, planned.count)), _rows(most), 0)
-    ThreadPoolExecutor(1).submit(_compile, tile, places()[0])
+    whole = Call(planned, np.arange(min(most, planned.count)), calls.rows_for(most), 0)
+    ThreadPoolExecutor(1).submit(calls.prepare, whole, places()[0])
 
 
 def _fill(plane: study.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:
@@ -344,7 +325,7 @@ def _fill(plane: study.Study, tell: Callable[[int, int], None], workers: cluster
     try:
         tell(done, total)
         # Closed at once whatever happens, or workers would go on for as long as somebody holds the error.
-        with closing(_made(tiles, _rows(plane.most), workers)) as made:
+        with closing(_made(tiles, calls.rows_for(plane.most), workers)) as made:
             for tile in made:
                 done += tile.planned.count
                 tell(done, total)
@@ -365,12 +346,12 @@ def _here(tiles: Iterable[study.Tile], rows: int) -> Iterator[study.Tile]:
     """Tiles, simulated and written by this process, as they are done."""
     running: dict[int, study.Tile] = {}
 
-    def calls() -> Iterator[_Tile]:
+    def one_each() -> Iterator[Call]:
         for tile in tiles:
             running[tile.number] = tile
             yield _whole(tile, rows)
 
-    with closing(_in_turn(calls())) as ended:
+    with closing(calls.in_turn(one_each())) as ended:
         for call, found, seconds in ended:
             study.write(running[call.number], variables(call.planned, found), seconds)
             yield running.pop(call.number)
@@ -379,145 +360,11 @@ def _here(tiles: Iterable[study.Tile], rows: int) -> Iterator[study.Tile]:
 def _make(rows: int, tile: study.Tile) -> None:
     """Simulate and write a tile, in a worker, on its first device."""
     call, place = _whole(tile, rows), places()[0]
-    _compile(call, place)
-    found, seconds = _simulate(call, place)
+    calls.prepare(call, place)
+    found, seconds = calls.perform(call, place)
     study.write(tile, variables(tile.planned, found), seconds)
 
 
-class _Tile(NamedTuple):
-    """Cells of a plan by flat index, how many rows their call has, and which tile it is."""
-
-    planned: Plan
-    cells: np.ndarray
-    rows: int
-    number: int
-
-
-def _whole(tile: study.Tile, rows: int) -> _Tile:
+def _whole(tile: study.Tile, rows: int) -> Call:
     """All cells of a tile of a study."""
-    return _Tile(tile.planned, np.arange(tile.planned.count), rows, tile.number)
-
-
-def _rows(cells: int) -> int:
-    """Rows of the call for so many cells: a power of two, so that few programs are compiled."""
-    return max(1 << max(cells - 1, 0).bit_length(), SMALLEST_TILE)
-
-
-def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
-    """Lay a part of the cells into the fields of all."""
-    for name, values in part.items():
-        found.setdefault(name, np.empty((count, *values.shape[1:]), values.dtype))[index] = values
-
-
-def _share(cells: int) -> int:
-    """Rows of a call where there are so many cells for all devices together."""
-    return min(_rows(math.ceil(cells / len(places()))), LARGEST_TILE)
-
-
-def _simulate_all(planned: Plan, group: np.ndarray, rows: int) -> Iterator[tuple[np.ndarray, Fields]]:
-    """Flat indices and fields of `Summary` of every tile of a group of cells, as the tiles are done."""
-    if not group.size:
-        return
-    # Strided tiles are samples of the whole plane: they cost the same, and nobody is left with the slow corner.
-    number = max(math.ceil(group.size / rows), min(len(places()), math.ceil(group.size / SMALLEST_TILE)))
-    for tile, found, _ in _in_turn(_Tile(planned, group[first::number], rows, first) for first in range(number)):
-        yield tile.cells, found
-
-
-def _in_turn(tiles: Iterable[_Tile]) -> Generator[tuple[_Tile, Fields, float], None, None]:
-    """Tiles, their fields and the seconds they took, as they are done; the next ones run meanwhile."""
-    tiles, here = iter(tiles), places()
-    free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
-    for place in here:
-        free.put(place)
-    # No tile runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
-    pool = ThreadPoolExecutor(len(here))
-    running: dict[Future[tuple[Fields, float]], _Tile] = {}
-
-    def fill() -> None:
-        for tile in itertools.islice(tiles, len(here) + 1 - len(running)):  # one waits, so that nobody does
-            running[pool.submit(_where_free, tile, free)] = tile
-
-    try:
-        if len(here) > 1 and (first := next(tiles, None)):
-            # Or the first tiles' seconds would hold it.
-            wait([pool.submit(_compile, first, place) for place in set(here)])
-            tiles = itertools.chain([first], tiles)
-        fill()
-        while running:
-            done = wait(running, return_when=FIRST_COMPLETED).done
-            for future in [future for future in running if future in done]:  # in the order in which they began
-                tile = running.pop(future)
-                fill()
-                yield tile, *future.result()
-    finally:
-        # After Ctrl-C the waiting tiles are dropped, and those that run end by themselves.
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _where_free(tile: _Tile, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
-    """As `_simulate`, on a device that is free."""
-    place = free.get()
-    try:
-        return _simulate(tile, place)
-    finally:
-        free.put(place)
-
-
-def _simulate(tile: _Tile, place: jax.Device) -> tuple[Fields, float]:
-    """Fields of `Summary` for the cells of a tile, and the seconds it took."""
-    began = time.perf_counter()
-    _LOG.info("tile %d begins", tile.number)
-    found: Fields = {}
-    for part in _kinds(tile):
-        _put(found, tile.cells.size, part, _summarise(tile, tile.cells[part], part.size, place))
-    return found, time.perf_counter() - began
-
-
-def _compile(tile: _Tile, place: jax.Device) -> None:
-    """What the tile needs, without running a cell. Threads that ask for the same wait for one of them, by `jax.jit`."""
-    for part in _kinds(tile):
-        _summarise(tile, tile.cells[part], 0, place)
-
-
-def _kinds(tile: _Tile) -> list[np.ndarray]:
-    """Places of a tile's level cells, which have a faster program, and of the others; those that there are."""
-    of = tile.planned.cells
-    level = of.flat(of.quantities["gamma"], tile.cells) == 0
-    return [kind for kind in (np.flatnonzero(level), np.flatnonzero(~level)) if kind.size]
-
-
-def _summarise(tile: _Tile, index: np.ndarray, count: int, place: jax.Device) -> Fields:
-    """Fields of `Summary` for the first `count` of these cells, padded so that one program serves all."""
-    planned = tile.planned
-    of, settings = planned.cells, planned.settings
-    padded = np.resize(index, tile.rows)
-    needs = planned.needs
-
-    def column(quantity: "xr.Variable") -> jax.Array:
-        return jnp.asarray(of.flat(quantity, padded).astype(settings["dtype"]))
-
-    def factors(scale: "xr.Variable") -> jax.Array:
-        return jnp.asarray(of.factors(scale).astype(settings["dtype"]))
-
-    d, kappa, r, gamma, u0, v0 = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0"))
-    summary = simulate.summarise(
-        ImpactPair(d=d, kappa=kappa if settings["wall"] == "soft" else None, r=r, gamma=gamma),
-        u0,
-        v0,
-        simulate.Scale(
-            length=column(of.length),
-            speed=column(of.speed),
-            length_variant=factors(of.length),
-            speed_variant=factors(of.speed),
-        ),
-        jax.tree.map(lambda constant: np.asarray(constant, settings["dtype"]), planned.device),
-        periods=settings["periods"],
-        until=settings["until"],
-        transient=settings["transient"],
-        outputs=needs,
-        method=planned.method,
-        count=count,
-        on=place,
-    )
-    return {name: getattr(summary, name)[:count] for name in needs}
+    return Call(tile.planned, np.arange(tile.planned.count), rows, tile.number)
