@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
 
-TRIPS = 16  # quick trips between two rounds of serving, reviewing and refilling
+TRIPS = 8  # quick trips between two rounds of serving, reviewing and refilling
 _CHAIN_TRIPS = 4  # likewise, where lanes are few and a lane that waits holds up its chain
 _SHARE = 16  # one lane in so many makes a batch to serve or to refill: a larger one keeps slow cells waiting
 _CPU_OPTIONS = {
@@ -117,6 +117,10 @@ class _Queue(NamedTuple):
     results: Float[Array, "cell out"]
 
 
+_stored = lax.optimization_barrier
+"""Compute a value here. XLA on CPU would compute it again for every leaf that is gathered from it, in every lane."""
+
+
 def _cumulative(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
     """Running sum by doubling: on CPU ten times faster than XLA's."""
     reach = 1
@@ -135,7 +139,7 @@ def _first(
     """
     rank = _cumulative(mask.astype(jnp.int32))
     members = jnp.searchsorted(rank, jnp.arange(1, width + 1, dtype=jnp.int32))
-    return jnp.minimum(members, mask.size - 1), jnp.maximum(rank - 1, 0), mask & (rank <= width)
+    return _stored((jnp.minimum(members, mask.size - 1), jnp.maximum(rank - 1, 0), mask & (rank <= width)))
 
 
 def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
@@ -233,7 +237,7 @@ def run(
         rows = jnp.where(ready & (rows >= 0), rows, cells.shape[0])  # past the end: dropped
         results = queue.results.at[rows].set(program.unload(_take(queue.carry, members)), mode="drop")
         start = queue.waiting + jnp.arange(width, dtype=jnp.int32)
-        fresh = program.load(cells[jnp.minimum(start, cells.shape[0] - 1)])
+        fresh = _stored(program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]))
         carry = _put(queue.carry, fresh, place, chosen)
         begun = jnp.where(start < count, start, -1)
         cell = jnp.where(chosen, begun[jnp.minimum(place, width - 1)], queue.cell)
@@ -301,7 +305,7 @@ def chain(
         )
         after = state.link + 1
         goes_on = done & (after < length)
-        fresh = program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)]))
+        fresh = _stored(program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)])))
         carry = _put(state.carry, fresh, lane, goes_on)
         return _Chains(carry, jnp.where(goes_on, after, jnp.where(done, -1, state.link)), results)
 
