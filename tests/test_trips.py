@@ -1,0 +1,70 @@
+"""Trips: what a lane that declined has kept is what the careful step finds from where the lane stands."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vijax import lanes, simulate, trips
+from vijax.cell import Plan, Settings
+from vijax.model import Harvester
+
+CELLS, TRIPS = 2048, 60
+PLAN = Plan(
+    until="window",
+    stepping=None,
+    rigid=False,
+    level=True,
+    deep=True,
+    energies=False,
+    asymmetry=False,
+    tangent=False,
+    variants=1,
+)
+SETTINGS = Settings(
+    periods=jnp.asarray(1000.0),
+    transient=jnp.asarray(0.0),
+    device=jax.tree.map(jnp.asarray, Harvester()),
+    method=None,
+    length_variant=jnp.ones(1),
+    speed_variant=jnp.ones(1),
+)
+
+
+@pytest.fixture(scope="module")
+def declined():
+    """Cells after many trips and no service, of those that declined; the sampled and the careful answers to them."""
+    rng = np.random.default_rng(8)
+    one = np.ones(CELLS)
+    d, kappa = rng.uniform(0.05, 0.3, CELLS), np.exp(rng.uniform(np.log(3), np.log(400), CELLS))
+    rows = jnp.asarray(np.stack([d, kappa, 0.5 * one, 0 * one, one, one, 0 * one, 0.4 * one], axis=1))
+
+    @partial(jax.jit, compiler_options=lanes.compiler_options())
+    def work(rows):
+        fresh = simulate._load(PLAN, SETTINGS, rows)
+        cell = jax.lax.fori_loop(0, TRIPS, lambda _, cell: trips.trip(PLAN, SETTINGS, cell), fresh)
+        request = trips.request(PLAN, SETTINGS, cell)
+        return cell, trips.sampled_answer(PLAN, request), trips.careful_answer(PLAN, request)
+
+    cell, sampled, careful = jax.tree.map(np.asarray, work(rows))
+    # Of some the flight is not certain; these are for the careful step.
+    some = cell.declined & sampled.sure
+    assert 100 < some.sum() < CELLS
+    assert some.sum() > 0.7 * cell.declined.sum()
+    return some, cell, sampled.event.hit, careful.event.hit
+
+
+def test_the_kept_arrival_is_that_of_where_the_lane_stands(declined):
+    some, cell, _, careful = declined
+    np.testing.assert_array_equal(cell.arrival.side[some], careful.side[some])
+    np.testing.assert_allclose(cell.arrival.flight[some], careful.flight[some], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(cell.arrival.speed[some], np.abs(careful.v_in[some]), rtol=0, atol=1e-13)
+
+
+def test_the_sampled_answer_to_it_is_the_careful_one(declined):
+    some, _, sampled, careful = declined
+    for name in ("onset_t", "onset_n", "side", "v_in", "v_out", "flight", "duration", "depth"):
+        got, wanted = getattr(sampled, name)[some], getattr(careful, name)[some]
+        np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-12, err_msg=name)
