@@ -11,6 +11,7 @@ import pytest
 
 from vijax import simulate, trajectory
 from vijax.energy import harvested_energy
+from vijax.grid import sweep
 from vijax.model import Harvester, ImpactPair, Status
 
 DATA = Path(__file__).parent / "data"
@@ -285,3 +286,11 @@ def test_inclined_cells_know_the_50_digit_orbit_and_run_into_attractors():
     assert np.all(found.period == 1)
     assert found.lyapunov[0] == pytest.approx(largest_exponent(orbit), abs=1e-8)
     np.testing.assert_allclose(found.P[0, 0], float(orbit["P_J"]), rtol=1e-11)
+
+
+def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
+    """Its rounds failed again and again, each beginning its window anew: 7,678 periods for 400."""
+    found = sweep(d=0.05, kappa=65.9459038750667, gamma=0.1, outputs=["period", "periods_run", "status"])
+    assert int(found.status) == Status.SLOW
+    assert int(found.period) == -1
+    assert found.periods_run < 1000

@@ -168,16 +168,22 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
 
 
 def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] | float) -> Cell:
-    """A candidate that is no attractor: go on from where the round ended, with a tolerance a hundred times tighter."""
+    """A candidate that is no attractor: go on from where the round ended, with a tolerance a hundred times tighter.
+
+    What recurs to rounding and is none will not become one: the search is over, or it would hold the cell for
+    thousands of periods, each failed round beginning its window anew.
+    """
     c = cell.candidate
     zero = jnp.zeros_like(cell.since)
     ball = come_back(cell, bad)
+    rounding = jnp.finfo(zero.dtype).eps
+    tighter = jnp.where(c.tolerance > rounding, jnp.maximum(1e-2 * c.tolerance, jnp.maximum(least, rounding)), 0.0)
     new = eqx.tree_at(
         lambda x: (x.tracing, x.tolerance, x.anchor_v, x.next_anchor),
         c,
         (
             c.tracing & ~bad,
-            jnp.where(bad, jnp.maximum(1e-2 * c.tolerance, least), c.tolerance),
+            jnp.where(bad, tighter, c.tolerance),
             jnp.where(bad, jnp.inf, c.anchor_v),
             jnp.where(bad, cell.count, c.next_anchor),
         ),
