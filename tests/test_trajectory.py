@@ -10,8 +10,8 @@ import pytest
 from helpers import DIGITS, mp_march
 
 import vijax
-from vijax.lanes import compiler_options
 from vijax.model import ImpactPair, Status, impact_pair
+from vijax.xla import compiler_options
 
 IMPACTS, PERIODS = 3, 4
 H = "1e-9"

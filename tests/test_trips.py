@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax import lanes, simulate, trips
+from vijax import simulate, trips, xla
 from vijax.cell import Plan, Settings
 from vijax.model import Harvester
 
@@ -41,7 +41,7 @@ def declined():
     d, kappa = rng.uniform(0.05, 0.3, CELLS), np.exp(rng.uniform(np.log(3), np.log(400), CELLS))
     rows = jnp.asarray(np.stack([d, kappa, 0.5 * one, 0 * one, one, one, 0 * one, 0.4 * one], axis=1))
 
-    @partial(jax.jit, compiler_options=lanes.compiler_options())
+    @partial(jax.jit, compiler_options=xla.compiler_options())
     def work(rows):
         fresh = simulate._load(PLAN, SETTINGS, rows)
         cell = jax.lax.fori_loop(0, TRIPS, lambda _, cell: trips.trip(PLAN, SETTINGS, cell), fresh)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import lanes
+from vijax import lanes, xla
 from vijax import objective as aims
 from vijax import orbit as orbits
 from vijax.ascent import Box, Climb, ascend, converged
@@ -239,7 +239,7 @@ def _compiled(looks: int):
         box = Box(batch.low, batch.high, _RADIUS)
         return ascend(partial(aims.look, scene, batch), batch.z, aims.begin(scene, batch), box, looks)
 
-    return jax.jit(climb, compiler_options=lanes.compiler_options())
+    return jax.jit(climb, compiler_options=xla.compiler_options())
 
 
 class _End(NamedTuple):
@@ -356,7 +356,7 @@ def _apart(good: list[int], ends: list[_End], owner: np.ndarray) -> Iterator[lis
 
 @lru_cache(maxsize=1)
 def _compiled_states():
-    return jax.jit(jax.vmap(steady), compiler_options=lanes.compiler_options())
+    return jax.jit(jax.vmap(steady), compiler_options=xla.compiler_options())
 
 
 def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:

@@ -7,8 +7,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vijax.flow import half_turn, once
+from vijax.flow import half_turn
 from vijax.model import Harvester
+from vijax.xla import once
 
 PI = math.pi
 Values = Float[Array, "..."]

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from vijax import energy, flow
 from vijax.flow import PI, Force, Membrane
 from vijax.model import Impact, ImpactPair, State
+from vijax.xla import once, share
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -67,7 +68,7 @@ def bracketed_root(function: Callable, low: Scalar, high: Scalar, guess: Scalar,
 
     def shrink(carry):
         trip, low, high, x, _, width = carry
-        value, slope = flow.share(function(x))
+        value, slope = share(function(x))
         low, high = jnp.where(value > 0, x, low), jnp.where(value > 0, high, x)
         steep = slope != 0
         newton = x - value / jnp.where(steep, slope, 1.0)
@@ -100,7 +101,7 @@ def _half_width(force: Force) -> Scalar:
     return jnp.arccos(jnp.clip(level, -1.0, 1.0)) / PI
 
 
-@flow.once
+@once
 def _spell(force: Force, s: Scalar) -> Spell:
     """The sign of the forcing just after s, and the end of that stretch; an end within rounding of s counts as past."""
     half = _half_width(force)
@@ -156,7 +157,7 @@ def _envelope_end(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -
     return jnp.where(jnp.isfinite(bound) & spell.positive, spell.end, s)
 
 
-@flow.once
+@once
 def first_return(
     m: Membrane,
     force: Force,
@@ -184,7 +185,7 @@ def first_return(
         stretch = jnp.minimum(free, spell.end)
         leap = envelope > stretch
         ahead = jnp.minimum(jnp.where(leap, envelope, stretch), limit)
-        ahead, free, leap = flow.share((ahead, free, leap))
+        ahead, free, leap = share((ahead, free, leap))
         never = ~jnp.isfinite(ahead)
         w, z = flow.oscillate(m, force, w0, z0, jnp.where(never, s, ahead))
         falling = ~spell.positive & ~leap
@@ -195,13 +196,13 @@ def first_return(
         last = jnp.where((w > 0) & (z < 0), -w / jnp.where(z < 0, z, -1.0), 0.0)
         ahead = jnp.where(arrived, ahead + jnp.minimum(last, ahead - s), ahead)
         never = never | (~bracketed & ~arrived & (ahead >= limit))
-        bracketed, arrived, never, ahead = flow.share((bracketed, arrived, never, ahead))
+        bracketed, arrived, never, ahead = share((bracketed, arrived, never, ahead))
         return _Search(
             s=jnp.where(bracketed, s, jnp.where(never, jnp.inf, ahead)),
             w=jnp.where(bracketed, search.w, w),
             z=jnp.where(bracketed, search.z, z),
             high=jnp.where(bracketed, ahead, search.high),
-            spell=flow.share(_spell(force, ahead)),
+            spell=share(_spell(force, ahead)),
             running=~(bracketed | arrived | never),
             bracketed=bracketed,
             stage=search.stage + 1,

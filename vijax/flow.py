@@ -8,23 +8,14 @@ import math
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from vijax.model import ImpactPair
+from vijax.xla import once, share
 
 PI = math.pi
-
-once = jax.jit
-"""Marks a building block that one program contains many times: tracing it once and reusing the trace cuts the time
-before a program compiles to a third. XLA sees through it."""
-
-share = lax.optimization_barrier
-"""Store a value that several results need. XLA on CPU fuses one result at a time and would compute it again for each;
-with `lanes.compiler_options` the barrier survives until fusion: the quick step runs in half the time, a search in a
-third."""
 
 Scalar = Float[Array, ""]
 

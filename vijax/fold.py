@@ -5,11 +5,11 @@ import jax.numpy as jnp
 
 from vijax import energy
 from vijax.cell import TANGENT_SCALE, Cell, Event, Lane, Mask, Plan, Settings, Tally, batch_length, choose, last_period
-from vijax.flow import share
 from vijax.model import Status
 from vijax.quick import Hit
 from vijax.recurrence import recur
 from vijax.relay import note
+from vijax.xla import share
 
 _BUDGET = 512  # impacts per period before a cell is stopped
 

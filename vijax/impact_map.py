@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vijax import lanes, quick, trips
+from vijax import lanes, quick, trips, xla
 from vijax.cell import Event, Plan
 from vijax.model import ImpactPair
 from vijax.quick import Lanes
@@ -55,7 +55,7 @@ def _compiled(answer: Callable, plan: Plan):
         onset = 2 * hit.onset_n + hit.onset_t
         return Next(onset, hit.side, hit.v_in, hit.v_out, hit.duration, hit.depth, hit.work, real), given.sure
 
-    return jax.jit(work, compiler_options=lanes.compiler_options())
+    return jax.jit(work, compiler_options=xla.compiler_options())
 
 
 def _answered(work: Callable, requests: trips.Request) -> tuple[Next, np.ndarray]:

@@ -15,24 +15,17 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vijax.xla import in_blocks, kernel, share, whole_blocks
+
 Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
 
+Step = Callable[..., Any]
+"""A function of the loop, on arrays."""
+
 TRIPS = 8  # quick trips between two rounds of serving, reviewing and refilling
 _CHAIN_TRIPS = 4  # likewise, where lanes are few and a lane that waits holds up its chain
-_SHARE = 16  # one lane in so many makes a batch to serve or to refill: a larger one keeps slow cells waiting
-_CPU_OPTIONS = {
-    # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
-    "xla_cpu_prefer_vector_width": 512,
-    # Keeps `lax.optimization_barrier` until fusion, so that a shared value is computed once (see flow.share). The
-    # second pass hands loops of a few bytes to an emitter that does not know the barrier, and crashes.
-    "xla_disable_hlo_passes": "cse_barrier_expander,small-while-loop-hoisting,cpu-parallel-task-assigner",
-}
-
-
-def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` of a program that calls `run`, on the backend that JAX will use."""
-    return dict(_CPU_OPTIONS) if jax.default_backend() == "cpu" else {}
+_SHARE, _FEWEST = 32, 16  # one lane in so many is served or refilled together: a larger batch keeps slow cells waiting
 
 
 def workers() -> int:
@@ -80,6 +73,7 @@ class Program(NamedTuple):
         stopped, done: Carry -> which lanes are; a stopped lane waits for review.
         unload: Carry -> rows of the result table.
         service: For the rare lane that a trip declines.
+        arithmetic: Whether all of it may be put in kernels, see `xla.kernel`.
     """
 
     load: Callable[[Float[Array, "row in"]], Carry]
@@ -89,6 +83,7 @@ class Program(NamedTuple):
     done: Callable[[Carry], Bool[Array, "lane"]]
     unload: Callable[[Carry], Float[Array, "row out"]]
     service: Service | None = None
+    arithmetic: bool = True
 
 
 class Tile(NamedTuple):
@@ -109,16 +104,19 @@ def tiles(count: int, sizes: tuple[int, ...]) -> list[Tile]:
 
 
 class _Queue(NamedTuple):
-    """The loop's state: lanes, the cell each one works on (-1: idle), the next cell to start, the results."""
+    """The loop's state: lanes, the cell each one works on (-1: idle), the next cell to start."""
 
     carry: Carry
     cell: Int[Array, "lane"]
     waiting: Int[Array, ""]
-    results: Float[Array, "cell out"]
 
 
-_stored = lax.optimization_barrier
-"""Compute a value here. XLA on CPU would compute it again for every leaf that is gathered from it, in every lane."""
+class _Batch(NamedTuple):
+    """A few lanes of many: which they are, each lane's place among them (the last one's beyond), who is among them."""
+
+    members: Int[Array, "width"]
+    place: Int[Array, "lane"]
+    chosen: Bool[Array, "lane"]
 
 
 def _cumulative(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
@@ -130,16 +128,15 @@ def _cumulative(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
     return count
 
 
-def _first(
-    mask: Bool[Array, "lane"], width: int
-) -> tuple[Int[Array, "width"], Int[Array, "lane"], Bool[Array, "lane"]]:
-    """The first `width` lanes of a mask, each lane's place among them, and which lanes are among them.
+def _first(mask: Bool[Array, "lane"], width: int) -> _Batch:
+    """The first `width` lanes of a mask.
 
     By rank and binary search: gathers run at memory speed on every backend, scatters do not.
     """
     rank = _cumulative(mask.astype(jnp.int32))
     members = jnp.searchsorted(rank, jnp.arange(1, width + 1, dtype=jnp.int32))
-    return _stored((jnp.minimum(members, mask.size - 1), jnp.maximum(rank - 1, 0), mask & (rank <= width)))
+    place = jnp.clip(rank - 1, 0, width - 1)
+    return share(_Batch(jnp.minimum(members, mask.size - 1), place, mask & (rank <= width)))
 
 
 def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
@@ -151,9 +148,14 @@ def _put(carry: Carry, part: Carry, place: Int[Array, "lane"], chosen: Bool[Arra
 
     def merge(leaf, fresh):
         mask = chosen.reshape(chosen.shape + (1,) * (leaf.ndim - 1))
-        return jnp.where(mask, fresh[jnp.minimum(place, fresh.shape[0] - 1)], leaf)
+        return jnp.where(mask, fresh[place], leaf)
 
     return jax.tree.map(merge, carry, part)
+
+
+def _maker(program: Program) -> Callable[[Step], Step]:
+    """What every step of the loop goes through before it is called."""
+    return kernel if program.arithmetic else lambda step: step
 
 
 def _worker(program: Program, width: int, trips: int) -> Callable[[Int[Array, "lane"], Carry], Carry]:
@@ -164,7 +166,7 @@ def _worker(program: Program, width: int, trips: int) -> Callable[[Int[Array, "l
         width: How many lanes are served together.
         trips: Most trips of a round.
     """
-    service = program.service
+    service, made = program.service, _maker(program)
 
     def declined(cell, carry):
         return service.declined(carry) & (cell >= 0) if service else jnp.zeros_like(cell, bool)
@@ -172,38 +174,56 @@ def _worker(program: Program, width: int, trips: int) -> Callable[[Int[Array, "l
     def able(cell, carry):
         return ((cell >= 0) & ~declined(cell, carry) & ~program.stopped(carry)).sum()
 
-    def serve(cell, carry):
-        """A second try for easy lanes together, or the careful one for hard lanes."""
-        asking, hard = declined(cell, carry), service.hard(carry)
-        easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
-        members, place, chosen = _first(asking & (hard != easy), width)
-        requests = _take(service.request(carry), members)
-        if service.second is None:
-            answers = service.careful(requests)
-        else:
-            answers = lax.cond(easy, service.second, service.careful, requests)
-        return service.settle(carry, _take(answers, jnp.minimum(place, width - 1)), chosen)
-
+    @made
     def to_serve(cell, carry):
         """Whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
         asking, hard = declined(cell, carry), service.hard(carry)
         full = ((asking & ~hard).sum() >= width) | ((asking & hard).sum() >= width)
         return full | (asking.any() & (asking.sum() >= able(cell, carry)))
 
-    def keeps_on(cell, at_first, state):
+    @made
+    def ask(cell, carry):
+        """Whose turn it is, easy lanes or hard ones, and their requests."""
+        asking, hard = declined(cell, carry), service.hard(carry)
+        easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
+        batch = _first(asking & (hard != easy), width)
+        return easy, batch, _take(service.request(carry), batch.members)
+
+    @made
+    def settle(carry, answers, batch):
+        return service.settle(carry, _take(answers, batch.place), batch.chosen)
+
+    def serve(cell, carry):
+        """A second try for easy lanes together, or the careful one for hard lanes."""
+        easy, batch, requests = ask(cell, carry)
+        if service.second is None:
+            answers = made(service.careful)(requests)
+        else:
+            answers = lax.cond(easy, made(service.second), made(service.careful), requests)
+        return settle(carry, answers, batch)
+
+    def keeps_on(at_first, state):
         """Up to so many trips, fewer once half the lanes that set out wait for something else."""
-        trip, carry = state
+        trip, (cell, carry) = state
         return (trip < trips) & (2 * able(cell, carry) > at_first)
 
     def one_trip(state):
-        return state[0] + 1, program.trip(state[1])
+        trip, (cell, carry) = state
+        return trip + 1, (cell, program.trip(carry))
+
+    def some_trips(at_work):
+        going = partial(keeps_on, able(*at_work))
+        return lax.while_loop(going, one_trip, (0, at_work))[1]
+
+    @made
+    def all_trips(cell, carry):
+        return in_blocks(some_trips, (cell, carry))[1]
 
     def round_trip(cell, carry):
-        going = partial(keeps_on, cell, able(cell, carry))
-        _, carry = lax.while_loop(going, one_trip, (0, carry))
+        carry = all_trips(cell, carry)
         if service:
             carry = lax.while_loop(partial(to_serve, cell), partial(serve, cell), carry)
-        return program.review(carry)
+        return made(program.review)(carry)
 
     return round_trip
 
@@ -218,39 +238,52 @@ def run(
         cells: One row of parameters a cell.
         count: How many are real; the table may be padded.
         outputs: Length of a result row.
-        lanes: How many cells are worked on at once.
+        lanes: How many cells are worked on at once, at least.
 
     A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same
     elementwise arithmetic wherever it sits.
     """
-    width = max(lanes // _SHARE, 1)
+    lanes, made = whole_blocks(lanes), _maker(program)
+    width = min(max(lanes // _SHARE, _FEWEST), lanes)
     round_trip = _worker(program, width, TRIPS)
 
     def free(queue: _Queue) -> Bool[Array, "lane"]:
         """Lanes whose cell is done, or that wait for their first."""
         return jnp.where(queue.cell >= 0, program.done(queue.carry), queue.waiting < count)
 
-    def refill(queue: _Queue) -> _Queue:
-        members, place, chosen = _first(free(queue), width)
-        ready = jnp.arange(width, dtype=jnp.int32) < chosen.sum(dtype=jnp.int32)
-        rows = queue.cell[members]
-        rows = jnp.where(ready & (rows >= 0), rows, cells.shape[0])  # past the end: dropped
-        results = queue.results.at[rows].set(program.unload(_take(queue.carry, members)), mode="drop")
+    @made
+    def exchange(queue: _Queue) -> tuple[_Queue, Int[Array, "width"], Float[Array, "width out"]]:
+        """Lanes with new cells, and rows of the result table for those that were done; no cell: past its end."""
+        batch = _first(free(queue), width)
+        ready = jnp.arange(width, dtype=jnp.int32) < batch.chosen.sum(dtype=jnp.int32)
+        rows = queue.cell[batch.members]
+        rows = jnp.where(ready & (rows >= 0), rows, cells.shape[0])
+        found = program.unload(_take(queue.carry, batch.members))
         start = queue.waiting + jnp.arange(width, dtype=jnp.int32)
-        fresh = _stored(program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]))
-        carry = _put(queue.carry, fresh, place, chosen)
+        fresh = share(program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]))
+        carry = _put(queue.carry, fresh, batch.place, batch.chosen)
         begun = jnp.where(start < count, start, -1)
-        cell = jnp.where(chosen, begun[jnp.minimum(place, width - 1)], queue.cell)
-        return _Queue(carry, cell, queue.waiting + ready.sum(dtype=jnp.int32), results)
+        cell = jnp.where(batch.chosen, begun[batch.place], queue.cell)
+        return _Queue(carry, cell, queue.waiting + ready.sum(dtype=jnp.int32)), rows, found
 
+    def refill(state: tuple[_Queue, Float[Array, "cell out"]]) -> tuple[_Queue, Float[Array, "cell out"]]:
+        queue, results = state
+        queue, rows, found = exchange(queue)
+        return queue, results.at[rows].set(found, mode="drop")
+
+    @made
     def to_refill(queue: _Queue) -> Bool[Array, ""]:
         # With cells waiting a refill is worth its price only for several lanes; at the end nobody waits for it.
         enough = jnp.where(queue.waiting < count, width, 1)
         return free(queue).sum() >= enough
 
-    def advance(queue: _Queue) -> _Queue:
-        queue = lax.while_loop(to_refill, refill, queue)
-        return queue._replace(carry=round_trip(queue.cell, queue.carry))
+    def advance(state: tuple[_Queue, Float[Array, "cell out"]]) -> tuple[_Queue, Float[Array, "cell out"]]:
+        queue, results = lax.while_loop(lambda s: to_refill(s[0]), refill, state)
+        return queue._replace(carry=round_trip(queue.cell, queue.carry)), results
+
+    def goes_on(state):
+        queue, _ = state
+        return (queue.cell >= 0).any() | (queue.waiting < count)
 
     # Every cell is loaded by `refill`, the first ones too; until then its lane holds zeros.
     fresh = jax.eval_shape(program.load, jax.ShapeDtypeStruct((lanes, cells.shape[1]), cells.dtype))
@@ -258,9 +291,8 @@ def run(
         carry=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh),
         cell=jnp.full(lanes, -1, jnp.int32),
         waiting=jnp.asarray(0, jnp.int32),
-        results=jnp.zeros((cells.shape[0], outputs), cells.dtype),
     )
-    return lax.while_loop(lambda q: (q.cell >= 0).any() | (q.waiting < count), advance, queue).results
+    return lax.while_loop(goes_on, advance, (queue, jnp.zeros((cells.shape[0], outputs), cells.dtype)))[1]
 
 
 class _Chains(NamedTuple):
@@ -305,7 +337,7 @@ def chain(
         )
         after = state.link + 1
         goes_on = done & (after < length)
-        fresh = _stored(program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)])))
+        fresh = share(program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)])))
         carry = _put(state.carry, fresh, lane, goes_on)
         return _Chains(carry, jnp.where(goes_on, after, jnp.where(done, -1, state.link)), results)
 

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.flow import PI, share
+from vijax.flow import PI
 from vijax.membrane import Wall
 from vijax.method import Ode, Passage, decided
 from vijax.model import Impact, ImpactPair, MembranePair, State
+from vijax.xla import share
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]

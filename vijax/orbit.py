@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vijax import flow, lanes, shooting
+from vijax import flow, lanes, shooting, xla
 from vijax.curve import pieces
 from vijax.energy import harvested_energy
 from vijax.impact_map import Next, next_impacts
@@ -136,7 +136,7 @@ def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impa
 
 @lru_cache(maxsize=2)
 def _compiled(work: Callable[..., _Claim]) -> Callable[..., _Claim]:
-    return jax.jit(work, compiler_options=lanes.compiler_options())
+    return jax.jit(work, compiler_options=xla.compiler_options())
 
 
 def _tile(solved: Callable[..., _Claim], level: bool, rows: tuple) -> Orbit:

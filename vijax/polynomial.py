@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax.flow import PI, horner, once, share
+from vijax.flow import PI, horner
+from vijax.xla import once, share
 
 Lane = Float[Array, "lane"]
 

@@ -14,9 +14,10 @@ from jaxtyping import Array, Bool, Float
 
 from vijax import energy
 from vijax.exact import stick_speed
-from vijax.flow import PI, horner, membrane, once, share
+from vijax.flow import PI, horner, membrane
 from vijax.model import ImpactPair
 from vijax.polynomial import EXP_REACH, REACH, arcsine, exp, phase, sine_cosine
+from vijax.xla import once, share
 
 Lane = Float[Array, "lane"]
 

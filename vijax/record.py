@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from vijax import exact, lanes
+from vijax import exact, lanes, xla
 from vijax.model import ImpactPair, State
 from vijax.trajectory import ball_at
 
@@ -88,7 +88,7 @@ def _compiled():
 
         return lax.scan(one, (states, over), None, length=_STEPS)
 
-    return jax.jit(steps, compiler_options=lanes.compiler_options())
+    return jax.jit(steps, compiler_options=xla.compiler_options())
 
 
 def _advance(pair: ImpactPair, states: State, periods: int) -> tuple[State, np.ndarray, _Step, np.ndarray]:
@@ -147,4 +147,4 @@ def _compiled_balls():
         u, v, _ = jax.vmap(ball_at)(pair, steps.begun, steps.out, when)
         return u, v
 
-    return jax.jit(balls, compiler_options=lanes.compiler_options())
+    return jax.jit(balls, compiler_options=xla.compiler_options())

@@ -11,6 +11,7 @@ from vijax.method import Ode
 from vijax.model import Status
 from vijax.quick import Hit, Lanes
 from vijax.relay import come_back, depart
+from vijax.xla import share
 
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
 _ROUNDS = 8  # Newton rounds on one candidate
@@ -56,7 +57,7 @@ def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
     again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
     same = 1e-2 * recurrence(lag.dtype, 100 * grain(settings))
     again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < same)
-    fresh, again, found = flow.share((fresh | opening, again, found))
+    fresh, again, found = share((fresh | opening, again, found))
     return (
         Candidate(
             anchor_t=jnp.where(fresh, hit.onset_t, c.anchor_t),

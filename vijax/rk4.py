@@ -17,10 +17,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.flow import PI, share
+from vijax.flow import PI
 from vijax.membrane import Wall
 from vijax.method import Passage, Rk4, decided
 from vijax.model import Impact, ImpactPair, State
+from vijax.xla import share
 
 Scalar = Float[Array, ""]
 _ON_GRID = 1e-6  # of a step: a start so little before a sample is at it

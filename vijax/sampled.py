@@ -18,9 +18,10 @@ from jaxtyping import Array, Bool, Float
 
 from vijax import energy, flow
 from vijax.exact import stick_speed
-from vijax.flow import PI, Force, Membrane, share
+from vijax.flow import PI, Force, Membrane
 from vijax.model import ImpactPair
 from vijax.quick import Arrival, Hit, Lanes, converged_step, householder, through
+from vijax.xla import share
 
 Lane = Float[Array, "lane"]
 Mask = Bool[Array, "lane"]

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jax import export
 
-from vijax import lanes
+from vijax import xla
 from vijax.store import replacing
 
 _TRACED_BY = "jax", "jaxlib", "equinox", "diffrax"
@@ -53,7 +53,7 @@ class Program:
         def flat(*leaves):
             return self._work(*jax.tree.unflatten(tree, leaves))
 
-        options, folder = lanes.compiler_options(), _folder()
+        options, folder = xla.compiler_options(), _folder()
         if folder is None:
             return jax.jit(flat, compiler_options=options)
         path = folder / f"traced-{_DIGEST(f'{name} {_sources()}'.encode()).hexdigest()}"

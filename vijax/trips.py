@@ -14,6 +14,7 @@ from vijax.fold import fold
 from vijax.model import ImpactPair, State, Status
 from vijax.quick import Arrival, Hit, Lanes
 from vijax.recurrence import review
+from vijax.xla import share
 
 _QUIET = 64  # periods beyond the last one in which the end of a flight is still looked for
 _FOR_EVER = 1e7  # half periods
@@ -153,7 +154,7 @@ def stepping_trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """One solver step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
     old = cell.course
     step = partial(_stepping(plan).step, settings.method)
-    carry, passage, finished = flow.share(jax.vmap(step)(cell.pair, old.wall, old.carry))
+    carry, passage, finished = share(jax.vmap(step)(cell.pair, old.wall, old.carry))
     blocked = old.waits & finished
     new = Course(
         old.wall,

@@ -1,0 +1,89 @@
+"""Kernels and stored values change how a program is compiled, never what it computes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export, lax
+
+from vijax import xla
+from vijax.xla import in_blocks, kernel, share, whole_blocks
+
+X = jnp.linspace(0.1, 2.0, 192)
+MARK = "xla_cpu_small_call"
+ON_CPU = pytest.mark.skipif(jax.default_backend() != "cpu", reason="accelerators are given no kernels")
+
+
+def compiled(work, *args):
+    """The optimised program."""
+    return jax.jit(work, compiler_options=xla.compiler_options()).lower(*args).compile()
+
+
+def several(x, share=share):
+    """Several results of one value."""
+    dear = share(jnp.tan(x) * x)
+    return dear + 1, dear * 2, dear - x
+
+
+def falls(state):
+    """Each lane falls to zero by itself; the loop ends with the last one, and says after how many trips."""
+
+    def step(state):
+        left, trips = state
+        return jnp.maximum(left - 1, 0), trips + 1
+
+    return lax.while_loop(lambda state: (state[0] > 0).any(), step, state)
+
+
+def test_a_kernel_computes_what_the_function_does():
+    factor, unread = jnp.asarray(3.0), jnp.asarray(7.0)
+
+    def work(x, unused, *, rows):
+        _ = unread * unused
+        sums = lax.while_loop(lambda s: s[0].sum() < 1e6, lambda s: (factor * s[0], s[1] + x[rows]), (x, 0 * x))
+        return {"sum": sums[0], "taken": sums[1], "untouched": x}
+
+    rows = jnp.flip(jnp.arange(X.size))
+    plain = jax.jit(lambda x, unused: work(x, unused, rows=rows))(X, X)
+    made = compiled(lambda x, unused: kernel(work)(x, unused, rows=rows), X, X)(X, X)
+    jax.tree.map(np.testing.assert_array_equal, made, plain)
+
+
+@ON_CPU
+def test_a_kernel_is_one_call_also_of_a_program_that_was_kept():
+    made = jax.jit(lambda x: kernel(several)(x))
+    assert compiled(made, X).as_text().count(MARK) == 1
+    kept = export.deserialize(export.export(made)(X).serialize()).call
+    text = compiled(kept, X).as_text()
+    assert text.count(MARK) == 1
+    entry = text[text.index("ENTRY") :]
+    assert "fusion(" not in entry
+
+
+@ON_CPU
+def test_a_shared_value_is_computed_once():
+    shared, again = (compiled(lambda x, s=s: several(x, s), X).as_text() for s in (share, lambda value: value))
+    assert shared.count(" multiply(") < again.count(" multiply(")
+
+
+def test_a_shared_value_has_its_derivatives():
+    def cube(x):
+        return share((x * x, x))[0] * x
+
+    assert jax.jvp(jax.grad(cube), (2.0,), (1.0,)) == (12.0, 12.0)
+    np.testing.assert_array_equal(jax.vmap(cube)(X), X * X * X)
+
+
+def test_blocks_do_not_wait_for_each_other():
+    left = jnp.zeros(192, jnp.int32).at[70].set(9).at[130].set(4)
+    trips = jnp.zeros_like(left)
+    down, count = in_blocks(falls, (left, trips))
+    assert not down.any()
+    each = np.repeat([0, 9, 4], 64) if jax.default_backend() == "cpu" else 9
+    np.testing.assert_array_equal(count, each)
+
+
+@ON_CPU
+@pytest.mark.parametrize(("lanes", "whole"), [(1, 64), (64, 64), (65, 128), (512, 512)])
+def test_lanes_come_in_whole_blocks(lanes, whole):
+    assert whole_blocks(lanes) == whole

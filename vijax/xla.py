@@ -1,0 +1,86 @@
+"""What vijax asks of XLA: values that are stored, kernels of many operations, options of its compiler.
+
+On the CPU, XLA makes one kernel of each value that is stored and calls them one after another: with a few hundred lanes
+calls and memory cost as much as the arithmetic. It can emit a computation of many such values as one kernel, and does
+so by itself for loops of a few bytes; `kernel` asks for it by the same mark. An XLA that does not know the mark, and
+any accelerator, runs the same arithmetic without it.
+"""
+
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_CPU_OPTIONS = {
+    # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
+    "xla_cpu_prefer_vector_width": 512,
+    # Tiles already keep every core at work.
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+}
+_STAYS = {"inlineable": "false"}  # a call that XLA does not see through
+_ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
+_BLOCK = 64  # lanes: what a trip stores of them stays in the first cache; with 32 LLVM runs out of registers
+
+once = jax.jit
+"""Marks a building block that one program contains many times: tracing it once and reusing the trace cuts the time
+before a program compiles to a third. XLA sees through it."""
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
+
+
+def compiler_options() -> dict[str, Any]:
+    """Options for `jax.jit` of programs that are compiled for the backend that JAX will use."""
+    return dict(_CPU_OPTIONS) if _on_cpu() else {}
+
+
+@jax.jit
+def _same(value: Any) -> Any:
+    return value
+
+
+@once
+def share(value: Any) -> Any:
+    """Store a value that several results need: XLA on CPU fuses one result at a time, and would compute it for each.
+
+    A call that does nothing and stays a call. (A barrier is taken away before fusion, and no kernel may contain one.)
+    """
+    return set_xla_metadata(_same(value), **_STAYS) if _on_cpu() else lax.optimization_barrier(value)
+
+
+def kernel(work: Callable[P, T]) -> Callable[P, T]:
+    """The function as one kernel: arithmetic, gathers, reductions and loops, no scatter, sort or library call."""
+    if not _on_cpu():
+        return work
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        traced, shape = jax.make_jaxpr(work, return_shape=True)(*args, **kwargs)
+
+        def body(closed_over, given):
+            # Shared, every input is read: one that nothing reads would end the process.
+            return jax.core.eval_jaxpr(traced.jaxpr, share(closed_over), *share(given))
+
+        results = jax.jit(body)(traced.consts, jax.tree.leaves((args, kwargs)))
+        return jax.tree.unflatten(jax.tree.structure(shape), set_xla_metadata(results, **_ONE_KERNEL))
+
+    return call
+
+
+def whole_blocks(count: int) -> int:
+    """So many lanes or some more: what `in_blocks` parts evenly."""
+    return -(-count // _BLOCK) * _BLOCK if _on_cpu() else count
+
+
+def in_blocks(work: Callable[[T], T], lanes: T) -> T:
+    """`work` on all lanes, on the CPU block by block: lanes of one block do not wait for those of another."""
+    count = jax.tree.leaves(lanes)[0].shape[0]
+    if not _on_cpu() or count <= _BLOCK:
+        return work(lanes)
+    blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, _BLOCK, *leaf.shape[1:]), lanes)
+    return jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[2:]), lax.map(work, blocks))
