@@ -7,7 +7,7 @@ import pytest
 from jax import export, lax
 
 from vijax import xla
-from vijax.xla import in_blocks, kernel, share, whole_blocks
+from vijax.xla import in_blocks, kernel, put, share, whole_blocks
 
 X = jnp.linspace(0.1, 2.0, 192)
 MARK = "xla_cpu_small_call"
@@ -87,3 +87,15 @@ def test_blocks_do_not_wait_for_each_other():
 @pytest.mark.parametrize(("lanes", "whole"), [(1, 64), (64, 64), (65, 128), (512, 512)])
 def test_lanes_come_in_whole_blocks(lanes, whole):
     assert whole_blocks(lanes) == whole
+
+
+@pytest.mark.parametrize("count", [0, 2, 3])
+def test_rows_are_replaced_and_no_other(count):
+    lanes = {"x": jnp.arange(5.0), "yes": jnp.zeros((5, 2), bool)}
+    part = {"x": jnp.asarray([10.0, 20.0, 30.0]), "yes": jnp.ones((3, 2), bool)}
+    rows = np.asarray([4, 0, 2])
+    after = kernel(put)(lanes, part, jnp.asarray(rows, jnp.int32), jnp.asarray(count, jnp.int32))
+    expected = jax.tree.map(np.array, lanes)
+    for i, row in enumerate(rows[:count]):
+        expected["x"][row], expected["yes"][row] = part["x"][i], True
+    jax.tree.map(np.testing.assert_array_equal, after, expected)

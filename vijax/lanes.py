@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.xla import in_blocks, kernel, share, whole_blocks
+from vijax.xla import in_blocks, kernel, put, share, whole_blocks
 
 Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
@@ -112,10 +112,10 @@ class _Queue(NamedTuple):
 
 
 class _Batch(NamedTuple):
-    """A few lanes of many: which they are, each lane's place among them (the last one's beyond), who is among them."""
+    """A few lanes of many: which they are, how many are real, and for every lane whether it is among them."""
 
     members: Int[Array, "width"]
-    place: Int[Array, "lane"]
+    real: Int[Array, ""]
     chosen: Bool[Array, "lane"]
 
 
@@ -135,22 +135,17 @@ def _first(mask: Bool[Array, "lane"], width: int) -> _Batch:
     """
     rank = _cumulative(mask.astype(jnp.int32))
     members = jnp.searchsorted(rank, jnp.arange(1, width + 1, dtype=jnp.int32))
-    place = jnp.clip(rank - 1, 0, width - 1)
-    return share(_Batch(jnp.minimum(members, mask.size - 1), place, mask & (rank <= width)))
+    chosen = mask & (rank <= width)
+    return share(_Batch(jnp.minimum(members, mask.size - 1), chosen.sum(dtype=jnp.int32), chosen))
 
 
 def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
     return jax.tree.map(lambda leaf: leaf[rows], carry)
 
 
-def _put(carry: Carry, part: Carry, place: Int[Array, "lane"], chosen: Bool[Array, "lane"]) -> Carry:
-    """`carry` with the chosen lanes replaced by their places in `part`."""
-
-    def merge(leaf, fresh):
-        mask = chosen.reshape(chosen.shape + (1,) * (leaf.ndim - 1))
-        return jnp.where(mask, fresh[place], leaf)
-
-    return jax.tree.map(merge, carry, part)
+def _choose(mask: Bool[Array, "lane"], yes: Carry, no: Carry) -> Carry:
+    """Leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), yes, no)
 
 
 def _maker(program: Program) -> Callable[[Step], Step]:
@@ -191,7 +186,8 @@ def _worker(program: Program, width: int, trips: int) -> Callable[[Int[Array, "l
 
     @made
     def settle(carry, answers, batch):
-        return service.settle(carry, _take(answers, batch.place), batch.chosen)
+        blank = jax.tree.map(lambda leaf: jnp.zeros((batch.chosen.size, *leaf.shape[1:]), leaf.dtype), answers)
+        return service.settle(carry, put(blank, answers, batch.members, batch.real), batch.chosen)
 
     def serve(cell, carry):
         """A second try for easy lanes together, or the careful one for hard lanes."""
@@ -255,16 +251,13 @@ def run(
     def exchange(queue: _Queue) -> tuple[_Queue, Int[Array, "width"], Float[Array, "width out"]]:
         """Lanes with new cells, and rows of the result table for those that were done; no cell: past its end."""
         batch = _first(free(queue), width)
-        ready = jnp.arange(width, dtype=jnp.int32) < batch.chosen.sum(dtype=jnp.int32)
         rows = queue.cell[batch.members]
-        rows = jnp.where(ready & (rows >= 0), rows, cells.shape[0])
+        rows = jnp.where((jnp.arange(width, dtype=jnp.int32) < batch.real) & (rows >= 0), rows, cells.shape[0])
         found = program.unload(_take(queue.carry, batch.members))
         start = queue.waiting + jnp.arange(width, dtype=jnp.int32)
-        fresh = share(program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]))
-        carry = _put(queue.carry, fresh, batch.place, batch.chosen)
-        begun = jnp.where(start < count, start, -1)
-        cell = jnp.where(batch.chosen, begun[batch.place], queue.cell)
-        return _Queue(carry, cell, queue.waiting + ready.sum(dtype=jnp.int32)), rows, found
+        fresh = program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]), jnp.where(start < count, start, -1)
+        carry, cell = put((queue.carry, queue.cell), fresh, batch.members, batch.real)
+        return _Queue(carry, cell, queue.waiting + batch.real), rows, found
 
     def refill(state: tuple[_Queue, Float[Array, "cell out"]]) -> tuple[_Queue, Float[Array, "cell out"]]:
         queue, results = state
@@ -337,8 +330,8 @@ def chain(
         )
         after = state.link + 1
         goes_on = done & (after < length)
-        fresh = share(program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)])))
-        carry = _put(state.carry, fresh, lane, goes_on)
+        fresh = program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)]))
+        carry = _choose(goes_on, fresh, state.carry)
         return _Chains(carry, jnp.where(goes_on, after, jnp.where(done, -1, state.link)), results)
 
     def advance(state: _Chains) -> _Chains:

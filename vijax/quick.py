@@ -24,6 +24,7 @@ Lane = Float[Array, "lane"]
 _FLIGHT_TRIPS = 3  # in single precision, before the one in double
 _EXIT_TRIPS = 2
 _CREST_TRIPS = 2
+_NEAR = 64  # roundings within which an extremum may be on either side of a wall
 _DOUBT = 1e-3  # a sign or a bound that is closer is not trusted to single precision
 _DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
 
@@ -185,6 +186,43 @@ class _Flight(eqx.Module):
     never: Bool[Array, "lane"]
 
 
+class _Stretch(NamedTuple):
+    """The monotone stretch of a flight that ends at a wall, in the frame where the ball starts downwards."""
+
+    up: Bool[Array, "lane"]  # to the upper wall
+    periods: Lane  # before it begins
+    doubt: Bool[Array, "lane"]  # an extremum on the way may be a graze or a miss
+
+
+def _stretch(half: Lane, u: Lane, p: Lane, ahead: Lane, cosine: Lane) -> _Stretch:
+    """By comparing extrema with the walls, in single precision: what is closer than that can tell is in doubt.
+
+    The centre of the first stretch is a time `ahead`.
+    """
+    inside = jnp.clip(p, -1.0, 1.0)
+    angle = arcsine(inside) * (1 / PI)
+    swing = jnp.sqrt((1 - inside) * (1 + inside)) * (1 / PI**2)
+    drift = p * (1 / PI)
+    u_centre = u + drift * ahead + cosine * (1 / PI**2)
+    lowest = u_centre + drift * (0.5 - angle) - swing
+    highest = u_centre + drift * (1.5 + angle) + swing
+    lowest, highest, u_centre, drift = share((lowest, highest, u_centre, drift))
+    falls = p <= -1  # downwards for ever
+    left, right = (lowest <= -half) | falls, highest >= half
+    up = ~left & (right | (drift > 0))
+    slow_point = jnp.where(falls, u_centre + drift, lowest)
+    short = jnp.where(drift > 0, half - highest, slow_point + half)  # still to climb or sink, period by period
+    periods = jnp.ceil(short / jnp.maximum(jnp.abs(2 * drift), jnp.finfo(half.dtype).tiny))
+    periods = jnp.where((right & ~left) | (left & ~falls), 0.0, jnp.maximum(periods, 0.0))
+    margin = _NEAR * jnp.finfo(half.dtype).eps
+    beyond = jnp.where(up, highest - half, lowest + half) + 2 * drift * periods
+    near = jnp.abs(beyond) < margin
+    before = (jnp.abs(beyond - 2 * drift) < margin) & (periods > 0)
+    passed = (jnp.abs(lowest + half) < margin) | (~left & (jnp.abs(highest - half) < margin))
+    flat = jnp.abs(jnp.abs(p) - 1) < margin  # there may be extrema or none
+    return _Stretch(up, periods, ((near | before | passed) & ~falls) | flat)
+
+
 def _fly(half: Lane, lane: Lanes) -> _Flight:
     """First wall crossing without gravity: pick the one monotone stretch that holds it, then Kepler's equation.
 
@@ -201,37 +239,16 @@ def _fly(half: Lane, lane: Lanes) -> _Flight:
     u = flip * lane.u
     p = flip * PI * lane.v - sine
     u, t, p, cosine = share((u, t, p, cosine))
-    inside = jnp.clip(p, -1.0, 1.0)
-    angle = arcsine(inside) * (1 / PI)
-    swing = jnp.sqrt((1 - inside) * (1 + inside)) * (1 / PI**2)
+    centre = jnp.where(t < 0.5, -0.5, 1.5).astype(t.dtype)
+    stretch = _stretch(*_single((half, u, p, centre - t, cosine)))
+    wall = jnp.where(stretch.up, 1.0, -1.0).astype(half.dtype)
+    periods = stretch.periods.astype(half.dtype)
     drift = p * (1 / PI)
-    centre = jnp.where(t < 0.5, -0.5, 1.5)
-    u_centre = u + drift * (centre - t) + cosine * (1 / PI**2)
-    lowest = u_centre + drift * (0.5 - angle) - swing
-    highest = u_centre + drift * (1.5 + angle) + swing
-    lowest, highest, u_centre, drift = share((lowest, highest, u_centre, drift))
-    falls = p <= -1  # downwards for ever
-    left, right = (lowest <= -half) | falls, highest >= half
-    up = ~left & (right | (drift > 0))
-    slow_point = jnp.where(falls, u_centre + drift, lowest)
-    short = jnp.where(drift > 0, half - highest, slow_point + half)  # still to climb or sink, period by period
-    periods = jnp.ceil(short / jnp.maximum(jnp.abs(2 * drift), jnp.finfo(half.dtype).tiny))
-    periods = jnp.where((right & ~left) | (left & ~falls), 0.0, jnp.maximum(periods, 0.0))
-    # An extremum within rounding of the wall may be a graze or a miss: not for here.
-    margin = 512 * eps
-    lift = 2 * drift * periods
-    near = jnp.abs(jnp.where(up, highest, lowest) + lift - jnp.where(up, half, -half)) < margin
-    before = (jnp.abs(jnp.where(up, highest, lowest) + lift - 2 * drift - jnp.where(up, half, -half)) < margin) & (
-        periods > 0
-    )
-    passed = (jnp.abs(lowest + half) < margin) | (~left & (jnp.abs(highest - half) < margin))
-    wall = jnp.where(up, 1.0, -1.0).astype(half.dtype)
-    centre = centre + jnp.where(up, 1.0, 0.0) + 2 * periods
-    away = centre - t
+    away = centre + jnp.where(stretch.up, 1.0, 0.0) + 2 * periods - t
     slope = wall * p
     goal = PI**2 * (half - wall * (u + drift * away + cosine * (1 / PI**2)))
     never = periods > 1e7
-    slope, goal, away, doubt = share((slope, goal, away, (near | before | passed) & ~falls))
+    slope, goal, away, doubt = share((slope, goal, away, stretch.doubt))
     y, step, sine, cosine = _kepler(slope, goal)
     square = step * step
     turn_sine, turn_cosine = step * (1 - square * (1 / 6)), 1 - square * (0.5 - square * (1 / 24))

@@ -11,8 +11,10 @@ from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array, Int
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -88,3 +90,21 @@ def in_blocks(work: Callable[[T], T], lanes: T) -> T:
         return work(lanes)
     blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, _BLOCK, *leaf.shape[1:]), lanes)
     return jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[2:]), lax.map(work, blocks))
+
+
+def put(lanes: T, part: T, rows: Int[Array, "row"], count: Int[Array, ""]) -> T:
+    """`lanes` with the first `count` of these rows replaced by those of `part`.
+
+    On the CPU one after another: a scatter cannot be in a kernel, and what is merged otherwise is read in every lane.
+    """
+    if not _on_cpu():
+        at = jnp.where(jnp.arange(rows.size, dtype=count.dtype) < count, rows, jax.tree.leaves(lanes)[0].shape[0])
+        return jax.tree.map(lambda leaf, new: leaf.at[at].set(new, mode="drop"), lanes, part)
+
+    def one(i, lanes):
+        def replaced(leaf, new):
+            return lax.dynamic_update_slice_in_dim(leaf, lax.dynamic_slice_in_dim(new, i, 1), rows[i], 0)
+
+        return jax.tree.map(replaced, lanes, part)
+
+    return lax.fori_loop(0, count, one, lanes)
