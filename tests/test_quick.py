@@ -60,6 +60,40 @@ def test_it_is_sure_of_nearly_every_step(both):
     assert sure[impacts].mean() > 0.95
 
 
+def near_grazes(rng, count):
+    """Level flights with an extremum 1e-14 to 1e-2 on either side of a wall; some all but monotone, some that drift."""
+    drift = rng.choice(3, count)
+    p = rng.uniform(-1.3, 1.3, count)
+    sign, size = np.sign(p), 10.0 ** rng.uniform(-14, -1, count)
+    p = np.select([drift == 1, drift == 2], [sign * (1 + rng.choice([-1, 1], count) * size), sign * size], p)
+    t0, d, lower = rng.uniform(0, 2, count), 10.0 ** rng.uniform(-2, 0.3, count), rng.random(count) < 0.5
+    angle = np.arcsin(np.clip(p, -1, 1)) / np.pi
+    extremum = np.where(lower, -angle, 1 + angle)
+    extremum += 2 * (np.ceil((t0 - extremum) / 2) + rng.integers(0, 6, count))
+    rise = p / np.pi * (extremum - t0) - (np.cos(np.pi * extremum) - np.cos(np.pi * t0)) / np.pi**2
+    off = rng.choice([-1, 1], count) * 10.0 ** rng.uniform(-14, -2, count)
+    u, v = np.where(lower, -d, d) / 2 + off - rise, (p + np.sin(np.pi * t0)) / np.pi
+    flip = rng.choice([-1, 1], count)
+    inside = np.abs(u) <= d / 2
+    return tuple(x[inside] for x in (d, flip * u, flip * v, np.where(flip > 0, t0, (t0 + 1) % 2)))
+
+
+def test_no_crossing_is_missed_beside_a_graze():
+    d, u, v, t = (x[:4096] for x in near_grazes(np.random.default_rng(8), 40_000))
+    pair = jax.tree.map(jnp.asarray, pairs(d, None, 0.5, 0.0))
+    lane = quick.Lanes(*map(jnp.asarray, (u, v, t, np.zeros_like(t))))
+    step = jax.jit(lambda pair, lane: quick.quick_step(quick.prepare(pair), jnp.zeros_like(lane.u), lane))
+    careful = jax.jit(jax.vmap(exact.step, in_axes=(0, 0, None)))
+    hit, _, sure, never = jax.tree.map(np.asarray, step(pair, lane))
+    out = careful(pair, jax.tree.map(jnp.asarray, start(u, v, t)), HORIZON)
+    assert u.size == 4096
+    assert 0.2 < sure.mean() < 0.8
+    assert not never.any()
+    told = sure & (hit.flight < HORIZON)
+    np.testing.assert_array_equal(hit.side[told], out.impact.side[told])
+    np.testing.assert_allclose(hit.flight[told], out.flight[told], rtol=1e-6, atol=1e-6)
+
+
 def test_patience_decides_or_says_that_it_did_not():
     """A limited patience gives the unlimited answer or NaN (it once gave the depth found so far)."""
     rng = np.random.default_rng(5)
