@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Bool, Float
 
-from vijax import lanes
+from vijax import lanes, xla
 
 Lane = Float[Array, "lane"]
 
@@ -151,6 +151,18 @@ def test_every_cell_ends_as_in_a_plain_loop_of_its_own(kinds):
 def test_results_do_not_depend_on_the_number_of_lanes(width):
     cells = draw(600, [EASY, DECLINES, HARD])
     assert np.array_equal(results(cells, width), [plain(row) for row in cells])
+
+
+def test_an_accelerator_is_given_no_kernels_and_the_same_results(monkeypatch):
+    cells = draw(600, [EASY, DECLINES, HARD])
+    monkeypatch.setattr(xla, "_on_cpu", lambda: False)
+
+    @jax.jit
+    def as_there(cells):
+        return lanes.run(PROGRAM, cells, jnp.asarray(len(cells), jnp.int32), OUTPUTS, 100)
+
+    assert "xla_cpu" not in as_there.lower(jnp.asarray(cells)).as_text()
+    assert np.array_equal(as_there(jnp.asarray(cells)), [plain(row) for row in cells])
 
 
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 599, 600])
