@@ -78,6 +78,11 @@ class Ode(eqx.Module):
     law: Law
     dt: Real | None = None
 
+    @property
+    def arithmetic(self) -> bool:
+        """Whether a step calls no library: the implicit solvers leave their linear systems to LAPACK."""
+        return not self.solver.startswith("Kvaerno")
+
 
 class Rk4(eqx.Module):
     """The paper's method: classical Runge-Kutta steps of constant length, no event located.
@@ -89,6 +94,11 @@ class Rk4(eqx.Module):
 
     steps: Real
     law: Law
+
+    @property
+    def arithmetic(self) -> bool:
+        """Whether a step calls no library."""
+        return True
 
 
 Method = Ode | Rk4

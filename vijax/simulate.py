@@ -77,7 +77,7 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
         stopped=lambda cell: ~cell.running,
         done=lambda cell: cell.done,
         unload=lambda cell: pack(unload(plan, settings, cell)),
-        arithmetic=plan.stepping is None,
+        arithmetic=settings.method is None or settings.method.arithmetic,
     )
     if plan.stepping:
         return program
