@@ -99,7 +99,8 @@ def timed(what: str, side: int, periods: int, repeat: int, call: Callable[[], An
 
 def typical(rows: list[Row], what: str) -> Row:
     """The median of the repeats of one thing."""
-    return statistics.median_low(sorted((row for row in rows if row.what == what), key=lambda row: row.seconds))
+    repeats = sorted((row for row in rows if row.what == what), key=lambda row: row.seconds)
+    return repeats[(len(repeats) - 1) // 2]
 
 
 def against_peer(quick: bool) -> Iterator[Row]:
