@@ -11,9 +11,9 @@ without a number has an infinite error. The time is that of a warm call on many 
 compilation stands beside it. Typical printout, two cores:
 
     2 cores, cpu, JAX 0.10.2
-    soft, kappa = 4          exact               float64       0.555 us  error 1.5e-16
-    soft, kappa = 4          exact float32       float32       0.389 us  error 1.3e-07
-    soft, kappa = 4          ode Tsit5           1e-8           14.9 us  error 2.2e-09
+    soft, kappa = 4          exact               float64       0.285 us  error 1.5e-16
+    soft, kappa = 4          exact float32       float32       0.168 us  error 1.3e-07
+    soft, kappa = 4          ode Tsit5           1e-8           9.89 us  error 2.2e-09
 """
 
 import argparse
