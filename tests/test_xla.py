@@ -99,3 +99,13 @@ def test_rows_are_replaced_and_no_other(count):
     for i, row in enumerate(rows[:count]):
         expected["x"][row], expected["yes"][row] = part["x"][i], True
     jax.tree.map(np.testing.assert_array_equal, after, expected)
+
+
+@ON_CPU
+def test_what_the_user_says_in_xla_flags_comes_first(monkeypatch):
+    name = "xla_backend_optimization_level"
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    assert name in xla.compiler_options()
+    monkeypatch.setenv("XLA_FLAGS", f"--{name}=3")
+    assert name not in xla.compiler_options()
+    assert xla.compiler_options()

@@ -10,7 +10,6 @@ transient.
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -170,8 +169,3 @@ def batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
     """Periods of a batch behind the standard error."""
     window = settings.periods * (1.0 if plan.until == "window" else 1 - TRANSIENT_SHARE)
     return jnp.maximum(jnp.floor(window / BATCHES), 1.0)
-
-
-def choose(mask: Mask, new, old):
-    """`new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
-    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)

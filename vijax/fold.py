@@ -4,7 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from vijax import energy
-from vijax.cell import TANGENT_SCALE, Cell, Event, Lane, Mask, Plan, Settings, Tally, batch_length, choose, last_period
+from vijax.cell import TANGENT_SCALE, Cell, Event, Lane, Mask, Plan, Settings, Tally, batch_length, last_period
+from vijax.lanes import choose
 from vijax.model import Status
 from vijax.quick import Hit
 from vijax.recurrence import recur

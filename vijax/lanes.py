@@ -143,9 +143,9 @@ def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
     return jax.tree.map(lambda leaf: leaf[rows], carry)
 
 
-def _choose(mask: Bool[Array, "lane"], yes: Carry, no: Carry) -> Carry:
-    """Leaf by leaf."""
-    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), yes, no)
+def choose(mask: Bool[Array, "lane"], new: Carry, old: Carry) -> Carry:
+    """`new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
 def _maker(program: Program) -> Callable[[Step], Step]:
@@ -331,7 +331,7 @@ def chain(
         after = state.link + 1
         goes_on = done & (after < length)
         fresh = program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)]))
-        carry = _choose(goes_on, fresh, state.carry)
+        carry = choose(goes_on, fresh, state.carry)
         return _Chains(carry, jnp.where(goes_on, after, jnp.where(done, -1, state.link)), results)
 
     def advance(state: _Chains) -> _Chains:

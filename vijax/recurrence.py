@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vijax import flow
-from vijax.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally, choose
+from vijax.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally
+from vijax.lanes import choose
 from vijax.method import Ode
 from vijax.model import Status
 from vijax.quick import Hit, Lanes

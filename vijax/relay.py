@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from vijax import flow
-from vijax.cell import Cell, Lane, Mask, Relay, Settings, choose
+from vijax.cell import Cell, Lane, Mask, Relay, Settings
+from vijax.lanes import choose
 from vijax.model import ImpactPair, Status
 from vijax.quick import Hit, Lanes
 

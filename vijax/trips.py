@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from vijax import exact, flow, quick, sampled
-from vijax.cell import Cell, Course, Event, Lane, Mask, Plan, Settings, choose, last_period
+from vijax.cell import Cell, Course, Event, Lane, Mask, Plan, Settings, last_period
 from vijax.fold import fold
+from vijax.lanes import choose
 from vijax.model import ImpactPair, State, Status
 from vijax.quick import Arrival, Hit, Lanes
 from vijax.recurrence import review

@@ -52,12 +52,16 @@ def _same(value: Any) -> Any:
 
 
 @once
+def _kept(value: Any) -> Any:
+    return set_xla_metadata(_same(value), **_STAYS)
+
+
 def share(value: Any) -> Any:
     """Store a value that several results need: XLA on CPU fuses one result at a time, and would compute it for each.
 
     A call that does nothing and stays a call. (A barrier is taken away before fusion, and no kernel may contain one.)
     """
-    return set_xla_metadata(_same(value), **_STAYS) if _on_cpu() else lax.optimization_barrier(value)
+    return _kept(value) if _on_cpu() else lax.optimization_barrier(value)
 
 
 def kernel(work: Callable[P, T]) -> Callable[P, T]:
