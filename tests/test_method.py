@@ -8,7 +8,7 @@ import vijax
 from vijax import HuntCrossley, sweep
 from vijax.membrane import Linear
 from vijax.method import OPTIONS, Ode, choose, record
-from vijax.model import ImpactPair, impact_pair
+from vijax.model import ImpactPair, Status, impact_pair
 
 PLANE = {"d": np.linspace(0.08, 0.3, 6), "kappa": np.geomspace(4, 300, 6), "r": 0.5, "u0": 0.0, "v0": 0.4}
 
@@ -180,3 +180,18 @@ def test_hunt_crossley_maps():
     assert float(restitution.max()) < 1
     assert float(restitution.max() - restitution.min()) > 0.01  # it is a result: slower impacts lose less
     assert "hunt-crossley" in found.attrs["membrane"]
+
+
+def test_a_plane_by_an_implicit_solver():
+    """Its linear systems are LAPACK's, which no kernel may call."""
+    told = {
+        "d": 0.12,
+        "kappa": 40.0,
+        "until": "window",
+        "periods": 3,
+        "method": "ode",
+        "outputs": ["impacts_per_period"],
+    }
+    implicit, explicit = sweep(solver="Kvaerno3", **told), sweep(solver="Tsit5", **told)
+    assert int(implicit.status) == Status.OK
+    assert float(implicit.impacts_per_period) == float(explicit.impacts_per_period)
