@@ -3,13 +3,17 @@
     python scripts/branch.py
     python scripts/branch.py --wall rigid --d 0.19 --impacts RLL --along d=0.1:0.3
     python scripts/branch.py --s 0.2 --omega 11 --impacts 1:1/3T --along omega=2.5:13 --generations 2
+    python scripts/branch.py --s 0.3 --along omega0=20:400 --quantity P
 
 The orbits start at the parameters given, with the impacts asked for: walls in order, such as RLL, or a label n:m/pT.
+Where the parameter that is followed is not given, they start at the device's own value, or where there are orbits
+within its bounds.
 """
 
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,9 +21,12 @@ import command
 
 if TYPE_CHECKING:
     from vijax.branch import Branch
+    from vijax.model import Harvester, ImpactPair
+    from vijax.orbit import Orbit
 
 _DEFAULT_FILES = ("branch.zarr", "branch.png")
 _START = {"d": "0.2", "kappa": "400"}
+_PARTS = (1 / 2, 1 / 4, 3 / 4, 1 / 8, 3 / 8, 5 / 8, 7 / 8)  # of the bounds: where orbits to begin with are looked for
 
 
 def _options() -> list[click.Parameter]:
@@ -54,7 +61,7 @@ def branch(
     overwrite: bool,
     **given: Any,
 ) -> None:
-    """Follow periodic orbits along d, kappa, r, gamma or omega, and say what they meet.
+    """Follow periodic orbits along d, kappa, r, gamma, omega, omega0, k, s, A or beta, and say what they meet.
 
     With neither --out nor --plot, branch.zarr and branch.png are written.
     """
@@ -64,23 +71,23 @@ def branch(
 
     with command.door():
         store, picture = command.targets(out, plot, _DEFAULT_FILES, overwrite)
-        pair, device = command.at_one_point(command.take_axes(given, _START), command.device(constants), wall)
         name, within = _bounds(along)
+        chosen = given.get(name) is not None
+        # Along a quantity of the device it is a device that is given, of Tables I and II unless otherwise.
+        start = {} if name in command.DEVICE else _START
+        pair, device = command.at_one_point(command.take_axes(given, start), command.device(constants), wall)
         if guesses < 1 or generations < 0:
             raise ValueError(f"guesses must be at least 1 and generations at least 0; got {guesses}, {generations}")
         orbit.sequences(impacts)
-        branches.check_bounds(pair, name, within, device)
+        branches.check_along(pair, name, within)
+        places = list(_places(float(branches.value_at(pair, name, device)), name, within, chosen))
         chart.check_branch_quantity(quantity)
         if picture is not None:
             check_format(picture)
     command.keep_compiled()
     began = time.perf_counter()
-    found = orbit.search(pair, impacts, guesses=guesses)
     with command.door():
-        if not len(found):
-            raise ValueError(
-                f"impacts must be those of an orbit at the start; got none with {impacts}; try more guesses"
-            )
+        found = _found(pair, name, places, device, impacts, guesses)
     followed = branches.family(found, name, within, device=device, generations=generations)
     seconds = time.perf_counter() - began
     dataset = branches.dataset(followed, device)
@@ -99,6 +106,34 @@ def _bounds(along: str) -> tuple[str, tuple[float, float]]:
         raise ValueError(f"along must be NAME=LO:HI, as in d=0.1:0.3; got {along!r}")
     low, high = parse_axis(name, text.replace(":", ","))
     return name, (float(low), float(high))
+
+
+def _places(own: float, name: str, within: tuple[float, float], chosen: bool) -> Iterator[float]:
+    """Where branches may begin: at the device's own value and, unless that was chosen, elsewhere in the bounds."""
+    low, high = within
+    if low <= own <= high:
+        yield own
+    elif chosen:
+        raise ValueError(f"{name} must lie within the bounds of along to begin there; got {own:.6g}; leave it out")
+    if not chosen:
+        yield from (low + part * (high - low) for part in _PARTS)
+
+
+def _found(
+    pair: "ImpactPair", name: str, places: list[float], device: "Harvester", impacts: str, guesses: int
+) -> "Orbit":
+    """The orbits at the first place that has any."""
+    from vijax import branch as branches
+    from vijax import orbit
+
+    for place in places:
+        if len(found := orbit.search(branches.pair_at(pair, name, place, device), impacts, guesses=guesses)):
+            return found
+    tried = ", ".join(f"{place:.6g}" for place in places)
+    raise ValueError(
+        f"impacts must be those of an orbit where the branch begins; got none with {impacts} at {name} = "
+        f"{tried}; try more guesses"
+    )
 
 
 def _summary(followed: "list[Branch]", seconds: float) -> str:

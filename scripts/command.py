@@ -43,6 +43,7 @@ AXES = {
 }
 # One physical name among these, and the plane is the device's: what is not given is taken from Tables I and II.
 PHYSICAL = {"s", "omega0", "k"}
+DEVICE = PHYSICAL | {"omega", "A", "beta"}
 
 
 def axis_options(**changed: str | None) -> list[click.Parameter]:

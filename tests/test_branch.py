@@ -1,12 +1,13 @@
 """Branches: the bifurcations of the rigid wall at their known places, each with the multiplier that makes it one."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from vijax import branch, chart
 from vijax import orbit as orbits
-from vijax.model import Harvester, Status, impact_pair
+from vijax.model import Harvester, Status, impact_pair, with_constants
 from vijax.shooting import Sequence
 
 SPAN = (0.1, 0.3)
@@ -103,8 +104,9 @@ def test_the_dataset_and_its_picture(family, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"along": "omega0"}, "along must be one of"),
-        ({"along": "kappa"}, "a rigid wall has no kappa"),
+        ({"along": "omega0"}, "a rigid wall has none"),
+        ({"along": "u0"}, "along must be one of d, kappa"),
+        ({"along": "kappa"}, "a rigid wall has none"),
         ({"within": (0.3, 0.1)}, "within must be two bounds"),
         ({"within": (0.1,)}, "within must be two bounds"),
         ({"points": 1}, "points must be a whole number"),
@@ -122,3 +124,36 @@ def test_bad_input_is_told(family, change, message):
 def test_nothing_begins_at_a_grazing(family):
     with pytest.raises(ValueError, match="point must be a flip"):
         branch.switch(points(family, "grazing flight")[0], "d", SPAN)
+
+
+DEVICE = Harvester(s=0.2, omega0=60.0, beta=0.01)
+OTHER = {"omega": 3.3, "omega0": 70.0, "k": 10.0, "s": 0.21, "A": 1.2, "beta": -0.02}
+
+
+@pytest.mark.parametrize("along", OTHER)
+@pytest.mark.parametrize("wall", ["soft", "rigid"])
+def test_a_quantity_of_the_device_moves_the_pair_as_it_does_the_device(along, wall):
+    pair = DEVICE.pair(wall)
+    assert float(branch.value_at(DEVICE.pair(), along, DEVICE)) == pytest.approx(getattr(DEVICE, along), rel=1e-14)
+    if wall == "rigid" and along in ("omega0", "k"):
+        return
+    there = branch.pair_at(pair, along, OTHER[along], DEVICE)
+    for own, expected in zip(
+        jax.tree.leaves(there), jax.tree.leaves(with_constants(DEVICE, **{along: OTHER[along]}).pair(wall)), strict=True
+    ):
+        assert float(own) == pytest.approx(float(expected), rel=1e-14, abs=1e-17)
+
+
+def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
+    found = orbits.search(DEVICE.pair("rigid"), "RL", guesses=32)
+    (one,) = branch.follow(found[:1], "A", (1, 2), device=DEVICE, direction="up", points=8)
+    assert one.values[0] == pytest.approx(1.0, abs=1e-14)
+    assert one.values[-1] > 1.004
+    assert (np.asarray(one.orbit.status) == Status.OK).all()
+    shaken = with_constants(DEVICE, A=jnp.asarray(one.values)).pair("rigid")
+    np.testing.assert_allclose(one.orbit.pair.d, shaken.d, rtol=1e-14)
+    np.testing.assert_allclose(one.orbit.pair.gamma, shaken.gamma, rtol=1e-14)
+    table = branch.dataset([one], DEVICE)
+    assert table["A"].attrs["units"] == "m s-2"
+    last = with_constants(DEVICE, A=float(one.values[-1]))
+    assert float(table["P"][0, -1]) == pytest.approx(float(orbits.power(one.orbit[-1:], last)[0]), rel=1e-12)

@@ -13,11 +13,21 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import clearance, elimination, flow, lanes, shooting
+from vijax import clearance, elimination, lanes, shooting
 from vijax.model import ImpactPair
 from vijax.shooting import Sequence
 
-ALONG = ("d", "kappa", "r", "gamma", "omega")
+# Powers with which d, kappa and gamma go in a quantity of the device, by Eqs. (37)-(38).
+_POWERS = {
+    "omega": {"d": 2, "kappa": -1},
+    "omega0": {"kappa": 1},
+    "k": {"kappa": 0.5},
+    "s": {"d": 1},
+    "A": {"d": -1, "gamma": -1},
+}
+# What moves with each quantity that a branch can be followed along: of the pair itself alone, of the device several.
+MOVED = {name: (name,) for name in ("d", "kappa", "r", "gamma")}
+MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("gamma",)}
 CLOSE = 1e-11  # size of the last correction
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
 _ROUNDS = 6  # Newton corrections of a step, at most
@@ -41,28 +51,39 @@ FOLD, PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
 FIRST_END = Tests._fields.index("speed")
 
 
+def moved(pair: ImpactPair, along: str, x: Array, start: Array, steepest: Array) -> ImpactPair:
+    """A pair where a parameter, which was `start` there, is x; `steepest` is g/A, gamma of a vertical tube."""
+    fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
+    if along == "beta":
+        fields["gamma"] = steepest * jnp.sin(x)
+    elif along not in _POWERS:
+        fields[along] = x
+    for name, power in _POWERS.get(along, {}).items():
+        if fields[name] is not None:  # as kappa of a rigid wall is
+            fields[name] = fields[name] * (x / start) ** power
+    return ImpactPair(**fields)
+
+
 class Arc(eqx.Module):
     """What a lane follows: the orbit's parameters where it began, its walls, and which parameter moves.
 
     Attributes:
-        ratio: s/A of the device, that fixes d at a frequency (along="omega" only).
-        scale: Range of the parameter, the unit of its share of the arclength.
+        start: The parameter where the orbit began.
+        steepest: g/A of the device, gamma of a vertical tube (along="beta" only).
+        low, high: Bounds of the parameter; their distance is the unit of its share of the arclength.
     """
 
     pair: ImpactPair
     sequence: Sequence
-    ratio: Float[Array, ""]
+    start: Float[Array, ""]
+    steepest: Float[Array, ""]
     low: Float[Array, ""]
     high: Float[Array, ""]
     along: str = eqx.field(static=True)
 
     def at(self, x: Float[Array, ""]) -> ImpactPair:
         """The pair at a value of the parameter."""
-        if self.along != "omega":
-            return eqx.tree_at(lambda pair: getattr(pair, self.along), self.pair, x)
-        d = self.ratio * (x / flow.PI) ** 2
-        kappa = None if self.pair.kappa is None else self.pair.kappa * jnp.sqrt(self.pair.d / d)
-        return ImpactPair(d, kappa, self.pair.r, self.pair.gamma)
+        return moved(self.pair, self.along, x, self.start, self.steepest)
 
 
 def unpack(arc: Arc, y):

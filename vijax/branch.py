@@ -3,7 +3,7 @@
 A sign change of a test function is located on the arc, and says what it was: a bifurcation, or why the branch ends.
 """
 
-import dataclasses
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vijax import flow, shooting
 from vijax import orbit as orbits
-from vijax.arc import ALONG, CLOSE, FIRST_END, FOLD, PLUS, Arc, Place, Tests, advance, unpack
+from vijax import shooting
+from vijax.arc import CLOSE, FIRST_END, FOLD, MOVED, PLUS, Arc, Place, Tests, advance, moved, unpack
 from vijax.axes import AXES
 from vijax.method import whole
-from vijax.model import Harvester, ImpactPair, Status, check
+from vijax.model import Harvester, ImpactPair, Status, check, with_constants
 from vijax.orbit import Orbit
 
 if TYPE_CHECKING:
@@ -162,10 +162,12 @@ def follow(
 
     Args:
         orbit: Where to start, each a branch of its own; all at once.
-        along: "d", "kappa", "r", "gamma", or "omega" [rad/s] at fixed device.
+        along: "d", "kappa", "r", "gamma", or a quantity of the device, which moves several of them together: "omega",
+            "omega0" [rad/s], "s" [m], "A" [m/s^2], "beta" [rad] or "k" [N/m].
         within: Bounds of the parameter; the starts lie between.
         direction: "up" or "down" in the parameter at first, or "both".
-        device: For "omega": its s and A say at which omega the orbit is.
+        device: For a quantity of the device: its other constants, which stay, say at which value of it the orbit is.
+            So omega and A follow from d and s, s from d, omega0 and k from kappa, beta from gamma.
         points: Most orbits of a branch each way.
 
     Returns:
@@ -203,32 +205,63 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
         raise ValueError(f"orbit must hold orbits only; got {Status(int(orbit.status[index])).name} at index {index}")
     device = Harvester() if device is None else device
     x = check_bounds(orbit.pair, along, within, device)
-    if along == "gamma" and bool(orbit.sequence.mirrored.any()):
-        raise ValueError("orbit must be closed in full to be followed along gamma; got one closed half way; unfold it")
+    if _tilts(along) and bool(orbit.sequence.mirrored.any()):
+        raise ValueError(
+            f"orbit must be closed in full to be followed along {along}; got one closed half way; unfold it"
+        )
     size, (low, high) = len(orbit), within
-    ratio = jnp.full(size, device.s / device.A)
-    arcs = Arc(orbit.pair, orbit.sequence, ratio, jnp.full(size, low), jnp.full(size, high), along)
+    steepest, low_end, high_end = (jnp.full(size, float(x)) for x in (device.g / device.A, low, high))
+    arcs = Arc(orbit.pair, orbit.sequence, x, steepest, low_end, high_end, along)
     # By NumPy from here on: branches differ in length, and JAX would compile a program for each.
     arcs = jax.tree.map(np.asarray, arcs)
     knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 
+def _tilts(along: str) -> bool:
+    """Whether gravity along the axis moves alone, and with it the symmetry of the walls goes."""
+    return along in ("gamma", "beta")
+
+
 def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> Array:
     """The parameter's value at a pair, or ValueError unless it can be followed from there within the bounds."""
-    if along not in ALONG or (along == "kappa" and pair.kappa is None):
-        rigid = "; a rigid wall has no kappa" if pair.kappa is None else ""
-        raise ValueError(f"along must be one of {', '.join(ALONG)}; got {along!r}{rigid}")
-    if len(within) != 2 or not within[0] < within[1]:
-        raise ValueError(f"within must be two bounds, the lower first; got {within}")
-    low, high = within
-    for bound in within:
-        check(along, bound)
-    # The frequency at which the device's gap is d.
-    x = flow.PI * jnp.sqrt(pair.d * device.A / device.s) if along == "omega" else getattr(pair, along)
+    low, high = check_along(pair, along, within)
+    x = value_at(pair, along, device)
     if not bool(((x >= low) & (x <= high)).all()):
         raise ValueError(f"within must hold the start; got {within} and {along} = {float(jnp.ravel(x)[0]):.6g}")
     return x
+
+
+def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tuple[float, float]:
+    """Bounds of a parameter, or ValueError unless branches of a pair with such walls can be followed between them."""
+    soft_only = pair.kappa is None and set(MOVED.get(along, ())) == {"kappa"}
+    if along not in MOVED or soft_only:
+        rigid = "; a rigid wall has none" if soft_only else ""
+        raise ValueError(f"along must be one of {', '.join(MOVED)}; got {along!r}{rigid}")
+    if len(within) != 2 or not within[0] < within[1]:
+        raise ValueError(f"within must be two bounds, the lower first; got {within}")
+    for bound in within:
+        check(along, bound)
+    return within
+
+
+def value_at(pair: ImpactPair, along: str, device: Harvester) -> Array:
+    """The parameter's value where a device, by that parameter, has a pair."""
+    omega0 = None if pair.kappa is None else pair.kappa * device.omega / math.pi
+    known = {
+        "omega": lambda: math.pi * jnp.sqrt(pair.d * device.A / device.s),
+        "omega0": lambda: omega0,
+        "k": lambda: device.m_b * omega0**2,
+        "s": lambda: pair.d * device.length_unit,
+        "A": lambda: device.s * (device.omega / math.pi) ** 2 / pair.d,
+        "beta": lambda: jnp.arcsin(pair.gamma * device.A / device.g),
+    }
+    return known[along]() if along in known else getattr(pair, along)
+
+
+def pair_at(pair: ImpactPair, along: str, value: float, device: Harvester) -> ImpactPair:
+    """The pair where the parameter has another value, all else of the device as it is."""
+    return moved(pair, along, jnp.asarray(value), value_at(pair, along, device), jnp.asarray(device.g / device.A))
 
 
 def _branch(arc: Arc, rows: list[tuple], along: str, end: str) -> Branch:
@@ -361,7 +394,7 @@ def family(
     grown: list[Branch] = []
     for index in range(len(orbit)):
         one = orbit[index : index + 1]
-        closed = along != "gamma" and bool(orbits.symmetric(one)[0])
+        closed = not _tilts(along) and bool(orbits.symmetric(one)[0])
         one = orbits.halved(one) if closed else one
         grown += _new(follow(one, along, within, device=device, points=points), grown)
     youngest = grown
@@ -397,7 +430,7 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
 
     Args:
         branches: Along one parameter.
-        device: Gives A, omega (unless that is the parameter) and the electrical constants; Tables I and II by default.
+        device: Gives A, omega (unless one is the parameter) and the electrical constants; Tables I and II by default.
 
     Returns:
         Over (branch, point): the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the label's `period`,
@@ -442,8 +475,8 @@ def _about(parameter: str) -> dict[str, str]:
 
 def _constants(branch: Branch) -> "dict[str, tuple]":
     """The parameters that do not move."""
-    moving = ("d", "kappa") if branch.along == "omega" else (branch.along,)
-    pair = {name: getattr(branch.orbit.pair, name) for name in ("d", "kappa", "r", "gamma") if name not in moving}
+    still = [name for name in ("d", "kappa", "r", "gamma") if name not in MOVED[branch.along]]
+    pair = {name: getattr(branch.orbit.pair, name) for name in still}
     return {name: ((), float(values[0]), _about(name)) for name, values in pair.items() if values is not None}
 
 
@@ -469,8 +502,8 @@ _ABOUT = {
 
 def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
     """What the dataset holds of a branch, a row a point."""
-    if branch.along == "omega":
-        device = dataclasses.replace(device, omega=jnp.asarray(branch.values[:, None]))
+    if branch.along not in ImpactPair.__dataclass_fields__:
+        device = with_constants(device, **{branch.along: jnp.asarray(branch.values[:, None])})
     hits, label = orbits.impacts(branch.orbit), orbits.counts(branch.orbit)
     length = orbits.depth_unit(branch.orbit, device)
     columns = {
