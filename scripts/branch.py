@@ -86,9 +86,14 @@ def branch(
             check_format(picture)
     command.keep_compiled()
     began = time.perf_counter()
-    with command.door():
-        found = _found(pair, name, places, device, impacts, guesses)
-    followed = branches.family(found, name, within, device=device, generations=generations)
+    with command.progress(2, "stages") as show:
+        command.waiting("search for orbits, compiled at first")
+        with command.door():
+            found = _found(pair, name, places, device, impacts, guesses)
+        show(1, 2)
+        command.waiting("branches, compiled at first")
+        followed = branches.family(found, name, within, device=device, generations=generations)
+        show(2, 2)
     seconds = time.perf_counter() - began
     dataset = branches.dataset(followed, device)
 

@@ -3,11 +3,14 @@
 A script is a click command whose body is one `door`, one run under `progress`, and one `finish`.
 """
 
+import logging
 import math
 import os
 import signal
+import sys
 import threading
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,9 +26,11 @@ if TYPE_CHECKING:
     from vijax.model import Harvester, ImpactPair
 
 _STARTED = time.perf_counter()
+_WAITING = logging.getLogger("vijax.waiting")
+_MANY = 10_000  # from here on a bar counts by thousands
 VALUES = (
     "VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --u0=-0.1:0.1:9); a number "
-    "may be a multiple of pi, as in 6pi."
+    "may be a multiple of pi, as in 6pi, and all may have units, as in 2Hz:10Hz:9 or 20deg (Hz are turns a second)."
 )
 AXES = {
     "d": "gap, dimensionless",
@@ -89,7 +94,8 @@ def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, A
 
 
 def device(constants: Iterable[str]) -> "Harvester":
-    """The device of Tables I and II with other constants, each written NAME=VALUE."""
+    """The device of Tables I and II with other constants, each written NAME=VALUE, with a unit or in SI."""
+    from vijax import units
     from vijax.model import Harvester, with_constants
 
     values = {}
@@ -99,10 +105,13 @@ def device(constants: Iterable[str]) -> "Harvester":
             raise ValueError(
                 f"set must name a constant that has no option of its own; got {text!r}; give --{name}={value}"
             )
+        number, unit = units.split(value)
         try:
-            values[name] = float(value)
+            values[name] = float(number)
         except ValueError:
             raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}") from None
+        if unit:
+            values[name] = units.with_unit(name, values[name], unit)
     return with_constants(Harvester(), **values)
 
 
@@ -174,10 +183,10 @@ def import_beside(module: str) -> None:
 
 @contextmanager
 def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], None]]:
-    """A progress bar, as the callback (done, in all) that runs take."""
+    """A progress bar that says what is being waited for, as the callback (done, in all) that runs take."""
     from tqdm import tqdm
 
-    with tqdm(total=total, desc="compiling", unit=unit, unit_scale=True) as bar:
+    with tqdm(total=total, desc="starting", unit=unit, unit_scale=total >= _MANY) as bar, _told_of_waiting(bar):
 
         def show(done: int, total: int) -> None:
             if done:
@@ -186,6 +195,33 @@ def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], N
             bar.update(done - bar.n)
 
         yield show
+
+
+def waiting(what: str) -> None:
+    """Say at the progress bar what is being waited for."""
+    _WAITING.info(what)
+
+
+@contextmanager
+def _told_of_waiting(bar: Any) -> Iterator[None]:
+    """What vijax says it waits for stands before the bar, whose clock goes on while nothing is done."""
+    handler, ended = logging.Handler(), threading.Event()
+    handler.emit = lambda record: bar.set_description(record.getMessage())  # type: ignore[method-assign]
+
+    def tick() -> None:
+        while not ended.wait(1.0):
+            bar.refresh()
+
+    _WAITING.addHandler(handler)
+    _WAITING.setLevel(logging.INFO)
+    clock = threading.Thread(target=tick, daemon=True)
+    if sys.stderr.isatty():  # a log would fill with it
+        clock.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        _WAITING.removeHandler(handler)
 
 
 def finish(
@@ -216,7 +252,8 @@ def close(summary: str, *written: Path | None) -> None:
 
 def pace(count: int, seconds: float, unit: str = "cells") -> str:
     """How much was done in what time."""
-    return f"{count:,} {unit} in {seconds:.2f} s, {count / seconds:,.0f} {unit}/s"
+    rate = count / seconds
+    return f"{count:,} {unit} in {seconds:.2f} s, {rate:{',.0f' if rate >= 100 else '.3g'}} {unit}/s"
 
 
 def flags(variable: "xr.DataArray") -> str:
@@ -237,6 +274,24 @@ def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] |
     return ", ".join(f"{word} {n:,}" for word, n in found.items())
 
 
+@contextmanager
+def _warnings_told() -> Iterator[None]:
+    """What vijax warns of becomes one line, told once."""
+    from tqdm import tqdm
+
+    told: set[str] = set()
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in told:
+            told.add(str(message))
+            tqdm.write(f"warning: {message}", file=sys.stderr)  # beside a bar that may be there
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=UserWarning, module="vijax")
+        warnings.showwarning = tell
+        yield
+
+
 class _Terminated(KeyboardInterrupt):
     """What SIGTERM raises."""
 
@@ -253,7 +308,8 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
     try:
-        command.main(arguments, standalone_mode=False)
+        with _warnings_told():
+            command.main(arguments, standalone_mode=False)
     except click.ClickException as error:
         click.echo(f"error: {error.format_message()}", err=True)
         return 2

@@ -98,7 +98,7 @@ def design(
     command.keep_compiled()
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
-        show(0, stages)
+        command.waiting("survey and ascents, compiled at first")
         began = time.perf_counter()
         found = designs.optimise_all(
             devices,
@@ -114,8 +114,10 @@ def design(
         show(1, stages)
         diagram = None
         if along is None:
+            command.waiting("orbit diagram")
             diagram = _diagram(found[0], devices[0])
             show(2, stages)
+        command.waiting("surroundings and tolerances")
         told = [report.describe(one, diagram=diagram, **_judged(one, scatter, along is None)) for one in found]
         show(stages, stages)
     whole = told[0] if along is None else {"over": {"name": along[0], "values": along[1]}, "designs": told}

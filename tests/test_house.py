@@ -18,12 +18,13 @@ PACKAGE = [path for path in SOURCES if path.parent.name == "vijax"]
 
 # What each room may import of the others: the README's room table. `__init__` names the public functions of all.
 ROOMS: dict[str, set[str]] = {
-    "model": set(),
+    "units": set(),
+    "model": {"units"},
     "xla": set(),
     "flow": {"model", "xla"},
     "membrane": {"model"},
     "method": {"model", "membrane"},
-    "energy": {"xla", "model", "flow"},
+    "energy": {"units", "xla", "model", "flow"},
     "exact": {"xla", "model", "flow", "energy"},
     "polynomial": {"xla", "flow"},
     "quick": {"xla", "model", "flow", "energy", "exact", "polynomial"},
@@ -60,7 +61,7 @@ ROOMS: dict[str, set[str]] = {
     "steady": {"elimination", "model", "flow", "energy", "exact", "shooting", "clearance"},
     "ascent": set(),
     "tolerance": {"model"},
-    "tuning": {"model"},
+    "tuning": {"units", "model"},
     "objective": {"model", "shooting", "steady", "ascent", "tuning"},
     "impact_map": {"xla", "model", "quick", "lanes", "cell", "trips"},
     "label": {"model"},
@@ -81,8 +82,8 @@ ROOMS: dict[str, set[str]] = {
     "record": {"xla", "model", "exact", "lanes", "trajectory"},
     "survey": {"lanes", "model", "simulate", "record", "shooting"},
     "starts": {"model", "energy", "tuning", "survey"},
-    "axes": {"model"},
-    "branch": {"model", "method", "shooting", "orbit", "arc", "axes"},
+    "axes": {"units", "model"},
+    "branch": {"units", "model", "method", "shooting", "orbit", "arc", "axes"},
     "dataset": {"lanes", "model", "method", "axes", "simulate"},
     "study": {"lanes", "model", "axes", "dataset", "store"},
     "refine": {"label"},
@@ -128,9 +129,9 @@ ROOMS: dict[str, set[str]] = {
     "figures": {"model", "curve", "orbit", "paper", "portrait", "cached"},
     "evidence": {"model", "orbit", "branch", "attractor", "chaos", "label", "cached", "paper"},
     "claims": {"model", "branch", "chaos", "diagram", "grid", "cached", "paper", "evidence"},
-    "report": {"model", "energy", "design", "objective", "surroundings", "tolerance", "tuning"},
+    "report": {"units", "model", "energy", "design", "objective", "surroundings", "tolerance", "tuning"},
     "chart": {"store", "style"},
-    "blueprint": {"report", "store", "style", "tuning"},
+    "blueprint": {"units", "report", "store", "style", "tuning"},
     "panels": set(),
     "plot": {"model", "axes", "dataset", "label", "store", "grid", "compare", "style", "panels"},
 }
@@ -139,9 +140,10 @@ ROOMS["__init__"] = set(ROOMS)
 ONLY_IN = {
     "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
     "distributed": {"vijax/cluster.py"},
+    "pint": {"vijax/units.py"},
     "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py", "vijax/blueprint.py"},
 }
-NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax", "distributed"]
+NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax", "distributed", "pint"]
 IMPORT_SECONDS = 1.5
 
 # Built here, so that this line is not what it looks for.

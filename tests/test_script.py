@@ -243,7 +243,7 @@ def test_the_progress_bar_follows_a_total_that_grows(capsys):
     with command.progress(8) as show:
         for done, total in ((0, 2), (2, 2), (2, 5), (5, 5)):
             show(done, total)
-    assert "5.00/5.00" in capsys.readouterr().err
+    assert "5/5" in capsys.readouterr().err
 
 
 def test_from_arguments_to_store_and_picture(folder, monkeypatch):
@@ -284,3 +284,18 @@ def test_ctrl_c_leaves_what_is_done(folder):
     assert err.endswith("stopped; 0 of 262,144 cells are in map.zarr; the same command goes on from there\n")
     assert {path.name for path in folder.iterdir()} <= {"cache", "map.zarr"}
     assert (grid.load(folder / "map.zarr")["status"] == Status.NOT_RUN).all()
+
+
+def test_the_bar_says_what_is_waited_for(folder, capsys):
+    assert script.main([*TINY, "--out", "map.zarr"]) == 0
+    err = capsys.readouterr().err
+    assert err.index("starting") < err.index("compiling") < err.index("running 6 cells side by side") < err.index("6/6")
+    assert not command._WAITING.handlers
+
+
+@pytest.mark.parametrize(
+    ("count", "seconds", "said"),
+    [(12, 35.0, "0.343 cells/s"), (3, 1.0, "3 cells/s"), (26395, 1.0, "26,395 cells/s"), (0, 1.0, "0 cells/s")],
+)
+def test_a_slow_rate_has_digits(count, seconds, said):
+    assert command.pace(count, seconds).endswith(f" {said}")

@@ -18,7 +18,7 @@ from vijax.model import ImpactPair
 from vijax.shooting import Sequence
 
 # Powers with which d, kappa and gamma go in a quantity of the device, by Eqs. (37)-(38).
-_POWERS = {
+_POWERS: dict[str, dict[str, float]] = {
     "omega": {"d": 2, "kappa": -1},
     "omega0": {"kappa": 1},
     "k": {"kappa": 0.5},
@@ -26,7 +26,7 @@ _POWERS = {
     "A": {"d": -1, "gamma": -1},
 }
 # What moves with each quantity that a branch can be followed along: of the pair itself alone, of the device several.
-MOVED = {name: (name,) for name in ("d", "kappa", "r", "gamma")}
+MOVED: dict[str, tuple[str, ...]] = {name: (name,) for name in ("d", "kappa", "r", "gamma")}
 MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("gamma",)}
 CLOSE = 1e-11  # size of the last correction
 _BATCHES = (8, 64, 512)  # lanes of one compiled call

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vijax import units
 from vijax.model import Harvester, check
 
 if TYPE_CHECKING:
@@ -30,12 +31,12 @@ AXES = {
     "kappa": Axis(r"\kappa", "1", "stiffness of the walls, omega0 pi / omega"),
     "r": Axis("r", "1", "coefficient of restitution of a free contact"),
     "gamma": Axis(r"\gamma", "1", "gravity along the axis, g sin(beta) / A"),
-    "omega": Axis(r"\omega", "rad s-1", "angular frequency of the forcing"),
-    "s": Axis("s", "m", "gap between the membranes"),
-    "omega0": Axis(r"\omega_0", "rad s-1", "natural frequency of ball and membrane"),
-    "k": Axis("k", "N m-1", "stiffness of the membrane"),
-    "A": Axis("A", "m s-2", "amplitude of the forcing"),
-    "beta": Axis(r"\beta", "rad", "inclination"),
+    "omega": Axis(r"\omega", units.cf("omega"), "angular frequency of the forcing"),
+    "s": Axis("s", units.cf("s"), "gap between the membranes"),
+    "omega0": Axis(r"\omega_0", units.cf("omega0"), "natural frequency of ball and membrane"),
+    "k": Axis("k", units.cf("k"), "stiffness of the membrane"),
+    "A": Axis("A", units.cf("A"), "amplitude of the forcing"),
+    "beta": Axis(r"\beta", units.cf("beta"), "inclination"),
     "u0": Axis("u_0", "1", "displacement at the start, in units of A pi^2 / omega^2"),
     "v0": Axis("v_0", "1", "velocity at the start, in units of A pi / omega"),
 }
@@ -52,7 +53,8 @@ _FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
 def parse_axis(name: str, text: str) -> np.ndarray:
     """Values of an axis written as a number (0-d), a comma list, `LO:HI:N`, `LO:HI:N:log` or `@FILE` (1-d).
 
-    A number may be written with pi, as in `pi` or `12pi`. A file holds numbers apart by white space or commas.
+    A number may be written with pi, as in `pi` or `12pi`, and with a unit, as in `5Hz` or `20deg`; then all are. Of an
+    angular frequency Hz are turns a second. A file holds numbers apart by white space or commas.
 
     Raises:
         ValueError: If the text is none of these, or its values are not allowed on the axis `name`.
@@ -63,19 +65,28 @@ def parse_axis(name: str, text: str) -> np.ndarray:
     elif ":" in text:
         values = _from_range(name, text)
     elif "," in text:
-        values = [_number(name, item, text) for item in text.split(",")]
+        values = _numbers(name, text.split(","), text)
     else:
-        values = _number(name, text, text)
+        (values,) = _numbers(name, [text], text)
     return check_axis(name, values)
 
 
-def _number(name: str, item: str, text: str) -> float:
-    factor, pi, rest = item.strip().partition("pi")
+def _numbers(name: str, items: list[str], text: str) -> list[float]:
+    """Numbers of which all have a unit or none has, or a reader would not know what the others are in."""
+    parts = [units.split(item) for item in items]
+    if len({bool(unit) for _, unit in parts}) > 1:
+        raise ValueError(f"{name} must have a unit at every number or at none; got {text!r}")
+    return [_number(name, *part, text) for part in parts]
+
+
+def _number(name: str, item: str, unit: str, text: str) -> float:
+    factor, pi, rest = item.partition("pi")
     try:
-        return float({"": "1", "-": "-1"}.get(factor, factor)) * math.pi if pi and not rest else float(item)
+        value = float({"": "1", "-": "-1"}.get(factor, factor)) * math.pi if pi and not rest else float(item)
     except ValueError:
         within = "" if item == text else f" in {text!r}"
         raise ValueError(f"{name} must be {_FORMS}; got {item!r}{within}") from None
+    return units.with_unit(name, value, unit) if unit else value
 
 
 def _from_range(name: str, text: str) -> np.ndarray:
@@ -84,13 +95,13 @@ def _from_range(name: str, text: str) -> np.ndarray:
         raise ValueError(f"{name} must be {_FORMS}; got {text!r}")
     if not count.strip().isdecimal() or int(count) < 1:
         raise ValueError(f"{name}: N in LO:HI:N must be a whole number of at least 1; got {count!r} in {text!r}")
-    ends = _number(name, low, text), _number(name, high, text)
-    check_axis(name, ends)
+    first, last = _numbers(name, [low, high], text)
+    check_axis(name, [first, last])
     if not spacing:
-        return np.linspace(*ends, int(count))
-    if ends[0] * ends[1] <= 0:
+        return np.linspace(first, last, int(count))
+    if first * last <= 0:
         raise ValueError(f"{name}: LO and HI of a log axis must be on one side of zero; got {text!r}")
-    return np.geomspace(*ends, int(count))
+    return np.geomspace(first, last, int(count))
 
 
 def _from_file(name: str, path: str) -> list[float]:
@@ -99,7 +110,7 @@ def _from_file(name: str, path: str) -> list[float]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise ValueError(f"{name} must name a file that can be read; got @{path} ({reason})") from None
-    return [_number(name, item, f"@{path}") for item in items]
+    return _numbers(name, items, f"@{path}")
 
 
 def check_axis(name: str, values: Any) -> np.ndarray:
@@ -108,7 +119,7 @@ def check_axis(name: str, values: Any) -> np.ndarray:
     Raises:
         ValueError: With what must hold, what came and where, if they are not allowed.
     """
-    array = np.asarray(values)
+    array = np.asarray(units.plain(name, values))
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name} must be a real number or an array of them; got {values!r}")
     if array.ndim > 1 or array.size == 0:

@@ -8,10 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vijax.report import UNITS, amount, factors
+from vijax.report import amount, factors
 from vijax.store import replacing
 from vijax.style import STYLE, axis_label, check_format, symbol
 from vijax.tuning import LINEAR, constant
+from vijax.units import UNITS
 
 if TYPE_CHECKING:
     import xarray as xr

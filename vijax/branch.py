@@ -4,7 +4,8 @@ A sign change of a test function is located on the arc, and says what it was: a 
 """
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array
 
 from vijax import orbit as orbits
-from vijax import shooting
+from vijax import shooting, units
 from vijax.arc import CLOSE, FIRST_END, FOLD, MOVED, PLUS, Arc, Place, Tests, advance, moved, unpack
 from vijax.axes import AXES
 from vijax.method import whole
@@ -164,7 +165,7 @@ def follow(
         orbit: Where to start, each a branch of its own; all at once.
         along: "d", "kappa", "r", "gamma", or a quantity of the device, which moves several of them together: "omega",
             "omega0" [rad/s], "s" [m], "A" [m/s^2], "beta" [rad] or "k" [N/m].
-        within: Bounds of the parameter; the starts lie between.
+        within: Bounds of the parameter, as numbers or quantities of pint; the starts lie between.
         direction: "up" or "down" in the parameter at first, or "both".
         device: For a quantity of the device: its other constants, which stay, say at which value of it the orbit is.
             So omega and A follow from d and s, s from d, omega0 and k from kappa, beta from gamma.
@@ -204,6 +205,7 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
         index = int(np.argmax(np.asarray(orbit.status) != Status.OK))
         raise ValueError(f"orbit must hold orbits only; got {Status(int(orbit.status[index])).name} at index {index}")
     device = Harvester() if device is None else device
+    within = check_along(orbit.pair, along, within)
     x = check_bounds(orbit.pair, along, within, device)
     if _tilts(along) and bool(orbit.sequence.mirrored.any()):
         raise ValueError(
@@ -238,20 +240,24 @@ def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tu
     if along not in MOVED or soft_only:
         rigid = "; a rigid wall has none" if soft_only else ""
         raise ValueError(f"along must be one of {', '.join(MOVED)}; got {along!r}{rigid}")
+    within = units.plain(along, within)
     if len(within) != 2 or not within[0] < within[1]:
         raise ValueError(f"within must be two bounds, the lower first; got {within}")
     for bound in within:
         check(along, bound)
-    return within
+    return float(within[0]), float(within[1])
 
 
 def value_at(pair: ImpactPair, along: str, device: Harvester) -> Array:
     """The parameter's value where a device, by that parameter, has a pair."""
-    omega0 = None if pair.kappa is None else pair.kappa * device.omega / math.pi
-    known = {
+
+    def omega0() -> Array:
+        return jnp.asarray(pair.kappa) * device.omega / math.pi
+
+    known: dict[str, Callable[[], Any]] = {
         "omega": lambda: math.pi * jnp.sqrt(pair.d * device.A / device.s),
-        "omega0": lambda: omega0,
-        "k": lambda: device.m_b * omega0**2,
+        "omega0": omega0,
+        "k": lambda: device.m_b * omega0() ** 2,
         "s": lambda: pair.d * device.length_unit,
         "A": lambda: device.s * (device.omega / math.pi) ** 2 / pair.d,
         "beta": lambda: jnp.arcsin(pair.gamma * device.A / device.g),

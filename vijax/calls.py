@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _LOG = logging.getLogger(__name__)
+_WAITING = logging.getLogger("vijax.waiting")  # tells at INFO what a run is waiting for; scripts show it
 
 Fields = dict[str, np.ndarray]
 """Fields of `Summary`, by name."""
@@ -90,9 +91,11 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
             running[pool.submit(_where_free, call, free)] = call
 
     try:
-        if len(here) > 1 and (first := next(calls, None)):
+        if first := next(calls, None):
             # Or the first calls' seconds would hold it.
+            _WAITING.info("compiling")
             wait([pool.submit(prepare, first, place) for place in set(here)])
+            _WAITING.info("running %s cells side by side, done with the slowest", f"{first.cells.size:,}")
             calls = itertools.chain([first], calls)
         fill()
         while running:

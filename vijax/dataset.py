@@ -4,6 +4,7 @@ import math
 import os
 import platform
 import subprocess
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -157,6 +158,18 @@ def best(dataset: "xr.Dataset") -> "xr.DataArray | None":
     power = dataset["P"].where(dataset["admissible"]).fillna(0.0)
     peak = power.isel({dim: int(i) for dim, i in power.argmax(...).items()})
     return peak if peak > 0 else None
+
+
+def warn_if_held(dataset: "xr.Dataset") -> None:
+    """Warn where gravity along the axis keeps the ball on a wall in every cell: then there is nothing to see."""
+    status, gamma = dataset["status"], dataset["gamma"]
+    # One cell first: a store may be larger than memory.
+    if status.isel(dict.fromkeys(status.dims, 0)) != Status.PERMANENT_CONTACT or not gamma.all():
+        return
+    if (status == Status.PERMANENT_CONTACT).all():
+        span = " to ".join(f"{x:.4g}" for x in np.unique([gamma.min(), gamma.max()]))
+        advice = "from 1 on it outweighs the forcing; raise A or lower beta"
+        warnings.warn(f"gravity holds the ball: gamma = {span}, permanent contact everywhere; {advice}", stacklevel=2)
 
 
 def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":

@@ -3,6 +3,7 @@
 `plan` checks everything that can be wrong and starts nothing, `run` does the work, `orbit_diagram` is both.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -16,7 +17,7 @@ from jaxtyping import ArrayLike
 
 from vijax import energy, simulate
 from vijax.axes import AXES, cells, check_axis
-from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance
+from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
 from vijax.grid import Axes
 from vijax.lanes import workers
 from vijax.method import whole
@@ -26,6 +27,7 @@ from vijax.record import Record, record
 if TYPE_CHECKING:
     import xarray as xr
 
+_WAITING = logging.getLogger("vijax.waiting")  # see `calls`
 _WAYS = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
 _CHOICES = {"direction": tuple(_WAYS), "wall": ("soft", "rigid"), "dtype": ("float64", "float32")}
 # A call takes chains so many points further: one compiled program for diagrams of every length.
@@ -189,7 +191,9 @@ def run(diagram: Diagram, progress: Callable[[int, int], None] | None = None) ->
     widest = max(chain["v_in"].shape[-1] for chain in found.values())
     order = [found[chain] for chain in sorted(found)]
     fields = {name: np.stack([_widened(chain[name], widest, name) for chain in order]) for name in order[0]}
-    return _label(diagram, fields)
+    dataset = _label(diagram, fields)
+    warn_if_held(dataset)
+    return dataset
 
 
 def _widened(values: np.ndarray, widest: int, name: str) -> np.ndarray:
@@ -235,10 +239,15 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
             lanes = min(max(1 << (share - 1).bit_length(), _FEWEST_LANES), _MOST_LANES)
             number = math.ceil(group.size / lanes)
             tiles = [group[first::number] for first in range(number)]
+            chains = f"{tiles[0].size:,} chains of {diagram.points:,} points side by side"
             if number > 1:
+                _WAITING.info("compiling")
                 # Compiles; all threads at once would each do so.
                 brief = {name: x[:, :1] for name, x in table.items()}
                 pool.submit(_simulate, diagram, brief, tiles[0][:1], lanes, 1, 1).result()
+                _WAITING.info("running %s", chains)
+            else:
+                _WAITING.info("compiling, then running %s", chains)
             periods, keep = (diagram.planned.settings[name] for name in ("periods", "keep"))
             running = {pool.submit(_simulate, diagram, table, tile, lanes, periods, keep): tile for tile in tiles}
             for future in as_completed(running):

@@ -7,6 +7,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from vijax import units
 from vijax.flow import half_turn
 from vijax.model import Harvester
 from vijax.xla import once
@@ -48,15 +49,19 @@ def capacitance(device: Harvester, depth: Values) -> Values:
     return _rest_capacitance(device) * (1 + stretch(device, depth)) ** 2
 
 
-@once
 def harvested_energy(device: Harvester, depth: Values) -> Values:
-    """Energy E_j [J] harvested from an impact whose largest penetration is `depth` [m].
+    """Energy E_j [J] harvested from an impact whose largest penetration is `depth`, in metres or a quantity of pint.
 
     E = (C_max + C_T)/(C_min + C_T) (C_max - C_min) V^2/2, of full relative accuracy down to depth 0, where it and its
     gradient vanish.
 
     Source: Eq. (34).
     """
+    return _harvested_energy(device, units.plain("depth", depth))
+
+
+@once
+def _harvested_energy(device: Harvester, depth: Values) -> Values:
     growth = stretch(device, depth)
     least = _rest_capacitance(device)
     gain = least * growth * (2 + growth)

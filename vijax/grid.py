@@ -21,7 +21,7 @@ from vijax import method as methods
 from vijax import refine as refinement
 from vijax.axes import Cells, cells
 from vijax.calls import Call, Fields
-from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables
+from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
 from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester
@@ -81,7 +81,7 @@ def sweep(
 ) -> "xr.Dataset":
     """Energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
 
-    Each axis is a number or a 1-D array; arrays become dimensions in the order in which they are given:
+    Each axis is a number or a 1-D array, or such a quantity of pint; arrays become dimensions in the order given:
 
         sweep(d=np.linspace(0.05, 0.3, 128), kappa=np.geomspace(3, 400, 128), r=0.5)  # the (d, kappa) plane
         sweep(omega=np.pi * np.linspace(1, 12, 64), omega0=np.linspace(20, 400, 64))  # one device, other frequencies
@@ -136,6 +136,9 @@ def sweep(
         OSError: If `out` holds anything else, is being written by another run, or can be written no more; if no
             scheduler answers, or its workers are lost.
         ModuleNotFoundError: With `workers` but without Dask.
+
+    Warns:
+        UserWarning: If beta exceeds pi/2, or gravity holds the ball in every cell.
 
     Source: Eqs. (36)-(38), corrected.
     """
@@ -226,7 +229,19 @@ def run(
     workers: cluster.Workers | None = None,
 ) -> "xr.Dataset":
     """The map of a plan, its cells simulated tile by tile on every device; see `sweep`."""
-    tell = progress or (lambda done, total: None)
+    found = _found(planned, progress or (lambda done, total: None), out, overwrite, workers)
+    warn_if_held(found)
+    return found
+
+
+def _found(
+    planned: Plan,
+    tell: Callable[[int, int], None],
+    out: str | Path | None,
+    overwrite: bool,
+    workers: cluster.Workers | None,
+) -> "xr.Dataset":
+    """As `run`, nothing said of what was found."""
     if workers is not None:
         check_workers(planned, workers, out)
     if out is None:

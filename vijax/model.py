@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from vijax import units
 
 Real = float | Float[Array, "..."]
 
@@ -106,8 +109,8 @@ def damping_ratio(r: Real) -> Float[Array, "..."]:
 class Harvester(eqx.Module):
     """The device in SI units; the defaults are Tables I and II of the paper.
 
-    Every field is a number or an array, traced and never static. The stiffness k is derived from m_b and omega0;
-    `with_constants(device, k=...)` sets omega0 by it.
+    Every field is a number or an array, traced and never static; quantities of pint become plain numbers. The stiffness
+    k is derived from m_b and omega0; `with_constants(device, k=...)` sets omega0 by it.
 
     Attributes:
         m_b: Mass of the ball [kg].
@@ -145,6 +148,10 @@ class Harvester(eqx.Module):
     V: Real = 2000.0
     r_b: Real = 0.0050
     penetration_limit: Real | None = None
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            setattr(self, field.name, units.plain(field.name, getattr(self, field.name)))
 
     def __check_init__(self):
         for field in dataclasses.fields(self):
@@ -225,6 +232,7 @@ def with_constants(device: Harvester, **constants: Real) -> Harvester:
     for name in constants:
         if name not in (*known, "k"):
             raise ValueError(f"{name} must be a constant of the device; got {name!r}; known are k, {', '.join(known)}")
+    constants = {name: units.plain(name, value) for name, value in constants.items()}
     if "k" in constants:
         if "omega0" in constants:
             raise ValueError("k and omega0 must not both be given, as k = m_b omega0^2; got both; leave one out")
@@ -327,6 +335,9 @@ def check(name: str, value: Any) -> None:
 
     Raises:
         ValueError: "r must lie in (0, 1]; got -0.2 at index (3, 7); an elastic wall is r = 1".
+
+    Warns:
+        UserWarning: An inclination beyond pi/2, as degrees taken for rad.
     """
     if not is_concrete(value):
         return
@@ -337,6 +348,9 @@ def check(name: str, value: Any) -> None:
     good = rule.holds(array)
     if not np.all(good):
         raise ValueError(f"{name} {rule.must}; got {_first(array, good)}; {rule.advice}")
+    if name == "beta" and (steepest := np.abs(array).max()) > 0.5 * math.pi:
+        advice = "20 degrees are 20deg on the command line, and numpy.deg2rad(20) in Python"
+        warnings.warn(f"beta is up to {steepest:.6g} rad, which is beyond pi/2; {advice}", stacklevel=2)
 
 
 def _first(values: Any, good: Any) -> str:
@@ -362,6 +376,7 @@ def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
     given = {"d": d, "kappa": kappa, "r": r, "gamma": gamma}
     if kappa is None:
         del given["kappa"]
+    given = {name: units.plain(name, value) for name, value in given.items()}
     for name, value in given.items():
         check(name, value)
     arrays = [np.asarray(value) if isinstance(value, list | tuple) else value for value in given.values()]

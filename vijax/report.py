@@ -12,6 +12,7 @@ from vijax.objective import OBJECTIVES
 from vijax.surroundings import Surroundings
 from vijax.tolerance import Tolerance
 from vijax.tuning import LINEAR, constant, value_of
+from vijax.units import UNITS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -20,22 +21,6 @@ _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "n": 1
 _TIE = 1e-6  # optima whose objectives differ by less, relative, are a tie
 _MOST_ROWS = 12
 _LOSSES = {"lost": "lose the orbit", "inadmissible": "are inadmissible"}
-UNITS = {
-    "omega0": "rad/s",
-    "omega": "rad/s",
-    "k": "N/m",
-    "s": "m",
-    "A": "m/s^2",
-    "beta": "rad",
-    "m_b": "kg",
-    "g": "m/s^2",
-    "w0": "m",
-    "R0": "m",
-    "eps_M": "F/m",
-    "C_T": "F",
-    "V": "V",
-    "r_b": "m",
-}
 
 
 def describe(

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vijax import units
 from vijax.model import CONSTANTS, Harvester, check
 
 # Other names of what a constant decides: each is applied after the constants, in this order.
@@ -103,6 +104,7 @@ def limits(names: tuple[str, ...], bounds: Mapping[str, tuple[float, float]], de
 
 
 def _checked(name: str, bounds: tuple[float, float], device: Harvester) -> tuple[float, float]:
+    bounds = units.plain(name, bounds)
     if len(bounds) != 2 or not bounds[0] < bounds[1]:
         raise ValueError(f"bounds of {name} must be two, the lower first; got {bounds}")
     for bound in bounds:

@@ -1,0 +1,156 @@
+"""Units: what a number with one is in SI, at every door that takes physical quantities, and what is refused."""
+
+import math
+
+import numpy as np
+import orbit_diagram as diagram_script
+import pint
+import pytest
+
+import vijax
+from vijax import axes, branch, dataset, diagram, grid, orbit, tuning, units
+from vijax.model import CONSTANTS, Harvester, impact_pair, with_constants
+
+U = pint.UnitRegistry()
+HZ = 2 * math.pi
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("omega", "5Hz", 5 * HZ),
+        ("omega", "0.005 kHz", 5 * HZ),
+        ("omega", "60rpm", HZ),
+        ("omega", "6pi rad/s", 6 * math.pi),
+        ("omega", "6pi", 6 * math.pi),
+        ("omega0", "2Hz:10Hz:3", [2 * HZ, 6 * HZ, 10 * HZ]),
+        ("omega0", "1Hz:100Hz:3:log", [HZ, 10 * HZ, 100 * HZ]),
+        ("beta", "20deg", math.radians(20)),
+        ("beta", "-20°", -math.radians(20)),
+        ("s", "30cm", 0.3),
+        ("s", "1e2mm,20cm", [0.1, 0.2]),
+        ("s", "5e9picometer", 0.005),
+        ("A", "981cm/s^2", 9.81),
+        ("k", "0.56N/mm", 560.0),
+        ("k", "5e2", 500.0),
+    ],
+)
+def test_numbers_with_units_are_si(name, text, value):
+    np.testing.assert_allclose(axes.parse_axis(name, text), value, rtol=1e-14)
+
+
+def test_a_file_of_numbers_with_units(tmp_path):
+    path = tmp_path / "axis"
+    path.write_text("2Hz, 3Hz\n4Hz")
+    np.testing.assert_allclose(axes.parse_axis("omega", f"@{path}"), np.array([2, 3, 4]) * HZ, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("omega", "5kg", "omega must be in rad/s, or in a unit of that kind; got one in kilogram"),
+        ("beta", "5Hz", "beta must be in rad, .* got one in hertz"),
+        ("s", "5parsnips", "s must be in m, or in a unit known; got 'parsnips'"),
+        ("omega", "2:10Hz:9", "omega must have a unit at every number or at none; got '2:10Hz:9'"),
+        ("s", "0.2,30cm", "s must have a unit at every number or at none"),
+        ("d", "5mm", "d must be a number without a unit; got one in millimeter; with a unit there is s"),
+        ("gamma", "5deg", "gamma must be a number without a unit; got one in degree; with a unit there is beta"),
+        ("r", "1m", "r must be a number without a unit"),
+        ("u0", "1mm", "u0 must be a number without a unit"),
+        ("s", "-5mm", "s must be positive and finite; got -0.005"),
+    ],
+)
+def test_what_is_no_unit_of_a_quantity_is_told(name, text, message):
+    with pytest.raises(ValueError, match=message):
+        axes.parse_axis(name, text)
+
+
+def test_every_constant_of_the_device_takes_its_unit():
+    plain = Harvester(beta=0.1, penetration_limit=0.004)
+    names = [name for name in (*CONSTANTS, "penetration_limit") if name in units.UNITS]
+    scaled = {name: 1e3 * getattr(plain, name) * U.Unit(units.UNITS[name]) / 1e3 for name in names}
+    for name in names:
+        assert getattr(Harvester(**scaled), name) == pytest.approx(getattr(plain, name), rel=1e-14)
+    assert set(CONSTANTS) - set(names) == {"r"}
+    assert Harvester(omega=U.Quantity(5, "Hz")).omega == pytest.approx(5 * HZ, rel=1e-15)
+    assert with_constants(plain, k=U.Quantity(0.56, "N/mm")).k == pytest.approx(560, rel=1e-14)
+    with pytest.raises(ValueError, match="V must be in V, or in a unit of that kind; got one in millimeter"):
+        Harvester(V=U.Quantity(1, "mm"))
+
+
+def test_quantities_of_pint_at_the_doors():
+    swept = grid.plan(
+        {"omega": U.Quantity([2, 3], "Hz"), "s": [30 * U.cm, 0.4 * U.m]},
+        ["P"],
+        **{"periods": 400, "until": "attractor", "transient": 0, "wall": "soft", "method": "exact", "dtype": "float64"},
+    )
+    np.testing.assert_allclose(swept.cells.given["omega"], [2 * HZ, 3 * HZ], rtol=1e-14)
+    np.testing.assert_allclose(swept.cells.given["s"], [0.3, 0.4], rtol=1e-14)
+    settings = {"direction": "up", "periods": 9, "keep": 3, "wall": "soft", "dtype": "float64"}
+    planned = diagram.plan("beta", U.Quantity([1, 2], "deg"), {}, **settings)
+    np.testing.assert_allclose(planned.planned.cells.given["beta"], np.radians([1, 2]), rtol=1e-14)
+    bounds = tuning.limits(("omega0",), {"omega0": (2 * U.Hz, 3 * U.Hz)}, Harvester())
+    np.testing.assert_allclose(bounds[:, 0], [2 * HZ, 3 * HZ], rtol=1e-14)
+    harvested = vijax.harvested_energy(Harvester(), 2 * U.mm)
+    assert float(harvested) == pytest.approx(float(vijax.harvested_energy(Harvester(), 0.002)), rel=1e-14)
+    with pytest.raises(ValueError, match="d must be a number without a unit"):
+        impact_pair(1 * U.mm, 40.0, 0.5)
+    assert float(impact_pair(U.Quantity(0.2, ""), 40.0, 0.5).d) == 0.2
+    with pytest.raises(ValueError, match="s must have a unit at every value or at none"):
+        axes.check_axis("s", [0.3, 30 * U.cm])
+
+
+def test_a_branch_between_bounds_with_units():
+    found = orbit.search(Harvester(s=0.2).pair("rigid"), "RL", guesses=32)[:1]
+    kept = {"direction": "up", "points": 4, "device": Harvester(s=0.2)}
+    own, plain = (branch.follow(found, "s", within, **kept)[0] for within in ((19 * U.cm, 210 * U.mm), (0.19, 0.21)))
+    np.testing.assert_allclose(own.values, plain.values, rtol=1e-12)
+
+
+def test_datasets_write_the_same_units():
+    written = {name: axis.units for name, axis in axes.AXES.items()}
+    assert written == dict.fromkeys(axes.AXES, "1") | {
+        **{"omega": "rad s-1", "omega0": "rad s-1", "s": "m", "k": "N m-1", "A": "m s-2", "beta": "rad"}
+    }
+
+
+def test_degrees_taken_for_radians_are_warned_of():
+    with pytest.warns(UserWarning, match="beta is up to 20 rad, which is beyond pi/2; 20 degrees are 20deg"):
+        Harvester(beta=20.0)
+    with pytest.warns(UserWarning, match="beta is up to 20 rad"):
+        axes.check_axis("beta", [0.1, -20.0])
+
+
+def test_a_ball_that_gravity_holds_is_warned_of(tmp_path):
+    kept = {"d": 0.2, "kappa": [30.0, 40.0], "periods": 30}
+    for out in (None, tmp_path / "held.zarr"):
+        with pytest.warns(UserWarning, match=r"gravity holds the ball: gamma = 3.352, permanent contact everywhere"):
+            held = vijax.sweep(**kept, beta=20 * U.deg, out=out)
+    lively = vijax.sweep(**kept, beta=1 * U.deg)
+    assert (held.status == vijax.Status.PERMANENT_CONTACT).all()
+    dataset.warn_if_held(lively)  # would be an error
+
+
+def test_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    asked = []
+    monkeypatch.setattr(diagram_script, "_run", lambda planned: asked.append(planned) or _stop())
+    chosen = ["--along", "omega=2Hz:10Hz:3", "--s", "30cm", "--set", "penetration_limit=4mm", "--set", "V=1.7kV"]
+    with pytest.raises(_StopError):
+        diagram_script.main(chosen)
+    device = asked[0].planned.device
+    assert (float(device.penetration_limit), float(device.V)) == (pytest.approx(0.004), 1700)
+    np.testing.assert_allclose(asked[0].planned.cells.given["omega"], np.array([2, 6, 10]) * HZ, rtol=1e-14)
+    assert diagram_script.main(["--set", "V=2mm"]) == 2
+    assert "V must be in V" in capsys.readouterr().err
+    with pytest.raises(_StopError):
+        diagram_script.main(["--beta", "20", "--along", "omega=1:2:3"])
+    assert capsys.readouterr().err.count("warning: beta is up to 20 rad") == 1
+
+
+class _StopError(Exception):
+    """Ends a script before it runs."""
+
+
+def _stop():
+    raise _StopError
