@@ -262,6 +262,15 @@ def flags(variable: "xr.DataArray") -> str:
     return tally(variable.values, names.get)
 
 
+def statuses(variable: "xr.DataArray", of: str = "cells") -> str:
+    """How often each status occurs; below, what to do about those that are not OK."""
+    from vijax.model import Status
+
+    lines = [f"{of} by status: {flags(variable)}"]
+    found = [status for status in Status if status != Status.OK and (variable == status).any()]
+    return "\n".join([*lines, *(f"    {status.name.lower()}: {status.advice}" for status in found)])
+
+
 def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:
     """How often each name occurs among that many values, the least values first, or those least by `order`."""
     import numpy as np

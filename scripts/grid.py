@@ -263,7 +263,7 @@ def _summary(dataset: "xr.Dataset") -> str:
     """What the map holds, in a few lines: cells by status and by period, the best of them."""
     from vijax.dataset import best
 
-    lines = [f"cells by status: {flags(dataset['status'])}"]
+    lines = [command.statuses(dataset["status"])]
     if "computed" in dataset:
         computed, shown = dataset.attrs["refine_computed"], dataset.attrs["refine_shown"]
         lines.insert(0, f"cells computed: {computed:,} of {shown:,} shown, {computed / shown:.1%}; the others filled")
@@ -283,7 +283,7 @@ def _summary(dataset: "xr.Dataset") -> str:
 
 def _comparison_summary(dataset: "xr.Dataset") -> str:
     """What the comparison holds, in a few lines: how cells ended, labels, verdicts, from where rigid is enough."""
-    lines = [f"{wall} cells by status: {flags(dataset[f'status_{wall}'])}" for wall in ("soft", "rigid")]
+    lines = [command.statuses(dataset[f"status_{wall}"], f"{wall} cells") for wall in ("soft", "rigid")]
     lines.append(f"label: {flags(dataset['label'])}")
     lines.append(f"median difference in P: {100 * float(dataset['relative_difference'].median()):.3g} %")
     if "cheapest_model" in dataset:

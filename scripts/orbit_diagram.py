@@ -112,7 +112,7 @@ def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
     return "\n".join(
         [
             command.pace(count, seconds, "points"),
-            f"points by status: {command.flags(dataset['status'])}",
+            command.statuses(dataset["status"], "points"),
             f"points by label: {', '.join(f'{name} {n:,}' for name, n in [*common, ('others', rest)] if n)}",
         ]
     )

@@ -299,3 +299,10 @@ def test_the_bar_says_what_is_waited_for(folder, capsys):
 )
 def test_a_slow_rate_has_digits(count, seconds, said):
     assert command.pace(count, seconds).endswith(f" {said}")
+
+
+def test_what_to_do_is_said_where_a_status_is_printed():
+    status = dataset.flagged(xr.Variable("d", [0, 4, 4, 2]))
+    lines = command.statuses(xr.DataArray(status)).split("\n")
+    assert lines[0] == "cells by status: ok 1, permanent_contact 1, slow 2"
+    assert lines[1:] == [f"    permanent_contact: {Status(2).advice}", f"    slow: {Status(4).advice}"]

@@ -120,3 +120,14 @@ def test_a_rigid_wall_yields_by_the_depth_it_is_lent():
     assert float(value(0.5)) == pytest.approx(float(orbits.power(start, DEVICE)[index]), rel=1e-12)
     difference = (8 * (value(0.501) - value(0.499)) - (value(0.502) - value(0.498))) / 0.012
     assert float(jax.jit(jax.jacfwd(P))(0.5)) == pytest.approx(float(difference), rel=1e-7)
+
+
+def test_a_record_prints_its_status_by_name_and_what_to_do():
+    # The symmetric 1:1 orbit of a rigid wall repels beyond its flip at d = 0.187.
+    found = orbits.search(impact_pair(0.15, None, 0.5), "RL", guesses=64)
+    state = steady(DEVICE, found[0], pair=jax.tree.map(lambda x: x[0], found.pair))
+    assert int(state.status) == Status.UNSTABLE
+    assert "status=<Status.UNSTABLE: 9, follow it as a branch" in repr(state).replace("\n", " ")
+    assert f"'OK': {len(found)}" in repr(found)
+    assert "status=" in repr(jax.eval_shape(lambda: state))
+    assert all(status.advice for status in Status)

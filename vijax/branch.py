@@ -203,7 +203,8 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
         raise ValueError("orbit must hold an orbit to follow; got none; search with more guesses")
     if (np.asarray(orbit.status) != Status.OK).any():
         index = int(np.argmax(np.asarray(orbit.status) != Status.OK))
-        raise ValueError(f"orbit must hold orbits only; got {Status(int(orbit.status[index])).name} at index {index}")
+        got = Status(int(orbit.status[index]))
+        raise ValueError(f"orbit must hold orbits only; got {got.name} at index {index}; {got.advice}")
     device = Harvester() if device is None else device
     within = check_along(orbit.pair, along, within)
     x = check_bounds(orbit.pair, along, within, device)

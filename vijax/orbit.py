@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +18,7 @@ from vijax.energy import harvested_energy
 from vijax.impact_map import Next, next_impacts
 from vijax.label import label
 from vijax.method import whole
-from vijax.model import Harvester, Impact, ImpactPair, Status, check
+from vijax.model import Harvester, Impact, ImpactPair, Status, WithStatus, check
 from vijax.shooting import Sequence
 from vijax.trajectory import trajectory
 
@@ -29,7 +28,7 @@ _FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
 _TILES = (32, 256, 4096)  # orbits of one compiled call
 
 
-class Orbit(eqx.Module):
+class Orbit(WithStatus):
     """Periodic orbits, one along the leading axis; impacts along the last, padded with side 0 and NaN.
 
     Attributes:

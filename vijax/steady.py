@@ -6,7 +6,6 @@ with every impact's own unknowns kept. Where that derivative means nothing, valu
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -15,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from vijax import elimination, energy, flow, shooting
 from vijax.clearance import Clearance, between
 from vijax.exact import implicit_root
-from vijax.model import Harvester, ImpactPair, Status
+from vijax.model import Harvester, ImpactPair, Status, WithStatus
 from vijax.shooting import Knots, Sequence
 
 _CONVERGED = 1e-10  # residual of an orbit's equations
@@ -23,7 +22,7 @@ _CONVERGED = 1e-10  # residual of an orbit's equations
 _MARGIN = 1e-7
 
 
-class Steady(eqx.Module):
+class Steady(WithStatus):
     """What an attracting periodic orbit yields, impact by impact, and how far that can be trusted.
 
     Values are NaN, as are their derivatives, unless `status` is OK. Padded impacts hold 0 (`work`: inf).
@@ -38,8 +37,8 @@ class Steady(eqx.Module):
         condition: Condition number of I - DP, Frobenius.
         clearance: How far the orbit is from grazing.
         residual: Largest violation of the equations.
-        status: OK; UNSTABLE: it repels, or is at a bifurcation; VIRTUAL: the ball would meet a wall in between;
-            NO_ORBIT: Newton found none.
+        status: A `Status`, whose `advice` says what to do. OK; UNSTABLE: it repels, or is at a bifurcation; VIRTUAL: the
+            ball would meet a wall in between; NO_ORBIT: Newton found none.
         left, right, period: Label of the orbit: impacts on either wall, in so many forcing periods.
         knots: The orbit; see `shooting`.
     """

@@ -15,14 +15,14 @@ from jaxtyping import Array, Float, Int
 from vijax import exact, flow
 from vijax.membrane import HuntCrossley, Law
 from vijax.method import Method, Rk4, choose, repeated
-from vijax.model import Impact, ImpactPair, State, Status, check, is_concrete
+from vijax.model import Impact, ImpactPair, State, Status, WithStatus, check, is_concrete
 
 _CHUNK = 64  # steps that a differentiated run computes twice, to remember only where a chunk began and what it decided
 _STEPS = 256  # steps of an adaptive solver per impact and period, before a run is stopped
 _HELD = 8  # a contact that outlasts the last period by so many is for ever
 
 
-class Trajectory(eqx.Module):
+class Trajectory(WithStatus):
     """Impacts and stroboscopic states of one start, or of many along leading axes.
 
     Attributes:
