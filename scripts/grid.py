@@ -4,6 +4,7 @@
     python scripts/grid.py --gamma 0.1 --out inclined.zarr --plot inclined.png  # stopped, it goes on when given again
     python scripts/grid.py --omega pi:6pi:96 --omega0 20:400:96 --plot device.png
     python scripts/grid.py --show label --plot labels.png
+    python scripts/grid.py --show max_penetration --plot depth.png
     python scripts/grid.py --kappa 3:4000:128:log --compare rigid --tolerance 0.05
 
 An axis is a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE; arrays become dimensions in the order given: x, y and
@@ -30,9 +31,8 @@ if TYPE_CHECKING:
 _DEFAULT_PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
 _METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", "chi", "exponent")
 _LONG = 9  # periods from here on are counted together
-_SHOWN = ("power", "label")
 _FILES = {
-    "power": ("power_map.zarr", "power_map.png"),
+    "P": ("power_map.zarr", "power_map.png"),
     "label": ("label_map.zarr", "label_map.png"),
     "difference": ("comparison.zarr", "comparison.png"),
 }
@@ -72,7 +72,7 @@ def _options() -> list[click.Parameter]:
             metavar="LEVELS",
             help="compute every 2^LEVELS-th cell along each axis, then those at borders; fill the others",
         ),
-        click.Option(["--show"], default="power", show_default=True, help="what the picture shows: power or label"),
+        click.Option(["--show"], default="P", show_default=True, help="what the picture shows: any variable, or label"),
         *command.file_options(),
         click.Option(["--workers"], type=int, help="processes that share the cores and write the store, by Dask"),
         click.Option(["--scheduler"], metavar="ADDRESS", help="of Dask: its workers, which see the store, write it"),
@@ -82,8 +82,8 @@ def _options() -> list[click.Parameter]:
 @click.command(
     params=_options(),
     epilog=f"{command.VALUES} With neither --out nor --plot, power_map.zarr and power_map.png are written, "
-    "or the same of label_map or comparison. A map is written as it is made: stopped in whatever way, the same command "
-    "goes on with it, and --overwrite begins anew.",
+    "or the same of label_map, comparison or NAME_map, by what is shown. A map is written as it is made: stopped in "
+    "whatever way, the same command goes on with it, and --overwrite begins anew.",
     context_settings={"max_content_width": 120},
 )
 def power_map(
@@ -101,9 +101,8 @@ def power_map(
     with command.door():
         _check_show(show, compare, given["until"])
         picture = show if compare is None else "difference"
-        out, plot = command.targets(
-            given.pop("out"), given.pop("plot"), _FILES[picture], overwrite, goes_on=compare is None
-        )
+        files = _FILES.get(picture, (f"{picture}_map.zarr", f"{picture}_map.png"))
+        out, plot = command.targets(given.pop("out"), given.pop("plot"), files, overwrite, goes_on=compare is None)
         axes, device = command.take_axes(given, _DEFAULT_PLANE), command.device(constants)
         if compare is None and tolerance is not None:
             raise ValueError(f"tolerance must come with compare; got {tolerance:g} alone; add --compare rigid")
@@ -151,11 +150,14 @@ def _check_store(planned: Any, out: Path, overwrite: bool) -> None:
 
 
 def _check_show(show: str, compare: str | None, until: str) -> None:
-    if show not in _SHOWN:
-        raise ValueError(f"show must be power or label; got {show!r}")
-    if show == "label" and (compare is not None or until != "attractor"):
-        got = "a comparison" if compare is not None else f"until {until}"
-        raise ValueError(f"show must be power unless cells are run until their attractor; got label with {got}")
+    from vijax.dataset import OUTPUTS
+
+    if show != "label" and show not in OUTPUTS:
+        raise ValueError(f"show must be label, or among {', '.join(OUTPUTS)}; got {show!r}")
+    if show != "P" and compare is not None:
+        raise ValueError(f"show must be left out with compare, which shows the difference in P; got {show}")
+    if show == "label" and until != "attractor":
+        raise ValueError(f"show must not be label unless cells are run until their attractor; got until {until}")
 
 
 def _wanted(outputs: str | None, show: str) -> list[str] | None:
@@ -163,7 +165,8 @@ def _wanted(outputs: str | None, show: str) -> list[str] | None:
         return [name.strip() for name in outputs.split(",")]
     from vijax.dataset import ON_REQUEST, OUTPUTS
 
-    return [name for name in OUTPUTS if name not in ON_REQUEST or (show == "label" and name == "lyapunov")]
+    shown = "lyapunov" if show == "label" else show
+    return [name for name in OUTPUTS if name not in ON_REQUEST or name == shown]
 
 
 def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, settings: dict[str, Any]) -> "Plan":
@@ -215,21 +218,27 @@ def _membrane(name: str | None, chi: float | None, exponent: float | None) -> An
 def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
     from vijax import panels
     from vijax.compare import Comparison
+    from vijax.dataset import specimen
     from vijax.style import check_format
 
     check_format(path)
     if isinstance(planned, Comparison):
         panels.layout(planned.soft.cells.sizes)
         return
-    sizes = planned.cells.sizes
-    if show == "label":
-        panels.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
-    else:
-        panels.layout(sizes)
-    needs = panels.LABEL_NEEDS if show == "label" else panels.NEEDS
+    needs = {"label": panels.LABEL_NEEDS, "P": panels.NEEDS}.get(show, (show,))
     missing = [name for name in needs if name not in planned.outputs]
     if missing:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
+    sizes = planned.cells.sizes
+    if show == "label":
+        panels.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
+        return
+    if show == "P":
+        panels.layout(sizes)
+        return
+    drawn = specimen(planned)[show]  # its dimensions are those that it depends on
+    fits = panels.layout_of_kinds if panels.is_kind(drawn) else panels.layout
+    fits({str(dim): sizes[str(dim)] for dim in drawn.dims})
 
 
 def _run(
@@ -256,7 +265,11 @@ def _run(
 def _draw(picture: str, dataset: "xr.Dataset", path: Path) -> None:
     from vijax import plot as pictures
 
-    getattr(pictures, f"{picture}_map")(dataset, path)
+    known = {"P": pictures.power_map, "label": pictures.label_map, "difference": pictures.difference_map}
+    if picture in known:
+        known[picture](dataset, path)
+    else:
+        pictures.variable_map(dataset, picture, path)
 
 
 def _summary(dataset: "xr.Dataset") -> str:

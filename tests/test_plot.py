@@ -372,3 +372,77 @@ def test_a_map_of_kinds_wants_a_plane_and_its_variables():
         plot.label_map(labelled_map().drop_vars("status"))
     with pytest.raises(ValueError, match="without P"):
         plot.basin_map(basin_table().drop_vars("P"))
+
+
+# --- any variable -----------------------------------------------------------------------------------------------------
+
+
+def held_map() -> xr.Dataset:
+    """As `drawn_map`, with variables of every kind: wide and narrow numbers, counts, signs, flags, yes and no."""
+    found = drawn_map(d=D, kappa=KAPPA)
+    shape = found["P"].shape
+    spread = np.linspace(-1, 1, found["P"].size).reshape(shape)
+    status = {"flag_values": [0, 4, 9], "flag_meanings": "ok slow not_run"}
+    return found.assign(
+        power=(("d", "kappa"), found["P"].values ** 2, {"units": "W"}),
+        max_penetration=(("d", "kappa"), 0.002 + 1e-3 * spread, {"units": "m"}),
+        asymmetry=(("d", "kappa"), spread, {"units": "1"}),
+        impacts_left=(("d", "kappa"), np.where(spread < 0, -1, np.arange(48).reshape(shape) % 3)),
+        status=(("d", "kappa"), np.where(spread < -0.5, 4, 0).astype(np.int8), status),
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "log", "says"),
+    [
+        ("power", True, "power [W]"),
+        ("max_penetration", False, "max penetration [m]"),
+        ("asymmetry", False, "asymmetry"),
+        ("impacts_left", False, "impacts left"),
+    ],
+)
+def test_any_number_of_a_map_is_drawn(name, log, says):
+    found = held_map()
+    figure = plot.variable_map(found, name)
+    mesh = figure.axes[0].collections[0]
+    assert isinstance(mesh.norm, LogNorm) == log
+    assert figure.axes[1].get_ylabel() == says
+    shown = found[name].where(found["admissible"] & (found[name] >= 0 if name == "impacts_left" else True))
+    assert mesh.norm.vmax == pytest.approx(float(shown.max()))
+    drawn = np.ma.count(mesh.get_array())
+    assert drawn == {"power": 47, "impacts_left": 24}.get(name, 48)
+    assert "inadmissible" in words(figure)
+
+
+def test_a_variable_without_what_tells_of_the_others_is_drawn(tmp_path):
+    figure = plot.variable_map(held_map()[["max_penetration"]], "max_penetration", tmp_path / "map.png")
+    assert "inadmissible" not in words(figure)
+    assert (tmp_path / "map.png").exists()
+
+
+def test_kinds_have_a_colour_each():
+    for name, share in (("status", "75 % ok\n25 % slow"), ("admissible", "25 % no\n75 % yes")):
+        figure = plot.variable_map(held_map(), name)
+        assert "\n".join(text.get_text() for text in figure.legends[0].get_texts()) == share
+        assert figure.axes[0].get_yscale() == "log"  # the axes are still those of the map
+
+
+def test_a_variable_over_one_axis_is_a_curve():
+    figure = plot.variable_map(held_map().isel(kappa=3), "asymmetry")
+    assert figure.axes[0].get_yscale() == "linear"
+    np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), held_map()["asymmetry"][:, 3])
+
+
+def test_few_admissible_cells_do_not_choose_the_colours():
+    found = drawn_map(d=D, kappa=KAPPA)
+    for trusted, span in ((4, (2e-6, 48e-6)), (5, (4e-6, 8e-6))):  # of 47 cells shown
+        found["admissible"][:] = (found["P"] > 3.5e-6) & (found["P"] < (3.5 + trusted) * 1e-6)
+        norm = plot.power_map(found).axes[0].collections[0].norm
+        assert (norm.vmin, norm.vmax) == pytest.approx(span)
+
+
+def test_a_map_without_what_is_asked_for_says_what_draws_the_others():
+    with pytest.raises(ValueError, match=r"plot must have P, .* without P; variable_map \(--show NAME\) draws any"):
+        plot.power_map(held_map().drop_vars("P"))
+    with pytest.raises(ValueError, match="plot must have lyapunov; got a map without lyapunov"):
+        plot.variable_map(held_map(), "lyapunov")

@@ -104,10 +104,14 @@ BAD = [
     (["--refine", "2", "--until", "window"], "refine must be left out with until='window'"),
     (["--refine", "some"], "--refine"),
     (["--refine", "2", "--compare", "rigid"], "refine must not be chosen with compare"),
-    (["--show", "phase"], "show must be power or label; got 'phase'"),
-    (["--show", "label", "--until", "window"], "got label with until window"),
-    (["--show", "label", "--compare", "rigid"], "got label with a comparison"),
+    (["--show", "phase"], "show must be label, or among P, power, .*; got 'phase'"),
+    (["--show", "label", "--until", "window"], "must not be label unless .* got until window"),
+    (["--show", "label", "--compare", "rigid"], "show must be left out with compare, .* got label"),
     (["--show", "label", "--outputs", "period"], "outputs must hold impacts_left, impacts_right"),
+    (["--show", "power", "--compare", "rigid"], "show must be left out with compare"),
+    (["--show", "power", "--outputs", "P"], "outputs must hold power for a picture"),
+    (["--show", "status", "--kappa", "3"], "two axes of more than one value; got d alone"),
+    (["--show", "max_penetration", "--d", "0.1", "--kappa", "3"], "single cell"),
     (["--show", "label", "--kappa", "3"], "two axes of more than one value; got d alone"),
     (["--gravity", "1"], "No such option"),
     (["more"], "unexpected extra argument"),
@@ -306,3 +310,8 @@ def test_what_to_do_is_said_where_a_status_is_printed():
     lines = command.statuses(xr.DataArray(status)).split("\n")
     assert lines[0] == "cells by status: ok 1, permanent_contact 1, slow 2"
     assert lines[1:] == [f"    permanent_contact: {Status(2).advice}", f"    slow: {Status(4).advice}"]
+
+
+def test_any_variable_is_shown(folder):
+    assert script.main([*TINY, "--show", "max_penetration", "--outputs", "max_penetration"]) == 0
+    assert {path.name for path in folder.iterdir()} == {"max_penetration_map.zarr", "max_penetration_map.png"}

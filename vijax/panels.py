@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Mapping
+from typing import Any
 
 NEEDS = ("P", "period", "admissible")
 LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
@@ -38,3 +39,8 @@ def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
     if len(drawn) == 1:
         raise ValueError(f"plot must have two axes of more than one value; got {drawn[0]} alone")
     return layout(sizes)
+
+
+def is_kind(variable: Any) -> bool:
+    """Whether a variable says of what kind a cell is, and not how much there is of something."""
+    return variable.dtype == bool or "flag_values" in variable.attrs

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -20,15 +21,18 @@ from matplotlib.ticker import EngFormatter
 from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.label import label
-from vijax.panels import LABEL_NEEDS, NEEDS, layout, layout_of_kinds
+from vijax.panels import LABEL_NEEDS, NEEDS, is_kind, layout, layout_of_kinds
 from vijax.store import replacing
-from vijax.style import STYLE, axis_label, check_format, equations, title
+from vijax.style import STYLE, axis_label, check_format, equations, title, units
 
 if TYPE_CHECKING:
     import xarray as xr
 
 # A wider scale would say more about its faintest cells than about those worth building.
 _DECADES = 4
+_ALL_DECADES = 8  # where inadmissible cells are shown too
+_ENOUGH = 0.1  # of the cells shown: fewer admissible ones do not choose the colours
+_WIDE = 30  # ratio of the largest to the smallest number from which on their scale is logarithmic
 # Values count as evenly spaced if their steps differ by less than this part of their range.
 _EVEN = 1e-6
 # At most so many marks to a side, whatever the resolution of the map.
@@ -76,7 +80,7 @@ class _Kind(NamedTuple):
     label: str
     needs: tuple[str, ...]
     optional: tuple[str, ...]
-    colours: "Callable[[xr.Dataset], LogNorm]"
+    colours: "Callable[[xr.Dataset], Normalize]"
     marks: "Callable[[xr.Dataset], list[_Mark]]"
 
 
@@ -84,7 +88,8 @@ def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     """P on a log colour scale, with all that tells where to believe it.
 
     Inadmissible cells are veiled and hatched, the border of the period-1 region is a line, aperiodic cells carry dots
-    and undecided ones crosses, and a star stands on the largest admissible P. The colours span the admissible cells.
+    and undecided ones crosses, and a star stands on the largest admissible P. The colours span the admissible cells if
+    these are a tenth of those shown, and otherwise all.
 
     Args:
         dataset: A map with `P`, `period` and `admissible`. Its dimensions are, in order, x, y, columns and rows of
@@ -95,6 +100,31 @@ def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
         ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
     return _picture(dataset, _POWER, path)
+
+
+def variable_map(dataset: "xr.Dataset", name: str, path: str | Path | None = None) -> Figure:
+    """Any variable of a map, with the marks of `power_map` for as much as the map holds.
+
+    Numbers are coloured, on a log scale where they are positive and span a factor of 30; what is a kind, such as
+    `status` or `admissible`, has a colour each. Cells without a value are grey.
+
+    Args:
+        dataset: What `sweep` returned; dimensions as in `power_map`, for kinds two at least.
+        name: Of the variable.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    _need(dataset, (name,))
+    variable = dataset[name]
+    if is_kind(variable):
+        return _coded(*_kinds(dataset, name), path)
+    if variable.dtype.kind == "i":
+        dataset = dataset.assign({name: variable.where(variable >= 0)})  # -1 is none
+    written = name.replace("_", " ") + (f" [{units(variable)}]" if units(variable) else "")
+    kind = _Kind(name, written, (name,), (*NEEDS,), partial(_number_colours, name), partial(_number_marks, name))
+    return _picture(dataset, kind, path)
 
 
 def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
@@ -182,7 +212,10 @@ def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Fig
 def _need(dataset: "xr.Dataset", names: tuple[str, ...]) -> None:
     missing = [name for name in names if name not in dataset]
     if missing:
-        raise ValueError(f"plot must have {', '.join(names)}; got a map without {', '.join(missing)}")
+        raise ValueError(
+            f"plot must have {', '.join(names)}; got a map without {', '.join(missing)}; "
+            "variable_map (--show NAME) draws any variable that there is"
+        )
 
 
 def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
@@ -191,7 +224,7 @@ def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Fig
         check_format(path)
     whole = dataset[kind.coloured]
     layout({str(dim): size for dim, size in whole.sizes.items()})
-    names = [*kind.needs, *(name for name in kind.optional if name in dataset)]
+    names = list(dict.fromkeys([*kind.needs, *(name for name in kind.optional if name in dataset)]))
     # A variable lacks the dimensions that it does not depend on; the picture wants them all.
     full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
     dataset = dataset.assign(full)[names].squeeze()
@@ -242,11 +275,11 @@ def _panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple
     return figure, panels
 
 
-def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: LogNorm) -> QuadMesh:
+def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: Normalize) -> QuadMesh:
     across, up = (_edges(panel[dim].values)[0] for dim in (x, y))
     # matplotlib takes infinities for missing.
     values = np.minimum(panel[kind.coloured].values, np.finfo(float).max)
-    mesh = axes.pcolormesh(across, up, np.ma.masked_where(~(values > 0), values), norm=norm, rasterized=True)
+    mesh = axes.pcolormesh(across, up, np.ma.masked_where(~_drawn(values, norm), values), norm=norm, rasterized=True)
     _mark_map(axes, kind.marks(panel), (panel[x].values, panel[y].values), (across, up))
     return mesh
 
@@ -259,13 +292,15 @@ def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
     figure = Figure(figsize=(5.2, 3.8), layout="constrained")
     axes, peak = figure.subplots(), _peak(dataset)
     across, xscale = _edges(places)
-    axes.set(xscale=xscale, yscale="log", xlim=across[[0, -1]], xlabel=axis_label(dataset[x]), ylabel=kind.label)
-    drawn = (values > 0) & np.isfinite(values)
+    norm = kind.colours(dataset)
+    yscale = "log" if isinstance(norm, LogNorm) else "linear"
+    axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], xlabel=axis_label(dataset[x]), ylabel=kind.label)
+    drawn = _drawn(values, norm) & np.isfinite(values)
     axes.plot(places, np.where(drawn, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
     axes.margins(y=0.05)
     _mark_curve(axes, kind.marks(dataset), places, across, values)
     if peak is not None:
-        axes.plot(peak[x], peak, **_STAR, zorder=5)
+        axes.plot(peak[x], dataset[kind.coloured].sel({x: peak[x]}), **_STAR, zorder=5)
     _explain(figure, dataset, kind, peak)
     return figure
 
@@ -298,25 +333,77 @@ def _mark_curve(axes: Axes, marks: list[_Mark], places: np.ndarray, across: np.n
             axes.plot(places[mask], values[mask], **style | _SINGLE, zorder=2)
 
 
+def _drawn(values: np.ndarray, norm: Normalize) -> np.ndarray:
+    """Which values have a colour."""
+    return values > 0 if isinstance(norm, LogNorm) else ~np.isnan(values)
+
+
+def _spanned(dataset: "xr.Dataset", values: np.ndarray) -> tuple[np.ndarray, int]:
+    """What colours span, over how many decades at most: admissible cells, outside which formulas may give any number.
+
+    Where these are few, all that is shown: or the colours would tell nothing of what is around them.
+    """
+    drawn = np.isfinite(values)
+    trusted = drawn & dataset["admissible"].values if "admissible" in dataset else drawn
+    return (values[trusted], _DECADES) if trusted.sum() >= _ENOUGH * drawn.sum() else (values[drawn], _ALL_DECADES)
+
+
+def _log_colours(values: np.ndarray, decades: int) -> LogNorm:
+    return LogNorm(max(values.min(), values.max() / 10**decades), values.max())
+
+
 def _power_colours(dataset: "xr.Dataset") -> LogNorm:
-    """Colours for the admissible cells: outside, the formula may give any number of times more."""
     power = dataset["P"].values
-    trusted = power[(power > 0) & dataset["admissible"].values]
-    shown = trusted if trusted.size else power[power > 0]
-    if not shown.size:
-        return LogNorm(1e-9, 1e-6)
-    return LogNorm(max(shown.min(), shown.max() / 10**_DECADES), shown.max())
+    shown, decades = _spanned(dataset, np.where(power > 0, power, np.nan))
+    return _log_colours(shown, decades) if shown.size else LogNorm(1e-9, 1e-6)
+
+
+def _common_marks(dataset: "xr.Dataset") -> list[_Mark]:
+    """Marks of what a map holds besides what is coloured."""
+    marks = []
+    if "admissible" in dataset:
+        marks.append(_Mark(~dataset["admissible"].values, "veil", _VEIL, "inadmissible"))
+    if "period" in dataset:
+        period = dataset["period"].values
+        marks += [
+            _Mark(period == 1, "border", _LINE, "border of period 1"),
+            _Mark(period == 0, "most", _DOT, "aperiodic"),
+            _Mark(period < 0, "any", _CROSS, "undecided"),
+        ]
+    return marks
 
 
 def _power_marks(dataset: "xr.Dataset") -> list[_Mark]:
-    period = dataset["period"].values
-    return [
-        _Mark(~dataset["admissible"].values, "veil", _VEIL, "inadmissible"),
-        _Mark(period == 1, "border", _LINE, "border of period 1"),
-        _Mark(period == 0, "most", _DOT, "aperiodic"),
-        _Mark(period < 0, "any", _CROSS, "undecided"),
-        _Mark(dataset["P"].values == 0, "bare", _BARE, "no impact"),
-    ]
+    return [*_common_marks(dataset), _Mark(dataset["P"].values == 0, "bare", _BARE, "no impact")]
+
+
+def _number_colours(name: str, dataset: "xr.Dataset") -> Normalize:
+    shown, decades = _spanned(dataset, dataset[name].values)
+    positive = shown[shown > 0]
+    if positive.size and shown.min() >= 0 and positive.max() > _WIDE * positive.min():
+        return _log_colours(positive, decades)
+    return Normalize(shown.min(), shown.max()) if shown.size else Normalize(0, 1)
+
+
+def _number_marks(name: str, dataset: "xr.Dataset") -> list[_Mark]:
+    others = dataset.drop_vars(name) if name == "period" else dataset  # its own colours say it
+    none = ~_drawn(dataset[name].values, _number_colours(name, dataset))
+    zero = bool((dataset[name].values[none] == 0).any())
+    return [*_common_marks(others), _Mark(none, "bare", _BARE, "zero, or no value" if zero else "no value")]
+
+
+def _kinds(dataset: "xr.Dataset", name: str) -> "tuple[xr.Dataset, list[_Category]]":
+    """A variable of flags as places among categories, those that occur."""
+    variable = dataset[name]
+    if variable.dtype == bool:
+        words = {0: "no", 1: "yes"}
+    else:
+        words = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
+    found = sorted(flag for flag in words if (variable == flag).any())
+    codes = np.searchsorted(found, variable.values.astype(int))
+    shares = [f"{_share((variable.values == flag).mean())} {words[flag].replace('_', ' ')}" for flag in found]
+    categories = [_Category(colour, text) for colour, text in zip(_COLOURS, shares, strict=False)]
+    return dataset[[]].assign(code=variable.copy(data=codes)).assign_attrs(dataset.attrs), categories
 
 
 def _difference_colours(_: "xr.Dataset") -> LogNorm:

@@ -37,8 +37,8 @@ class Steady(WithStatus):
         condition: Condition number of I - DP, Frobenius.
         clearance: How far the orbit is from grazing.
         residual: Largest violation of the equations.
-        status: A `Status`, whose `advice` says what to do. OK; UNSTABLE: it repels, or is at a bifurcation; VIRTUAL: the
-            ball would meet a wall in between; NO_ORBIT: Newton found none.
+        status: A `Status`, whose `advice` says what to do. OK; UNSTABLE: it repels, or is at a bifurcation;
+            VIRTUAL: the ball would meet a wall in between; NO_ORBIT: Newton found none.
         left, right, period: Label of the orbit: impacts on either wall, in so many forcing periods.
         knots: The orbit; see `shooting`.
     """
