@@ -16,6 +16,7 @@ import pytest
 
 import vijax
 from vijax import design, objective
+from vijax import report as reports
 from vijax import surroundings as around
 from vijax.model import Harvester, Status
 from vijax.objective import Batch, Scene
@@ -317,3 +318,38 @@ def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder
     assert report["highest"]["P"] > 100 * report["best"]["P"]
     assert "not physical: P alone would choose omega0" in said
     assert not (folder / "design.png").exists()
+
+
+def test_chaos_without_a_design_is_told_with_its_power(folder, capsys, monkeypatch):
+    monkeypatch.setattr(script, "_POINTS", 8)
+    chaos = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--steps", "4", "--balls", "2"]
+    assert script.main([*chaos, "--impacts", "2"]) == 0
+    said = capsys.readouterr().out
+    met = strict(folder / "design.json")["survey"]
+    assert (met["orbits"], met["restless"], met["held"], met["silent"]) == (0, 4, 0, 0)
+    there = dataclasses.replace(Harvester(), s=0.12 * float(Harvester().length_unit))
+    there = dataclasses.replace(there, omega0=met["values"]["kappa"] * float(there.omega) / np.pi)
+    flown = vijax.sweep(d=0.12, kappa=met["values"]["kappa"], periods=400, device=there)
+    assert flown.period == 0
+    assert flown.admissible
+    assert met["P"] == pytest.approx(float(flown.P), rel=0.2)  # eight periods of chaos against hundreds
+    assert "no admissible attracting orbit was found; what the survey met instead:" in said
+    assert "aperiodic or long motion at 4 of the values looked at, P up to" in said
+    assert f"admissibly, at kappa = {met['values']['kappa']:.7g}: it has no gradient" in said
+    assert "widen the bounds" not in said
+
+
+def test_what_a_survey_met_says_what_to_do():
+    nothing = {"orbits": 0, "admissible": 0, "restless": 0, "P": 0.0, "values": {}, "held": 0.0, "silent": 0.0}
+    for met, says in (
+        ({"orbits": 3}, "3 periodic orbits that break a constraint: widen the bounds or the penetration limit"),
+        ({"orbits": 3, "admissible": 3}, "3 admissible orbits that led to no optimum"),
+        ({"restless": 2}, "none of it admissible"),
+        ({"held": 1.0}, "100 % of the starts on one wall for ever: raise A or lower beta"),
+        ({"silent": 0.5}, "50 % of the starts without impacts"),
+        ({}, "nothing that settles"),
+    ):
+        one = {"best": None, "survey": nothing | met}
+        (line,) = reports.table({"over": {"name": "d", "values": [0.1]}, "designs": [one]})
+        assert line.startswith("d 0.1: no admissible attracting orbit; ")
+        assert says in line

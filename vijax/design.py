@@ -23,7 +23,7 @@ from vijax.method import whole
 from vijax.model import Harvester, Status
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
-from vijax.starts import Effort, Met, find
+from vijax.starts import Effort, Looked, Met, find
 from vijax.steady import Steady, steady
 from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import check_names, limits, tuned, values, variables
@@ -80,7 +80,7 @@ class Design:
         tune, bounds: What was tuned, between which values.
         objective: Of `OBJECTIVES`.
         tolerances: Of the objective.
-        attractors: Periodic orbits that the survey found.
+        looked: What the survey met, periodic and not.
         starts: How many of them climbed.
     """
 
@@ -89,7 +89,7 @@ class Design:
     bounds: dict[str, tuple[float, float]]
     objective: str
     tolerances: tuple[Tolerance, ...]
-    attractors: int
+    looked: Looked
     starts: int
 
     @property
@@ -148,7 +148,7 @@ def optimise_all(
     box = check(devices, tune, bounds or {}, objective, scatter)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    starts, met = find(devices, tune, box, objective, far)
+    starts, looked = find(devices, tune, box, objective, far)
     ends = _climbed(scene, starts, box, looks)
     optima = _optima(scene, starts, ends, devices, looks)
     return [
@@ -158,7 +158,7 @@ def optimise_all(
             bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, box[owner])).T.tolist()), strict=True)),
             objective=objective,
             tolerances=scatter,
-            attractors=int(met[owner]),
+            looked=looked[owner],
             starts=int((starts.owner == owner).sum()),
         )
         for owner in range(len(devices))

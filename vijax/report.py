@@ -48,7 +48,7 @@ def describe(
         "bounds": {name: list(pair) for name, pair in design.bounds.items()},
         "objective": design.objective,
         "objective_means": OBJECTIVES[design.objective],
-        "attractors": design.attractors,
+        "survey": design.looked._asdict(),
         "starts": design.starts,
         "best": optimum(design.best) if design.best else None,
         "others": [optimum(one) for one in design.optima[1:]],
@@ -143,16 +143,39 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
     """What a builder needs to know before trusting a design, from what `describe` returned."""
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in report["bounds"].items())
     yield f"tuned: {ranges}; objective {report['objective']}, {report['objective_means']}"
-    yield f"survey: {report['attractors']:,} periodic attractors met, {report['starts']:,} climbed"
+    yield f"survey: {report['survey']['orbits']:,} periodic attractors met, {report['starts']:,} climbed"
     best = report["best"]
     if best is None:
-        yield "no admissible attracting orbit was found; widen the bounds or the penetration limit"
+        yield "no admissible attracting orbit was found; what the survey met instead:"
+        yield from (f"  {what}" for what in _instead(report["survey"]))
     else:
         yield from _best(best, report["objective"])
         yield from _around(best, report["surroundings"])
         yield from _others(best, report["others"], report["objective"])
         yield from _off(report)
     yield from _unconstrained(report)
+
+
+def _instead(survey: dict[str, Any]) -> Iterator[str]:
+    """What a survey met where no design came of it, and what to do about each."""
+    broken = survey["orbits"] - survey["admissible"]
+    if broken:
+        yield f"{broken:,} periodic orbits that break a constraint: widen the bounds or the penetration limit"
+    if survey["admissible"]:
+        yield f"{survey['admissible']:,} admissible orbits that led to no optimum: take more steps and balls"
+    if survey["restless"]:
+        where = ", ".join(quantity(*item) for item in survey["values"].items())
+        harvest = f"P up to {amount(survey['P'], 'J', 4)} admissibly, at {where}" if where else "none of it admissible"
+        yield (
+            f"aperiodic or long motion at {survey['restless']:,} of the values looked at, {harvest}: it has no "
+            "gradient; move the bounds, or look for narrow windows with more steps and balls"
+        )
+    if survey["held"]:
+        yield f"{100 * survey['held']:.3g} % of the starts on one wall for ever: raise A or lower beta"
+    if survey["silent"]:
+        yield f"{100 * survey['silent']:.3g} % of the starts without impacts: narrow the gap"
+    if not any(survey[name] for name in ("orbits", "restless", "held", "silent")):
+        yield "nothing that settles: look at more values, from more starts"
 
 
 def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
@@ -253,7 +276,7 @@ def table(report: dict[str, Any]) -> Iterator[str]:
     for value, one in zip(values, report["designs"], strict=True):
         best = one["best"]
         if best is None:
-            yield f"{name} {value:.5g}: no admissible attracting orbit"
+            yield f"{name} {value:.5g}: no admissible attracting orbit; {next(_instead(one['survey']))}"
             continue
         tuned = ", ".join(quantity(*item) for item in best["values"].items())
         spread = f", at worst {amount(one['spread']['worst'], 'J', 5)}" if one["spread"] else ""

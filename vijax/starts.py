@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.energy import harvested_energy
-from vijax.model import Harvester
+from vijax.model import Harvester, Status
 from vijax.survey import Flown, Survey, survey
-from vijax.tuning import moving, tuned
+from vijax.tuning import moving, tuned, values
 
 _LONGEST = 8  # forcing periods of an orbit
 _REACH = 0.49, 0.6  # of the gap that the ball's displacement may take, and its velocity
@@ -34,6 +34,26 @@ class Effort(NamedTuple):
     balls: int
     impacts: int
     periods: int
+
+
+class Looked(NamedTuple):
+    """What a survey of a device met.
+
+    Attributes:
+        orbits, admissible: Periodic attractors that can be climbed from; those that break no constraint.
+        restless: How many values of the tuned quantities have other motion: aperiodic, not settled, or too long.
+        P: Most that such motion harvests per half forcing period without breaking a constraint [J]; 0 if none does.
+        values: Of the tuned quantities where it does; none if none does.
+        held, silent: Shares of the starts that end on one wall for ever, and without a wall.
+    """
+
+    orbits: int
+    admissible: int
+    restless: int
+    P: float
+    values: dict[str, float]
+    held: float
+    silent: float
 
 
 class Met(NamedTuple):
@@ -74,8 +94,8 @@ class _Places(NamedTuple):
 
 def find(
     devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, objective: str, effort: Effort
-) -> tuple[Met, np.ndarray]:
-    """The attractors to climb from, and how many were met of every device.
+) -> tuple[Met, list[Looked]]:
+    """The attractors to climb from, and what else was met of every device.
 
     Args:
         devices: Where quantities that are not tuned are taken from.
@@ -93,16 +113,35 @@ def find(
     draws = np.random.default_rng(0).uniform(-1, 1, (2, cells)), np.random.default_rng(1).uniform(-1, 1, (2, cells))
     places = _Places(owner, level, step / max(steps - 1, 1), np.arange(owner.size) % cells)
     seen = _look(scene, places, draws[0])
-    met = seen.met(seen.found.orbits(effort.impacts))
+    met, unrest = seen.met(seen.found.orbits(effort.impacts)), seen.met(seen.found.unrest(effort.impacts))
     if first is not None:
         most = _most(_promise(met, objective), met.owner, len(devices))
-        again = _closer(seen.met(seen.found.unrest(effort.impacts)), most, objective, effort, cells)
+        again = _closer(unrest, most, objective, effort, cells)
         if again.owner.size:
             closer = _look(scene, again, draws[1])
             more = closer.met(closer.found.orbits(effort.impacts))
             met = jax.tree.map(lambda *x: np.concatenate(x), met, more)
     chosen = _promising(met, objective, len(devices), max(1, steps // _BESIDE))
-    return met.some(chosen), np.bincount(met.owner, minlength=len(devices))
+    return met.some(chosen), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
+
+
+def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
+    """What was met of a device, the closer survey's orbits among it."""
+    met, unrest = met.some(met.owner == one), unrest.some(unrest.owner == one)
+    broken, rest = _promise(met, "P").lacks < 0, _promise(unrest, "P")
+    power = np.where(rest.lacks < 0, 0.0, np.nan_to_num(np.exp(rest.value)))
+    best = float(power.max(initial=0.0))
+    where = np.asarray(values(tune, unrest.z[power.argmax()])).tolist() if best else []
+    status = seen.found.ended.status[seen.places.owner == one]
+    return Looked(
+        orbits=broken.size,
+        admissible=int((~broken).sum()),
+        restless=power.size,
+        P=best,
+        values=dict(zip(tune, where, strict=bool(best))),
+        held=float((status == Status.PERMANENT_CONTACT).mean()),
+        silent=float((status == Status.NO_IMPACT).mean()),
+    )
 
 
 class _Scene(NamedTuple):
