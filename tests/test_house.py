@@ -56,7 +56,7 @@ ROOMS: dict[str, set[str]] = {
     "curve": {"model", "flow"},
     "elimination": set(),
     "shooting": {"model", "flow", "elimination"},
-    "clearance": {"model", "flow", "shooting"},
+    "clearance": {"model", "flow", "exact", "shooting"},
     "steady": {"elimination", "model", "flow", "energy", "exact", "shooting", "clearance"},
     "ascent": set(),
     "tolerance": {"model"},
