@@ -132,19 +132,34 @@ def targets(
 ) -> tuple[Path | None, Path | None]:
     """Store and picture to write, both defaults where neither was given; raises unless they can be written.
 
-    With `goes_on` a store that is there is left to `study.check`, and its picture is drawn again.
+    With `goes_on` a store that is there is left to `study.check`, and its picture is drawn again if vijax drew it.
     """
-    from vijax.store import check_output
-
     if out is None and plot is None:
         out, plot = defaults
-    if out is not None and not out.endswith(ending):
-        raise ValueError(f"out must end in {ending}; got {out!r}")
-    overwrite = overwrite or (goes_on and out is not None and Path(out).exists())
-    return (
-        None if out is None else check_output("out", out, overwrite),
-        None if plot is None else check_output("plot", plot, overwrite),
-    )
+    store = None if out is None else _store(out, ending, overwrite, goes_on)
+    again = goes_on and not overwrite and store is not None and store.exists()
+    return store, None if plot is None else _picture(plot, overwrite, again)
+
+
+def _store(out: str, ending: str, overwrite: bool, goes_on: bool) -> Path:
+    from vijax.files import check_ending, check_output
+    from vijax.store import check_place, check_store
+
+    if ending != ".zarr":
+        check_ending("out", out, ending)
+        return check_output("out", out, overwrite)
+    place = check_place("out", out)
+    return place if goes_on and not overwrite and place.exists() else check_store("out", out, overwrite)
+
+
+def _picture(plot: str, overwrite: bool, again: bool) -> Path:
+    from vijax.files import check_output
+    from vijax.style import is_drawn
+
+    picture = check_output("plot", plot, overwrite or again)
+    if again and picture.exists() and not is_drawn(picture):
+        raise FileExistsError(f"plot must be new or a picture drawn by vijax; got {plot}; take another name")
+    return picture
 
 
 @contextmanager

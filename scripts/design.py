@@ -81,7 +81,7 @@ def design(
     """Find the membrane, and what else is tuned, that harvests most and can be built."""
     from vijax import blueprint, report
     from vijax import design as designs
-    from vijax.store import write_json
+    from vijax.files import write_json
     from vijax.style import check_format
 
     with command.door():

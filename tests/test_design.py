@@ -17,9 +17,9 @@ import pytest
 import vijax
 from vijax import design, objective
 from vijax import surroundings as around
+from vijax.files import write_json
 from vijax.model import Harvester, Status
 from vijax.objective import Batch, Scene
-from vijax.store import write_json
 from vijax.tolerance import Tolerance, nodes
 
 FAST = Harvester(A=3.0, omega=10 * math.pi, V=1700.0)

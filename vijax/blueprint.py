@@ -9,8 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vijax.report import UNITS, amount, factors
-from vijax.store import replacing
-from vijax.style import STYLE, axis_label, check_format, symbol
+from vijax.style import STYLE, axis_label, check_format, save_figure, symbol
 from vijax.tuning import LINEAR, constant
 
 if TYPE_CHECKING:
@@ -66,8 +65,7 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
         handles, texts = panels[0].get_legend_handles_labels()
         figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -210,8 +208,7 @@ def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure
         lower.set(yscale="log", ylabel="$P$ [J per half period]", xlabel=_named(over["name"]))
         figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 

@@ -14,8 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
-from vijax.store import replacing
-from vijax.style import STYLE, axis_label, check_format, symbol, title, units
+from vijax.style import STYLE, axis_label, check_format, save_figure, symbol, title, units
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -52,8 +51,7 @@ def stability_map(found: Any, path: str | Path | None = None) -> Figure:
         texts = ["bounded", "blown up within 50 periods", "theory"]
         figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -122,8 +120,7 @@ def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantit
         figure.suptitle(title(dataset, _FURTHER), fontsize="medium")
         _explain(figure, dataset, others, ways)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -252,8 +249,7 @@ def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figur
         figure.suptitle(_HOW_TO_READ, fontsize="medium")
         figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -371,8 +367,7 @@ def branches(dataset: "xr.Dataset", path: str | Path | None = None, quantity: st
         lines += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
         figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 

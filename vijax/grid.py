@@ -25,7 +25,7 @@ from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables
 from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
 from vijax.model import Harvester
-from vijax.store import check_output, load, save, view
+from vijax.store import check_store, load, save, view
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -116,10 +116,11 @@ def sweep(
             `computed` says which are which.
         progress: Called with (cells done, cells in all) from the calling thread, first before anything is run. While a
             plane is refined, all are those known to be needed, and grow.
-        out: Zarr store to write tile by tile, so that memory is set by a tile. It opens at any time, cells that were
-            not run yet by their `status`; stopped in whatever way, the same call goes on with what is left of it.
-            A refined plane is written when it is whole. Without, everything is in memory.
-        overwrite: Begin anew whatever the store holds.
+        out: Zarr store, named *.zarr, to write tile by tile, so that memory is set by a tile. It opens at any time,
+            cells that were not run yet by their `status`; stopped in whatever way, the same call goes on with what is
+            left of it, and mends what was damaged. A refined plane is written when it is whole. Without, everything is
+            in memory.
+        overwrite: Begin anew whatever the store holds; what vijax did not write is never replaced.
         workers: With `out`: who runs and writes the tiles, under Dask (extra `cluster`): so many new processes, which
             share the cores, or the address of a scheduler whose workers see `out` under the same path. A worker runs a
             tile a thread, on its first device. New processes import the calling script: what it does must stand under
@@ -247,10 +248,10 @@ def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
     """Raise unless the map of a plan can be written there, or goes on there; makes nothing.
 
     Raises:
-        OSError: Of which kind `study.check` and `store.check_output` say.
+        ValueError, OSError: As `study.check`; of a refined map as `store.check_store`.
     """
     if planned.refine:
-        check_output("out", out, overwrite)
+        check_store("out", out, overwrite)
     else:
         study.check(planned, out, overwrite)
 

@@ -21,8 +21,7 @@ from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.label import label
 from vijax.panels import LABEL_NEEDS, NEEDS, layout, layout_of_kinds
-from vijax.store import replacing
-from vijax.style import STYLE, axis_label, check_format, equations, title
+from vijax.style import STYLE, axis_label, check_format, equations, save_figure, title
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -199,8 +198,7 @@ def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Fig
     with mpl.rc_context(STYLE):
         figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -383,8 +381,7 @@ def _coded(dataset: "xr.Dataset", categories: list[_Category] | None, path: str 
             _list_categories(figure, categories, loc="outside right upper")
         figure.suptitle(title(dataset), fontsize="medium")
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 

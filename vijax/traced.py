@@ -17,7 +17,7 @@ import numpy as np
 from jax import export
 
 from vijax import xla
-from vijax.store import replacing
+from vijax.files import replacing
 
 _TRACED_BY = "jax", "jaxlib", "equinox", "diffrax"
 _DIGEST = hashlib.sha256
