@@ -3,9 +3,11 @@
 A script is a click command whose body is one `door`, one run under `progress`, and one `finish`.
 """
 
+import io
 import math
 import os
 import signal
+import sys
 import threading
 import time
 from collections import Counter
@@ -266,6 +268,9 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show must not end a finished run
     try:
         command.main(arguments, standalone_mode=False)
     except click.ClickException as error:

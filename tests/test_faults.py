@@ -280,3 +280,13 @@ def test_what_a_killed_run_left_beside_a_picture_is_cleared_away(folder, capsys,
     assert script.main([*ARGUMENTS, "--plot", "map.png"]) == 0
     assert [said.getMessage() for said in caplog.records] == [f"{left.name}, which a killed run had left, is removed"]
     assert {path.name for path in folder.iterdir()} == {"map.zarr", "map.png"}
+
+
+@pytest.mark.parametrize("coding", ["latin-1", "ascii", "utf-8"])
+def test_a_terminal_that_cannot_show_a_name_ends_no_run(folder, monkeypatch, coding):
+    name = "\u03ba\udcff.zarr"  # a Greek letter, and a byte that is no letter
+    with open("told.txt", "w", encoding=coding) as terminal:
+        monkeypatch.setattr(sys, "stdout", terminal)
+        assert script.main([*ARGUMENTS[:-1], name]) == 0
+    assert b".zarr\n" in (folder / "told.txt").read_bytes()
+    is_undisturbed(name)
