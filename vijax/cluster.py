@@ -4,7 +4,9 @@ Dask finds who is idle, runs again what a lost worker was at, and says what is d
 that they are done goes over the network: a task writes its own results.
 """
 
+import asyncio
 import itertools
+import logging
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
@@ -27,6 +29,7 @@ Workers = int | str
 
 _ANSWER = 10  # seconds that a scheduler has to answer
 _WAITING = 2  # tasks a thread of a worker: one runs and one waits, so that nobody does
+_LOGS = ("distributed.batched", "distributed.client", "distributed.core", "distributed.utils", "tornado.application")
 _CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
@@ -58,7 +61,10 @@ def done(work: Callable[[Task], None], tasks: Iterable[Task], workers: Workers) 
         As `check`; ChildProcessError if a task lost one worker after another; ConnectionError if the scheduler is lost.
     """
     with _joined(workers) if isinstance(workers, str) else _local(workers) as client:
-        yield from _in_turn(client, work, iter(tasks))
+        try:
+            yield from _in_turn(client, work, iter(tasks))
+        except (_dask().comm.CommClosedError, CancelledError):
+            raise ConnectionError("the scheduler was lost") from None
 
 
 def _in_turn(client: "Client", work: Callable[[Task], None], tasks: Iterator[Task]) -> Iterator[Task]:
@@ -94,8 +100,6 @@ def _check_ended(future: "Future") -> None:
     except KilledWorker as error:
         lost = error.allowed_failures + 1
         raise ChildProcessError(f"{lost} workers were lost, one after another, at the same tile") from None
-    except CancelledError:
-        raise ConnectionError("the scheduler was lost") from None
 
 
 def _dask() -> ModuleType:
@@ -120,8 +124,25 @@ def _joined(address: str) -> "Iterator[Client]":
         raise ConnectionError(
             f"scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give its address"
         ) from None
-    with client:
+    with _quiet(), client:
         yield client
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from the logs the tracebacks of connections that are lost: what is raised here says it in one line."""
+
+    def other(record: logging.LogRecord) -> bool:
+        return not (record.exc_info and isinstance(record.exc_info[1], OSError | asyncio.CancelledError))
+
+    loggers = [logging.getLogger(name) for name in _LOGS]
+    for logger in loggers:
+        logger.addFilter(other)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(other)
 
 
 @contextmanager
