@@ -489,6 +489,23 @@ def test_a_variable_that_is_gone_is_run_again(calls, out):
     xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
 
 
+@pytest.mark.parametrize("damage", [lambda file: file.write_text("{}"), Path.unlink])
+def test_a_store_without_its_list_is_mended_as_far_as_its_metadata_tell(calls, out, caplog, damage):
+    whole = sweep(**FEW, out=out).load()
+    damage(out / "vijax.json")
+    attribute("units", "mJ")(out / "P" / "zarr.json")
+    calls.clear()
+    xr.testing.assert_identical(sweep(**FEW, out=out).load(), whole)
+    xr.testing.assert_identical(load(out), whole)
+    assert sum(calls) == 0
+    names = [said.getMessage().partition(f" of {out} is written again")[0] for said in caplog.records]
+    assert names == ["P/zarr.json", "vijax.json"]
+    damage(out / "vijax.json")
+    exchange(out / "d" / "c" / "0")
+    with pytest.raises(FileExistsError, match=r"where vijax.json .* tell whether d/c/0 is what was written; allow"):
+        sweep(**FEW, out=out)
+
+
 @pytest.mark.parametrize("damage", [lambda lock: lock.write_bytes(b"\xff\x00"), Path.unlink])
 def test_a_lock_that_is_lost_is_made_again(calls, out, damage):
     whole = sweep(**AXES, out=out).load()
@@ -532,10 +549,11 @@ def test_a_store_of_an_earlier_version_opens_and_goes_on(calls, out):
     assert (load(out)["status"] == Status.NOT_RUN).any()
     xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
     assert len(calls) - before == len(records(out)) - done
-    (out / "P" / "zarr.json").write_text("{}")
-    with pytest.raises(ValueError, match="path must name a store that can be read") as error:
-        load(out)
-    assert "\n" not in str(error.value)
+    for damage, say in (("{}", "path must name a store that can be read"), ("{", "where P/zarr.json cannot be read")):
+        (out / "P" / "zarr.json").write_text(damage)
+        with pytest.raises(ValueError, match=say) as error:
+            load(out)
+        assert "\n" not in str(error.value)
     sweep(**AXES, out=out, overwrite=True)
 
 

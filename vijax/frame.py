@@ -93,20 +93,21 @@ def mend(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Ca
 
 
 def _mend_list(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
-    """Write the list of a store again that has lost it, if all else is what the plan has there."""
+    """Write the list of a store again that has lost it, and what metadata of arrays differ from those of the store."""
     reason = inventory.fault(path / inventory.LIST, None)
-    lost = reason != "is missing"
-    if not lost and "consolidated_metadata" not in (inventory.content(path / "zarr.json") or {}):
+    if reason == "is missing" and not inventory.had_list(path):
         return
     with _fresh(planned, tile, birth) as fresh:
-        made = inventory.read(fresh) or {}
-        if next(inventory.faults(path, made["files"]), None) is None:
-            _take(inventory.LIST, reason, fresh, path, say)
-        elif lost:
+        faults = dict(inventory.faults(path, (inventory.read(fresh) or {})["files"]))
+        if any("/zarr.json" not in name for name in faults):
             raise FileExistsError(
-                f"out must be whole; got {path}, where {inventory.LIST} {reason}; remove it to go on without "
-                "what it lists, allow overwriting, or take another name"
+                f"out must be whole or what this plane can mend; got {path}, where {inventory.LIST} {reason}, "
+                f"which would tell whether {next(iter(faults))} is what was written; allow overwriting, "
+                "or take another name"
             )
+        for name, fault in faults.items():
+            _take(name, fault, fresh, path, say)
+        _take(inventory.LIST, reason, fresh, path, say)
 
 
 @contextmanager

@@ -106,6 +106,14 @@ def listed(path: Path) -> Iterator[tuple[str, str]]:
     else:  # nothing to compare with, but to read a pipe would take for ever
         odd = (file for file in path.rglob("*") if file.exists() and not file.is_dir() and not file.is_file())
         yield from ((_name(path, file), "is no regular file") for file in odd)
+        unread = (file for file in path.glob("*/zarr.json") if content(file) is None)
+        yield from ((_name(path, file), "cannot be read") for file in unread)
+
+
+def had_list(path: Path) -> bool:
+    """Whether a store without a list had one: if so, its records name files, and not variables."""
+    record = content(next((path / TILES).glob("[0-9]*.json"), path / TILES)) or {}
+    return any("/" in name for name in record.get("files") or ())
 
 
 def records(path: Path) -> Iterator[tuple[str, str]]:
