@@ -60,7 +60,7 @@ def check_folder(name: str, path: str | Path) -> Path:
 
 
 def beside(path: Path, kind: str) -> Path:
-    """A sibling for what is being written, of kind "part", or for what is being replaced, of kind "old"."""
+    """Name a sibling for what is being written, of kind "part", or for what is being replaced, of kind "old"."""
     return path.with_name(f".{path.stem}.{os.getpid()}.{kind}{path.suffix}")
 
 
@@ -77,7 +77,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """As `replacing`, for a folder: what was there is put aside, and back if the new one cannot take its place."""
+    """Do as `replacing` for a folder: what was there is put aside, and back if the new one cannot take its place."""
     path = path.resolve()  # a link goes on pointing where it does
     part, old = beside(path, "part"), beside(path, "old")
     _WRITING.update((part, old))

@@ -53,7 +53,7 @@ def write(planned: Plan, tile: Mapping[str, int], birth: str, path: Path) -> Non
 
 
 def void(name: str, dtype: np.dtype) -> Any:
-    """What a variable holds where nothing was run."""
+    """Give what a variable holds where nothing was run."""
     if name == "status":
         return int(Status.NOT_RUN)
     return {"f": np.nan, "i": -1, "b": False}[dtype.kind]

@@ -22,7 +22,7 @@ _PART = re.compile(r"\.(\w+)\.\d+\.part(\.json)?")  # of `files.beside`
 
 
 def fingerprint(content: bytes) -> str:
-    """Length and checksum of a file."""
+    """Tell length and checksum of a file."""
     return f"{len(content)} bytes, CRC-32 {zlib.crc32(content):08x}"
 
 
@@ -56,7 +56,7 @@ def _check_way(file: Path) -> None:
 
 
 def content(file: Path) -> dict[str, Any] | None:
-    """The JSON object in a file; None if there is none, or what takes too long to read."""
+    """Read the JSON object in a file; None if there is none, or what takes too long to read."""
     try:
         if not file.is_file() or file.stat().st_size > _LONGEST:
             return None
@@ -78,7 +78,7 @@ def rewrite(path: Path, listed: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any] | None:
-    """The list of a store, if there is one that is as it was written."""
+    """Read the list of a store, if there is one that is as it was written."""
     listed = content(path / LIST)
     if listed is None or listed.pop("checksum", None) != _own(listed):
         return None
@@ -90,14 +90,14 @@ def _own(listed: Mapping[str, Any]) -> str:
 
 
 def faults(path: Path, files: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """What is wrong with the files of a list: names and reasons."""
+    """Find what is wrong with the files of a list: names and reasons."""
     for name, expected in files.items():
         if reason := fault(path / name, expected):
             yield name, reason
 
 
 def listed(path: Path) -> Iterator[tuple[str, str]]:
-    """What is wrong with the files that the list of a store names, or with that list."""
+    """Find what is wrong with the files that the list of a store names, or with that list."""
     found = read(path)
     if found is not None:
         yield from faults(path, found["files"])
@@ -111,13 +111,13 @@ def listed(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def had_list(path: Path) -> bool:
-    """Whether a store without a list had one: if so, its records name files, and not variables."""
+    """Tell whether a store without a list had one: if so, its records name files, and not variables."""
     record = content(next((path / TILES).glob("[0-9]*.json"), path / TILES)) or {}
     return any("/" in name for name in record.get("files") or ())
 
 
 def records(path: Path) -> Iterator[tuple[str, str]]:
-    """What is wrong with the files of the tiles that are done, and with their records; nothing without a list."""
+    """Find what is wrong with the files of the tiles that are done, and with their records; nothing without a list."""
     for record in sorted((path / TILES).glob("[0-9]*.json")) if read(path) else ():
         found = content(record)
         if found is None or not isinstance(found.get("files"), dict):
@@ -127,7 +127,7 @@ def records(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def is_study(path: Path) -> bool:
-    """Whether the files of a store are made tile by tile, so that what is damaged is made again."""
+    """Tell whether the files of a store are made tile by tile, so that what is damaged is made again."""
     return (path / TILES).is_dir() or "birth" in (read(path) or {})
 
 
@@ -135,7 +135,7 @@ def is_study(path: Path) -> bool:
 
 
 def is_store(path: Path) -> bool:
-    """Whether a folder is a store of vijax, of an earlier version too; it may be damaged."""
+    """Tell whether a folder is a store of vijax, of an earlier version too; it may be damaged."""
     if (path / LIST).is_file():
         return True
     attributes = (content(path / "zarr.json") or {}).get("attributes")
@@ -152,7 +152,7 @@ def foreign(path: Path) -> str | None:
 
 
 def half_written(path: Path) -> list[Path]:
-    """What killed processes were at, inside a store."""
+    """Find what killed processes were at, inside a store."""
     found = [file for file in path.rglob(".*.part*") if file.is_file() and not file.is_symlink()]
     return [file for file in found if _PART.fullmatch(file.name) and _ours(_name(path, file), None)]
 

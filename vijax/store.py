@@ -115,7 +115,7 @@ def load(path: str | Path) -> "xr.Dataset":
 
     Raises:
         FileNotFoundError: If there is no store.
-        ValueError: If a file of it is not what was written.
+        ValueError: If a file of it is not what was written; FileExistsError if a folder stands in its place.
     """
     with view(path) as dataset:
         _check(Path(path), inventory.records(Path(path)))

@@ -38,7 +38,7 @@ def save_figure(figure: Any, path: str | Path) -> None:
 
 
 def is_drawn(path: Path) -> bool:
-    """Whether a file is a picture that vijax drew and nothing else has saved since."""
+    """Tell whether a file is a picture that vijax drew and nothing else has saved since."""
     return path.is_file() and _MARK.encode() in path.read_bytes()
 
 
