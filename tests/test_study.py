@@ -17,7 +17,7 @@ import xarray as xr
 import zarr
 from helpers import SETTINGS, stand_in
 
-from vijax import grid, simulate, study
+from vijax import dataset, grid, simulate, study
 from vijax.grid import load, sweep
 from vijax.model import Harvester, Status
 
@@ -458,7 +458,7 @@ EDITS = {
 
 
 @pytest.mark.parametrize(("name", "edit"), EDITS.values(), ids=EDITS)
-def test_an_edit_is_noticed_and_mended_by_the_same_plane_alone(calls, out, caplog, name, edit):
+def test_an_edit_is_noticed_and_mended(calls, out, caplog, name, edit):
     whole = sweep(**FEW, out=out).load()
     before = (out / name).read_bytes()
     edit(out / name)
@@ -474,6 +474,14 @@ def test_an_edit_is_noticed_and_mended_by_the_same_plane_alone(calls, out, caplo
     assert (out / name).read_bytes() == before
     assert sum(calls) == 0
     assert [said.getMessage().partition(" is written again")[0] for said in caplog.records] == [f"{name} of {out}"]
+
+
+def test_metadata_are_mended_by_whatever_version(calls, out, monkeypatch):
+    whole = sweep(**FEW, out=out).load()
+    monkeypatch.setattr(dataset, "made_by", lambda: {"source": "vijax 9"})
+    for name in ("zarr.json", "P/zarr.json"):
+        (out / name).unlink()
+    xr.testing.assert_identical(sweep(**FEW, out=out).load(), whole)
 
 
 def test_an_edit_of_a_saved_map_is_noticed(calls, out):

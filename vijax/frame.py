@@ -1,7 +1,6 @@
 """What a store of tiles holds besides them, metadata and coordinates: made, mended, compared with a plan."""
 
 import json
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -63,7 +62,7 @@ def void(name: str, dtype: np.dtype) -> Any:
 
 
 def mend(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
-    """Write again what is damaged, where the plan has the same as was there: fingerprints tell.
+    """Write again what is damaged: metadata by their copies, coordinates by the plan if it has the same as was there.
 
     Args:
         planned: What the store should hold.
@@ -79,17 +78,18 @@ def mend(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Ca
         _mend_list(planned, tile, birth, path, say)
         return
     faults = dict(inventory.faults(path, listed["files"]))
+    for name in [name for name in faults if name in listed["metadata"]]:
+        _put(name, faults.pop(name), listed["metadata"][name].encode(), path, say)
     if not faults:
         return
     with _fresh(planned, listed["tile"], listed["birth"]) as fresh:
-        made = inventory.read(fresh) or {}
         for name, reason in faults.items():
-            if made["files"].get(name) != listed["files"][name]:
+            if inventory.fault(fresh / name, listed["files"][name]):
                 raise FileExistsError(
                     f"out must be whole or what this plane can mend; got {path}, where {name} {reason}, "
                     "and this plane has something else there; allow overwriting, or take another name"
                 )
-            _take(name, reason, fresh, path, say)
+            _put(name, reason, (fresh / name).read_bytes(), path, say)
 
 
 def _mend_list(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
@@ -105,9 +105,8 @@ def _mend_list(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, s
                 f"which would tell whether {next(iter(faults))} is what was written; allow overwriting, "
                 "or take another name"
             )
-        for name, fault in faults.items():
-            _take(name, fault, fresh, path, say)
-        _take(inventory.LIST, reason, fresh, path, say)
+        for name, fault in [*faults.items(), (inventory.LIST, reason)]:
+            _put(name, fault, (fresh / name).read_bytes(), path, say)
 
 
 @contextmanager
@@ -118,12 +117,12 @@ def _fresh(planned: Plan, tile: Mapping[str, int], birth: str) -> Iterator[Path]
         yield Path(folder, "fresh")
 
 
-def _take(name: str, reason: str, fresh: Path, path: Path, say: Callable[[str], None]) -> None:
-    """Copy a file of a fresh store into one where something is wrong with it."""
+def _put(name: str, reason: str, content: bytes, path: Path, say: Callable[[str], None]) -> None:
+    """Write a file of a store again."""
     target = path / name
     target.parent.mkdir(parents=True, exist_ok=True)
     with replacing(target) as part:
-        shutil.copyfile(fresh / name, part)
+        part.write_bytes(content)
     say(f"{name} of {path} is written again: it {reason}")
 
 

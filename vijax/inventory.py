@@ -67,13 +67,11 @@ def content(file: Path) -> dict[str, Any] | None:
 
 
 def write(path: Path, **facts: Any) -> None:
-    """List all files of a new store, and facts about it."""
-    files = {_name(path, file): fingerprint(file.read_bytes()) for file in sorted(path.rglob("*")) if file.is_file()}
-    rewrite(path, {**facts, "files": files})
-
-
-def rewrite(path: Path, listed: Mapping[str, Any]) -> None:
-    """Write a list with the checksum of its own."""
+    """List all files of a new store, with copies of those of metadata, and facts about it."""
+    files = {_name(path, file): file for file in sorted(path.rglob("*")) if file.is_file()}
+    metadata = {name: file.read_text(encoding="utf-8") for name, file in files.items() if file.name == "zarr.json"}
+    fingerprints = {name: fingerprint(file.read_bytes()) for name, file in files.items()}
+    listed = {**facts, "files": fingerprints, "metadata": metadata}
     write_json({**listed, "checksum": _own(listed)}, path / LIST)
 
 
