@@ -363,6 +363,16 @@ def test_what_is_run_again_is_said(calls, out, caplog):
     ]
 
 
+@pytest.mark.parametrize("files", [5, [], {"P/c/0/0": 5}], ids=str)
+def test_a_record_of_nonsense_is_written_again(calls, out, files):
+    whole = sweep(**FEW, out=out).load()
+    change(files=files)(records(out)[0])
+    with pytest.raises(ValueError, match=r"where (P/c/0/0|status/tiles/0.json) (is not what|cannot be)"):
+        load(out)
+    xr.testing.assert_identical(sweep(**FEW, out=out).load(), whole)
+    assert json.loads(records(out)[0].read_text())["files"] != files
+
+
 # --- left by killed runs ---------------------------------------------------------------------------------------------
 
 

@@ -39,7 +39,7 @@ def fault(file: Path, expected: str | None) -> str:
         return "is missing"
     if not file.is_file():
         return "is no regular file"  # to read a pipe would take for ever
-    if expected is None or not expected.startswith(f"{file.stat().st_size} bytes"):
+    if not str(expected).startswith(f"{file.stat().st_size} bytes"):
         return "is not what was written"
     try:
         content = file.read_bytes()
