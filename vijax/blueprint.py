@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vijax import checks
 from vijax.report import UNITS, amount, factors
 from vijax.store import replacing
 from vijax.style import STYLE, axis_label, check_format, symbol
@@ -48,6 +49,7 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
     Raises:
         ValueError: If the path does not end as a picture does.
     """
+    checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
     if path is not None:
         check_format(path)
     along, best = str(diagram.attrs["along"]), report["best"]

@@ -7,8 +7,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from vijax import checks
 from vijax.flow import half_turn
-from vijax.model import Harvester
+from vijax.model import Harvester, check_device
 from vijax.xla import once
 
 PI = math.pi
@@ -48,15 +49,25 @@ def capacitance(device: Harvester, depth: Values) -> Values:
     return _rest_capacitance(device) * (1 + stretch(device, depth)) ** 2
 
 
-@once
 def harvested_energy(device: Harvester, depth: Values) -> Values:
     """Energy E_j [J] harvested from an impact whose largest penetration is `depth` [m].
 
     E = (C_max + C_T)/(C_min + C_T) (C_max - C_min) V^2/2, of full relative accuracy down to depth 0, where it and its
     gradient vanish.
 
+    Raises:
+        ValueError: If the device is none, or a depth no number (traced ones are not looked at).
+
     Source: Eq. (34).
     """
+    check_device(device)
+    if checks.is_concrete(depth) and np.size(depth):
+        checks.numbers("depth", depth)
+    return _harvested(device, depth)
+
+
+@once
+def _harvested(device: Harvester, depth: Values) -> Values:
     growth = stretch(device, depth)
     least = _rest_capacitance(device)
     gain = least * growth * (2 + growth)

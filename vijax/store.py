@@ -4,12 +4,15 @@ import json
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from vijax import checks
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -21,17 +24,21 @@ def check_output(name: str, path: str | Path, overwrite: bool = False) -> Path:
     """The path, if something can be written there; `name` is the argument that an error speaks of.
 
     Raises:
+        ValueError: If it is no path.
         FileExistsError: If it is taken, and not ours to overwrite.
         FileNotFoundError, PermissionError: If its folder is missing or closed.
     """
-    target = Path(path)
+    target = checks.path(name, path)
     folder = target.absolute().parent
     if not target.name:
         raise FileNotFoundError(f"{name} must name a file; got {str(path)!r}")
     if not folder.is_dir():
         raise FileNotFoundError(f"{name} must lie in a folder that exists; got {path}; make {folder} first")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{name} must lie in a folder that can be written; got {path}")
+    try:
+        # Leaves no name behind. To ask for permission is not enough: all is allowed to root, and nothing in /proc.
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        raise PermissionError(f"{name} must lie in a folder that can be written; got {path}") from None
     if target.is_symlink() or target.exists():
         if not overwrite:
             raise FileExistsError(f"{name} must not exist yet; got {path}; allow overwriting, or take another name")
@@ -74,7 +81,8 @@ def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) ->
     Raises:
         FileExistsError, FileNotFoundError, PermissionError: As `check_output`.
     """
-    target = check_output("path", path, overwrite)
+    checks.variables("dataset", dataset, (), "sweep")
+    target = check_output("path", path, checks.flag("overwrite", overwrite))
     with replacing(target) as part:
         write(dataset, part)
 
@@ -108,7 +116,7 @@ def load(path: str | Path) -> "xr.Dataset":
         FileNotFoundError: If there is no store.
         ValueError: If a checksum does not match.
     """
-    with view(path) as dataset:
+    with view(checks.path("path", path)) as dataset:
         return dataset.load()
 
 

@@ -4,6 +4,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vijax import checks
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -22,8 +24,8 @@ CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
 
 def check_format(path: str | Path) -> None:
     """Raise ValueError unless the path ends as a picture does."""
-    if Path(path).suffix not in _ENDINGS:
-        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {str(path)!r}")
+    if checks.path("plot", path).suffix not in _ENDINGS:
+        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {checks.shown(path)}")
 
 
 def title(dataset: "xr.Dataset", further: tuple[str, ...] = ()) -> str:
