@@ -14,8 +14,9 @@ import numpy as np
 import xarray as xr
 
 import vijax
-from vijax import branch, chart, curve, design, model, orbit, plot, report, shooting, simulate
+from vijax import blueprint, branch, chart, curve, design, model, orbit, plot, report, shooting, simulate
 from vijax.compare import cheapest_model
+from vijax.report import lines, table
 from vijax.surroundings import surroundings, weighted
 from vijax.tolerance import Tolerance, nodes
 
@@ -50,6 +51,12 @@ def an_orbit() -> orbit.Orbit:
 def a_design() -> design.Design:
     """A design without optima."""
     return design.Design((), ("omega0",), {"omega0": (20.0, 400.0)}, "P", (), 0, 0)
+
+
+def an_optimum() -> design.Optimum:
+    """An optimum of which no more than the orbit is known."""
+    path = np.zeros((1, 1))
+    return design.Optimum({}, vijax.Harvester(), an_orbit(), "1:1", 0.0, None, {}, (), "maximum", 0, path, path[0])
 
 
 def a_map() -> xr.Dataset:
@@ -230,7 +237,15 @@ CALLS: Table = {
         },
     ),
     "optimise_all": (design.optimise_all, {}, {"devices": (3, [], [3], "paper", None, vijax.Harvester())}),
-    "under": (design.under, {"tolerances": [Tolerance("omega0", 0.05)]}, {"optimum": (3, None, "best", a_design())}),
+    "under": (
+        design.under,
+        {"optimum": an_optimum(), "tolerances": [Tolerance("omega0", 0.05)]},
+        {
+            "optimum": (3, None, "best", a_design()),
+            "tolerances": (3, "omega0", [3], [Tolerance("omega0", 2.0)]),
+            "samples": COUNT,
+        },
+    ),
     "trajectory": (
         vijax.trajectory,
         {"pair": pair(), "u0": 0.05, "v0": -0.4, "periods": 4},
@@ -394,7 +409,16 @@ CALLS: Table = {
         },
     ),
     "branch.dataset": (branch.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
-    "surroundings": (surroundings, {}, {"optimum": (3, None, "best", a_design())}),
+    "surroundings": (
+        surroundings,
+        {"optimum": an_optimum()},
+        {
+            "optimum": (3, None, "best", a_design()),
+            "starts": (*COUNT, 10**9),
+            "reach": (*REAL, 0, 1, -1),
+            "seed": SEED,
+        },
+    ),
     "weighted": (
         weighted,
         {"design": a_design()},
@@ -405,6 +429,10 @@ CALLS: Table = {
         {"design": a_design()},
         {"design": (3, None, "best"), "surroundings": (3, "all"), "diagram": (3, a_map()), "tolerances": (3, [3])},
     ),
+    "report.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design())}),
+    "report.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
+    "blueprint.design": (blueprint.design, {"diagram": a_map(), "report": {}}, {"diagram": (*DATASET, a_map())}),
+    "blueprint.design_map": (blueprint.design_map, {}, {"report": (3, None, "best")}),
     "report.optimum": (report.optimum, {}, {"one": (3, None, "best")}),
     **{
         f"plot.{door.__name__}": (door, {"dataset": a_map()}, {"dataset": DATASET})
@@ -420,7 +448,12 @@ CALLS: Table = {
     "curve": (
         curve.curve,
         {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05]},
-        {"pair": PAIR, "t": ("x", None, 0.1, [0.1, 0.2]), "samples": COUNT},
+        {"pair": PAIR, "t": ("x", None, 0.1), "side": ("x", None, 1, [1, -1]), "samples": COUNT},
+    ),
+    "curve.states": (
+        curve.states,
+        {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05], "when": 0.2},
+        {"pair": PAIR, "v_in": ("x", [0.1, 0.2]), "when": ("x", None, [], True)},
     ),
     "cheapest_model": (
         cheapest_model,
@@ -495,6 +528,7 @@ LARGE: dict[str, Callable[[], Any]] = {
     "omega and omega0 of 10^12 cells": lambda: vijax.sweep(
         omega=np.linspace(3, 9, 10**6), omega0=np.linspace(20, 400, 10**6)
     ),
+    "periods in single precision": lambda: vijax.sweep(**CELL, periods=10**8, dtype="float32"),
     "starts of 10^9": lambda: vijax.basin_fractions(**CELL, starts=10**9),
     "starts and d of 10^12": lambda: vijax.basin_fractions(d=np.linspace(0.1, 0.3, 10**6), starts=10**6),
     "u0 and v0 of 10^12": lambda: vijax.basins(**CELL, u0=np.linspace(0, 0.1, 10**6), v0=np.linspace(0, 1, 10**6)),
@@ -507,6 +541,7 @@ LARGE: dict[str, Callable[[], Any]] = {
     "periods of 10^9 recorded": lambda: vijax.trajectory(pair(), 0.05, -0.4, 10**9),
     "periods of 10^8 and u0 of many": lambda: vijax.trajectory(pair(), np.zeros(10**4), -0.4, 10**7),
     "samples of 10^9": lambda: orbit.path(an_orbit(), 10**9),
+    "guesses of 5005 sequences": lambda: orbit.search(pair(), "6:9", guesses=10**7),
     "points of 10^9": lambda: branch.follow(an_orbit(), "d", (0.1, 0.3), points=10**9),
     "steps and balls of 10^12": lambda: vijax.optimise(steps=10**6, balls=10**6),
     "samples of optimise": lambda: vijax.optimise(
@@ -531,9 +566,8 @@ def calls() -> Iterator[Case]:
                 yield Case(f"{door}({argument}={_short(value)})", (argument,), make)
     for text, traced in TRACED.items():
         yield Case(f"traced: {text}", _names(text), partial(jax.eval_shape, traced, 0.2))
-    for table in (SHAPES, LARGE):
-        for text, make in table.items():
-            yield Case(text, _names(text), make)
+    for text, make in (SHAPES | LARGE).items():
+        yield Case(text, _names(text), make)
 
 
 def _names(text: str) -> tuple[str, ...]:

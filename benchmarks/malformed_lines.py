@@ -192,6 +192,36 @@ LINES: Lines = {
         },
     ),
 }
+# Lines of another shape: a script, its arguments, what the error must name.
+SHAPES = (
+    ("grid", ("--d",), "d"),
+    ("grid", ("map.zarr",), "map.zarr"),
+    ("grid", ("--d", "0.1:0.2:3", "--s", "0.3"), "s"),
+    ("grid", ("--gamma", "0.1", "--beta", "0.1"), "beta"),
+    ("grid", ("--d", "0.1", "--kappa", "30"), "plot"),
+    ("grid", ("--omega", "3:12:50"), "omega"),
+    ("grid", ("--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), "workers"),
+    ("grid", ("--workers", "2", "--plot", "map.png"), "workers"),
+    ("grid", ("--overwrite=yes",), "overwrite"),
+    ("grid", ("--d", "0.1:0.3:100000", "--kappa", "3:40:100000", "--plot", "map.png"), "kappa"),
+    ("grid", ("--d", "0.1:0.3:100000", "--kappa", "3:40:100000", "--out", "map.zarr"), "yes"),
+    ("grid", ("--compare", "rigid", "--d", "0.1:0.3:100000", "--kappa", "3:40:100000"), "kappa"),
+    ("grid", ("--omega", "3:9:10000000", "--omega0", "20:400:10000000"), "omega0"),
+    ("basins", ("--u0", "0:0.1:10000000", "--v0", "0:0.1:10000000"), "v0"),
+    ("basins", ("--starts", "10000000", "--d", "0.1:0.3:100", "--kappa", "3:40:100"), "starts"),
+    ("basins", ("--starts", "100000", "--d", "0.1:0.3:20", "--kappa", "3:40:20", "--periods", "100000"), "yes"),
+    ("basins", ("--starts", "9", "--u0", "0.1"), "u0"),
+    ("basins", ("--merge-mirrors", "--gamma", "0.1"), "merge_mirrors"),
+    ("orbit_diagram", ("--along", "d=0.1:0.3:100000", "--periods", "100000"), "yes"),
+    ("orbit_diagram", ("--along", "d=0.1:0.3:1000000", "--kappa", "3:40:10", "--keep", "400"), "keep"),
+    ("branch", ("--wall", "rigid", "--along", "kappa=3:40"), "along"),
+    ("branch", ("--impacts", "6:9", "--guesses", "10000000"), "guesses"),
+    ("design", ("--steps", "100000", "--balls", "1000"), "balls"),
+    ("design", ("--steps", "10000", "--balls", "400"), "yes"),
+    ("design", ("--over", "d=0.1:0.3:10000", "--s", "0.2"), "s"),
+    ("paper", (), "figure"),
+    ("paper", ("--figure",), "figure"),
+)
 # What a line needs besides, so that the option is looked at.
 _WITH = {"into": ("--figure", "3")}
 _COMMANDS = {"grid": "power_map"}
@@ -205,6 +235,9 @@ def lines() -> Iterator[Case]:
                 words = option.split()
                 arguments = (*right, *_WITH.get(option, ()), f"--{words[0]}={text}")
                 yield Case(f"{door} {arguments[-1]}"[:100], (words[-1],), partial(_run, door.split()[0], arguments))
+
+    for script, given, name in SHAPES:
+        yield Case(f"{script} {' '.join(given)}", (name,), partial(_run, script, given))
 
 
 def _run(script: str, arguments: tuple[str, ...]) -> int:

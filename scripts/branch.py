@@ -66,9 +66,9 @@ def branch(
         store, picture = command.targets(out, plot, _DEFAULT_FILES, overwrite)
         pair, device = command.at_one_point(command.take_axes(given, _START), command.device(constants), wall)
         name, within = _bounds(along)
-        checks.whole("guesses", guesses, 1, orbit.MOST_GUESSES)
         checks.whole("generations", generations, 0, branches.MOST_GENERATIONS)
-        orbit.sequences(impacts)
+        walls, _ = orbit.sequences(impacts)
+        orbit.check_guesses(guesses, len(walls))
         with command.about("along"):
             branches.check_bounds(pair, name, within, device)
         chart.check_branch_quantity(quantity)

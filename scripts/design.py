@@ -55,6 +55,7 @@ def _options() -> list[click.Parameter]:
         *command.axis_options(**changed),
         *command.device_options(),
         *command.file_options(".json", "report"),
+        command.size_option(),
     ]
 
 
@@ -76,6 +77,7 @@ def design(
     out: str | None,
     plot: str | None,
     overwrite: bool,
+    yes: bool,
     **given: Any,
 ) -> None:
     """Find the membrane, and what else is tuned, that harvests most and can be built."""
@@ -94,8 +96,8 @@ def design(
         within = _bounds(bounds)
         weighed = scatter if objective in _OVER_TOLERANCES else ()
         designs.check(devices, names, within, objective, weighed)
-        designs.effort(steps, balls, impacts)
-    command.keep_compiled()
+        command.keep_compiled()
+        command.agree(designs.expected(len(devices), designs.effort(steps, balls, impacts)), yes)
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
         show(0, stages)

@@ -2,6 +2,7 @@
 
 import sys
 from functools import partial
+from io import StringIO
 from itertools import islice
 from pathlib import Path
 
@@ -32,6 +33,10 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+class BegunError(Exception):
+    """What a run raises that was begun."""
+
+
 @pytest.fixture
 def unrun(monkeypatch):
     """Plans whose run was begun, none of which runs."""
@@ -39,7 +44,7 @@ def unrun(monkeypatch):
 
     def run(planned, *_):
         begun.append(planned)
-        raise KeyboardInterrupt
+        raise BegunError
 
     monkeypatch.setattr(grid, "_run", run)
     return begun
@@ -111,7 +116,7 @@ def test_what_does_not_fit_in_memory_names_its_arguments(monkeypatch, unrun):
 
 def test_a_store_may_be_larger_than_memory(monkeypatch, unrun, tmp_path):
     monkeypatch.setattr(checks, "memory", lambda: 1e6)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(BegunError):
         vijax.sweep(d=np.linspace(0.1, 0.3, 100), kappa=np.linspace(3, 40, 100), out=tmp_path / "map.zarr")
     assert len(unrun) == 1
 
@@ -131,14 +136,20 @@ def planned(side, **axes):
     return grid.plan(plane | axes, **settings, dtype="float64")
 
 
-def test_the_next_estimate_is_by_the_pace_of_the_last_run(kept, monkeypatch):
+@pytest.fixture
+def watched(monkeypatch):
+    """What a run told that spent a hundred seconds on compiling and ten on nine thousand cells, and its watch."""
     clock = iter([0.0, 100.0, 103.0, 110.0])
     monkeypatch.setattr(estimate.time, "perf_counter", lambda: next(clock))
     told = []
     watch = estimate.Watch(lambda *step: told.append(step))
-    # The first hundred seconds were spent on compiling; then 9000 cells took ten.
     for done in (0, 1000, 5000, 10_000):
         watch(done, 10_000)
+    return told, watch
+
+
+def test_the_next_estimate_is_by_the_pace_of_the_last_run(kept, watched):
+    told, watch = watched
     assert estimate.of(planned(1000)).seconds == pytest.approx(2e-7 * 400 * 10**6)
     watch.keep(planned(100))
     assert told[-1] == (10_000, 10_000)
@@ -147,13 +158,19 @@ def test_the_next_estimate_is_by_the_pace_of_the_last_run(kept, monkeypatch):
     assert estimate.of(inclined).seconds == pytest.approx(2e-6 * 400 * 10**6)
 
 
+def test_a_run_is_not_lost_with_its_pace(kept, watched):
+    (kept / "closed").touch()
+    jax.config.update("jax_compilation_cache_dir", str(kept / "closed"))
+    watched[1].keep(planned(100))
+    assert (kept / "closed").is_file()
+
+
 def test_a_pace_that_cannot_be_read_is_none(kept):
     (kept / "paces.json").write_text("{")
     assert estimate.of(planned(100)).seconds == pytest.approx(2e-7 * 400 * 10**4)
 
 
-def test_a_long_run_asks_and_wants_yes(kept, folder, capsys, monkeypatch, unrun):
-    monkeypatch.setattr(command.os, "_exit", lambda code: None)
+def test_a_long_run_asks_and_wants_yes(kept, folder, capsys, unrun):
     plane = ["--d", "0.1:0.3:30000", "--kappa", "3:40:30000", "--out", "map.zarr"]
     assert script.main(plane) == 2
     said = capsys.readouterr().err
@@ -161,24 +178,24 @@ def test_a_long_run_asks_and_wants_yes(kept, folder, capsys, monkeypatch, unrun)
     assert said.count("\n") == 1
     assert not unrun
     assert not list(folder.glob("*.zarr"))
-    script.main([*plane, "--yes"])
+    with pytest.raises(BegunError):
+        script.main([*plane, "--yes"])
     assert [plan.count for plan in unrun] == [900_000_000]
 
 
-@pytest.mark.parametrize(("answer", "begun"), [("y\n", 1), ("n\n", 0)])
-def test_a_terminal_is_asked(kept, folder, monkeypatch, unrun, answer, begun):
-    from io import StringIO
-
-    stdin = StringIO(answer)
-    stdin.isatty = lambda: True
-    monkeypatch.setattr(sys, "stdin", stdin)
-    monkeypatch.setattr(command.os, "_exit", lambda code: None)
-    script.main(["--d", "0.1:0.3:30000", "--kappa", "3:40:30000", "--out", "map.zarr"])
-    assert len(unrun) == begun
+@pytest.mark.parametrize(("answer", "end"), [("y\n", BegunError), ("n\n", SystemExit)])
+def test_a_terminal_is_asked(kept, folder, monkeypatch, unrun, answer, end):
+    terminal = StringIO(answer)
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stdin", terminal)
+    monkeypatch.setattr(command.os, "_exit", sys.exit)
+    with pytest.raises(end):
+        script.main(["--d", "0.1:0.3:30000", "--kappa", "3:40:30000", "--out", "map.zarr"])
+    assert len(unrun) == (end is BegunError)
 
 
 def test_a_long_run_in_python_is_told_in_the_log(kept, folder, caplog, unrun):
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(BegunError):
         vijax.sweep(d=np.linspace(0.1, 0.3, 30_000), kappa=np.linspace(3, 40, 30_000), out="map.zarr")
     assert "a long run begins: 900,000,000 cells" in caplog.text
 

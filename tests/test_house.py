@@ -112,6 +112,7 @@ ROOMS: dict[str, set[str]] = {
     "compare": {"checks", "model", "dataset", "label", "grid"},
     "design": {
         "checks",
+        "estimate",
         "xla",
         "model",
         "energy",

@@ -179,9 +179,8 @@ def plan_fractions(
     speed, seed = checks.positive("speed", speed), checks.seed(seed)
     starts = checks.whole("starts", starts, 1, MOST_STARTS)
     planned = _plan(axes, device, merge_mirrors, settings)
+    check_starts(planned, starts)
     place = spread(starts, seed)
-    gaps = planned.cells.quantities["d"].size
-    checks.fits(("starts", "d"), 8 * starts * gaps, f"{starts:,} starts of {gaps:,} gaps")
     return started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
 
 
@@ -214,6 +213,12 @@ def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
         points = np.random.default_rng(seed).random((2, count))
     first, second = points - 0.5
     return xr.Variable("start", first), xr.Variable("start", second)
+
+
+def check_starts(planned: Plan, starts: int) -> None:
+    """Raise ValueError unless a plan's cells fit in memory with so many starts each."""
+    names = ["starts", *(dim for dim, size in planned.cells.sizes.items() if size > 1)]
+    checks.fits(names, starts * planned.size, f"{planned.count:,} cells of {starts:,} starts")
 
 
 def started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:

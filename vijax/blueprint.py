@@ -190,6 +190,7 @@ def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure
     Raises:
         ValueError: If the path does not end as a picture does.
     """
+    checks.instance("report", report, dict, "scripts/design.py --over")
     if path is not None:
         check_format(path)
     over, designs = report["over"], report["designs"]

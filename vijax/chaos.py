@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from vijax import checks, grid
-from vijax.attractor import MOST_STARTS, SPEED, described, plan_fractions, spread, started
+from vijax.attractor import MOST_STARTS, SPEED, check_starts, described, plan_fractions, spread, started
 from vijax.grid import Axes
 from vijax.model import Harvester
 
@@ -65,7 +65,7 @@ def lyapunov(
     for done, window in enumerate((_WARM_UP, _WARM_UP + periods)):
         planned = grid.plan(axes, ("lyapunov",), device, periods=window, **settings)
         of = planned.cells.quantities
-        checks.fits(("starts", "d"), 8 * starts * of["u0"].size, f"{starts:,} starts of {of['u0'].size:,} cells")
+        check_starts(planned, starts)
         near = started(planned, of["u0"] * (1 - _NEAR * (0.5 + place[0])), of["v0"] + _NEAR * place[1])
         tell = _share_of(progress, done, 2)
         run = grid.run(near, tell)

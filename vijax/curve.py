@@ -52,6 +52,7 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
 def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
     """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
     check_pair(pair)
+    when = checks.numbers("when", when)
     (t, side, v_in, v_out, duration), count = _padded(t=t, side=side, v_in=v_in, v_out=v_out, duration=duration)
     index = np.searchsorted(t[:count], when, side="right") - 1
     last = np.maximum(index, 0)

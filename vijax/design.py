@@ -5,6 +5,7 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 """
 
 import itertools
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,10 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import checks, lanes, xla
+from vijax import checks, estimate, lanes, xla
 from vijax import objective as aims
 from vijax import orbit as orbits
 from vijax.ascent import Box, Climb, ascend, converged
+from vijax.estimate import Estimate
 from vijax.model import Harvester, Status, one_device
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
@@ -27,6 +29,7 @@ from vijax.steady import Steady, steady
 from vijax.tolerance import Tolerance, check_tolerances, nodes
 from vijax.tuning import NAMES, check_names, limits, tuned, values, variables
 
+_LOG = logging.getLogger(__name__)
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
 _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
@@ -149,9 +152,8 @@ def optimise_all(
     scatter = tuple(checks.sequence("tolerances", tolerances, Tolerance, "vijax.tolerance.Tolerance records"))
     looks, far = checks.whole("looks", looks, 2, _MOST_LOOKS), effort(steps, balls, impacts, periods)
     box = check(devices, tune, bounds, objective, scatter)
-    checks.fits(
-        ("devices", "steps", "balls"), len(devices) * steps * balls * _BALL, f"the balls of {len(devices):,} devices"
-    )
+    if (asked := expected(len(devices), far)).long:
+        _LOG.warning("a long run begins: %s", asked)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
     starts, met = find(devices, tune, box, objective, far)
@@ -209,10 +211,20 @@ def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None
 
 def effort(steps: int, balls: int, impacts: int, periods: int = 200) -> Effort:
     """How far a survey looks; raises ValueError as `optimise_all` does."""
-    values, starts = checks.whole("steps", steps, 2, _MOST_STEPS), checks.whole("balls", balls, 1, _MOST_STEPS)
+    steps, balls = checks.whole("steps", steps, 2, _MOST_STEPS), checks.whole("balls", balls, 1, _MOST_STEPS)
     longest = checks.whole("impacts", impacts, 1, _MOST_IMPACTS)
-    checks.fits(("steps", "balls"), values * starts * _BALL, f"{values * starts:,} balls")
-    return Effort(values, starts, longest, checks.whole("periods", periods, 1))
+    return Effort(steps, balls, longest, checks.whole("periods", periods, 1))
+
+
+def expected(devices: int, far: Effort) -> Estimate:
+    """What the survey of so many devices asks of the machine; ascents take less.
+
+    Raises:
+        ValueError: If its balls do not fit in memory.
+    """
+    count = devices * far.steps * far.balls
+    checks.fits(("devices", "steps", "balls"), count * _BALL, f"{count:,} balls")
+    return estimate.of_recorded(count, far.periods, count * _BALL)
 
 
 def check(

@@ -18,7 +18,7 @@ from jaxtyping import ArrayLike
 from vijax import checks, energy, estimate, simulate
 from vijax.axes import AXES, cells, check_axis
 from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance
-from vijax.grid import Axes
+from vijax.grid import Axes, most_periods
 from vijax.lanes import workers
 from vijax.model import WALLS, Harvester, ImpactPair, State, Status, one_device
 from vijax.record import Record, record
@@ -142,7 +142,7 @@ class Diagram:
     @property
     def expected(self) -> estimate.Estimate:
         """What it asks of the machine."""
-        return estimate.of_chains(self.count, self.planned.settings["periods"], self.size)
+        return estimate.of_recorded(self.count, self.planned.settings["periods"], self.size)
 
     @property
     def size(self) -> int:
@@ -163,6 +163,8 @@ def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | N
     """
     swept = [name for name in AXES if name not in ("u0", "v0")]
     checks.choice("along", along, swept)
+    for name, allowed in _CHOICES.items():
+        checks.choice(name, settings[name], allowed)
     given = {name: value for name, value in axes.items() if value is not None}
     if along in given:
         raise ValueError(f"{along} must not be given twice; got it as the axis swept and as another")
@@ -170,11 +172,9 @@ def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | N
     if not points.ndim:
         raise ValueError(f"values must be a 1-D array of {along}; got {points}")
     for name in ("periods", "keep"):
-        settings[name] = checks.whole(name, settings[name], 1)
+        settings[name] = checks.whole(name, settings[name], 1, most_periods(settings["dtype"]))
     if settings["keep"] > settings["periods"]:
         raise ValueError(f"keep must be at most periods; got {settings['keep']} of {settings['periods']}")
-    for name, allowed in _CHOICES.items():
-        checks.choice(name, settings[name], allowed)
     device = one_device(device)
     # A start that a rigid gap does not hold is put back into it: to this door all walls are soft.
     laid_out = cells({**given, along: points}, device, "soft")

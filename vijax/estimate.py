@@ -8,6 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from vijax.store import write_json
 _HOUR, _GIGABYTES = 3600.0, 10e9
 # Seconds of a cell and a period by two slow cores; rk4 at 1000 steps.
 _SLOW = {"exact level": 2e-7, "exact inclined": 2e-6, "ode": 2e-5, "rk4": 2e-6}
-_CHAIN = 1e-5  # of an orbit diagram, whose impacts are recorded
+_RECORDED = 1e-5  # of cells whose impacts are recorded
 _LEAST_TIMED = 2.0  # seconds, for a pace that is worth keeping
 _UNITS = (("days", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
 _FILE = "paces.json"
@@ -58,9 +59,9 @@ def of(*plans: Plan) -> Estimate:
     )
 
 
-def of_chains(points: int, periods: int, size: float) -> Estimate:
-    """What an orbit diagram takes."""
-    return Estimate(points, size, points * periods * _CHAIN)
+def of_recorded(cells: int, periods: int, size: float) -> Estimate:
+    """What cells take whose impacts are recorded: the points of an orbit diagram, the balls of a survey."""
+    return Estimate(cells, size, cells * periods * _RECORDED)
 
 
 class Watch:
@@ -85,8 +86,9 @@ class Watch:
         file = _file()
         if file is not None and ended - began >= _LEAST_TIMED:
             pace = (ended - began) / ((last - first) * _periods(planned))
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_json(_paces() | {_kind(planned): pace}, file)
+            with suppress(OSError):  # of a closed or full folder: what was run is worth more than how fast
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_json(_paces() | {_kind(planned): pace}, file)
 
 
 def _periods(planned: Plan) -> int:

@@ -174,10 +174,10 @@ def plan(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
-    for name, least in (("periods", 1), ("transient", 0)):
-        settings[name] = checks.whole(name, settings[name], least)
     for name, allowed in _CHOICES.items():
         checks.choice(name, settings[name], allowed)
+    for name, least in (("periods", 1), ("transient", 0)):
+        settings[name] = checks.whole(name, settings[name], least, most_periods(settings["dtype"]))
     refine = settings.pop("refine", None)
     options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
     method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
@@ -197,6 +197,11 @@ def plan(
         device=device,
         refine=0 if refine is None else _levels(refine, laid_out, settings["until"]),
     )
+
+
+def most_periods(dtype: str) -> int:
+    """Periods that a cell may be told to run: two such numbers together are still counted one by one."""
+    return min(checks.MOST, 1 << int(np.finfo(dtype).nmant))
 
 
 def _levels(refine: Any, of: Cells, until: str) -> int:
@@ -273,8 +278,7 @@ def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
 
 def check_room(planned: Plan) -> None:
     """Raise ValueError unless the map of a plan fits in memory, where it is not written tile by tile."""
-    # Drawn starts are asked for by their number.
-    names = ["starts" if name == "start" else name for name, size in planned.cells.sizes.items() if size > 1]
+    names = [name for name, size in planned.cells.sizes.items() if size > 1]
     hint = "" if planned.refine else "; give out, a store that is written tile by tile"
     checks.fits(names, planned.size, f"{planned.count:,} cells", hint)
 

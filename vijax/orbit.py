@@ -29,7 +29,7 @@ _FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
 _TILES = (32, 256, 4096)  # orbits of one compiled call
 _MOST_PERIOD = 1000  # forcing periods of an orbit
 _MOST_IMPACTS, _MOST_SEQUENCES = 64, 10_000  # that a text may ask for
-MOST_GUESSES = 10**7
+_MOST_GUESSES = 10**7  # of all sequences together
 
 
 class Orbit(eqx.Module):
@@ -80,6 +80,8 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impac
     """
     checks.known("pair", check_pair(pair))
     checks.instance("sequence", sequence, Sequence, "vijax.shooting.Sequence(...)")
+    if np.shape(pair.d) != np.shape(sequence.side)[:1]:
+        raise ValueError(f"pair must be one cell an orbit; got shape {np.shape(pair.d)}; impact_pair broadcasts")
     if checks.numbers("knots", knots).shape != (*np.shape(sequence.side), 3) or np.ndim(knots) != 3:
         raise ValueError(f"knots must have the shape (orbit, impact, 3) of sequence.side; got {np.shape(knots)}")
     return _solved(pair, sequence, knots)
@@ -265,14 +267,19 @@ def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses
 
     Source: Eqs. (28)-(29) ask for one sequence from one guess.
     """
-    guesses = checks.whole("guesses", guesses, 1, MOST_GUESSES)
     checks.known("pair", check_pair(pair))
     if any(np.ndim(x) for x in jax.tree.leaves(pair)):
         raise ValueError(f"pair must be one cell; got shape {np.shape(pair.d)}; search each")
     every, period = sequences(impacts, period)
+    check_guesses(guesses, len(every))
     draw = np.random.default_rng(checks.seed(seed))
     found = [_search(pair, walls, period, guesses, draw) for walls in every]
     return distinct(concatenate(found))
+
+
+def check_guesses(guesses: Any, sequences: int) -> None:
+    """Raise ValueError unless so many guesses can be tried of each of some sequences."""
+    checks.whole("guesses", guesses, 1, _MOST_GUESSES // sequences)
 
 
 def sequences(impacts: str, period: int | None = None) -> tuple[list[tuple[int, ...]], int]:
@@ -326,7 +333,7 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
 
 def distinct(orbit: Orbit) -> Orbit:
     """The orbits that are there, each once whichever impact it was begun with."""
-    good = np.flatnonzero(np.asarray(orbit.status) == Status.OK)
+    good = np.flatnonzero(np.asarray(check_orbit(orbit).status) == Status.OK)
     rounded = np.round(np.asarray(marks(orbit))[good] / _SAME)
     _, first = np.unique(rounded, axis=0, return_index=True)
     return orbit[np.sort(good[first])]
@@ -347,7 +354,7 @@ def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
 
 def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"]:
     """Whether each orbit, run through once, is its own mirror image half a span later."""
-    host = jax.tree.map(np.asarray, check_orbit(orbit))
+    host, tolerance = jax.tree.map(np.asarray, check_orbit(orbit)), checks.positive("tolerance", tolerance)
     count = host.count
     index = np.arange(host.knots.shape[1])
     half = np.where(index < (count // 2)[:, None], index + (count // 2)[:, None], index)

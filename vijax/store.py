@@ -37,8 +37,9 @@ def check_output(name: str, path: str | Path, overwrite: bool = False) -> Path:
     try:
         # Leaves no name behind. To ask for permission is not enough: all is allowed to root, and nothing in /proc.
         tempfile.TemporaryFile(dir=folder).close()
-    except OSError:
-        raise PermissionError(f"{name} must lie in a folder that can be written; got {path}") from None
+    except OSError as error:
+        reason = error.strerror
+        raise PermissionError(f"{name} must lie in a folder that can be written; got {path} ({reason})") from None
     if target.is_symlink() or target.exists():
         if not overwrite:
             raise FileExistsError(f"{name} must not exist yet; got {path}; allow overwriting, or take another name")

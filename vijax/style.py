@@ -25,7 +25,7 @@ CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
 def check_format(path: str | Path) -> None:
     """Raise ValueError unless the path ends as a picture does."""
     if checks.path("plot", path).suffix not in _ENDINGS:
-        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {checks.shown(path)}")
+        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {checks.shown(str(path))}")
 
 
 def title(dataset: "xr.Dataset", further: tuple[str, ...] = ()) -> str:
