@@ -142,6 +142,7 @@ CALLS: Table = {
             "u0": START,
             "v0": START,
             "d": ([], "0.1", NAN),
+            "r": (np.linspace(0.1, 2, 1000), 10**4000),
             "merge_mirrors": FLAG,
             "periods": COUNT,
             "wall": CHOICE,
@@ -299,7 +300,7 @@ CALLS: Table = {
     "harvested_energy": (
         vijax.harvested_energy,
         {"device": vijax.Harvester(), "depth": 1e-3},
-        {"device": (*DEVICE, None), "depth": ("1 mm", None, {}, 1j, True)},
+        {"device": (*DEVICE, None), "depth": ("1 mm", None, {}, 1j, True, [[1.0], [2.0, 3.0]])},
     ),
     "load": (vijax.load, {}, {"path": (*PATH, "", "nowhere", "/dev/null", None)}),
     "save": (
@@ -356,6 +357,7 @@ CALLS: Table = {
             "outputs": (3, ["Q"], None),
             "method": ("ode", 3),
             "count": (*WHOLE, 2),
+            "on": ("cpu", 0, []),
         },
     ),
     "orbit.solve": (
@@ -429,9 +431,9 @@ CALLS: Table = {
         {"design": a_design()},
         {"design": (3, None, "best"), "surroundings": (3, "all"), "diagram": (3, a_map()), "tolerances": (3, [3])},
     ),
-    "report.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design())}),
+    "report.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design(), {})}),
     "report.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
-    "blueprint.design": (blueprint.design, {"diagram": a_map(), "report": {}}, {"diagram": (*DATASET, a_map())}),
+    "blueprint.design": (blueprint.design, {"diagram": a_map(), "report": {"best": None}}, {"diagram": (*DATASET, a_map())}),
     "blueprint.design_map": (blueprint.design_map, {}, {"report": (3, None, "best")}),
     "report.optimum": (report.optimum, {}, {"one": (3, None, "best")}),
     **{
@@ -452,8 +454,8 @@ CALLS: Table = {
     ),
     "curve.states": (
         curve.states,
-        {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05], "when": 0.2},
-        {"pair": PAIR, "v_in": ("x", [0.1, 0.2]), "when": ("x", None, [], True)},
+        {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05], "when": [0.2]},
+        {"pair": PAIR, "v_in": ("x", [0.1, 0.2]), "when": ("x", None, [], True, 0.2)},
     ),
     "cheapest_model": (
         cheapest_model,

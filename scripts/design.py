@@ -181,8 +181,7 @@ def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
             raise ValueError(f"tolerance must be NAME=5%, with :lognormal or not; got {text!r}")
         found.append(Tolerance(name, command.part("tolerance", spread), kind or "uniform"))
     with command.about("tolerance"):
-        check_tolerances(tuple(found), bounded=False)
-    return tuple(found)
+        return check_tolerances(found)
 
 
 def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":

@@ -100,7 +100,7 @@ def test_traced_values_still_pass_the_doors_that_are_differentiated():
 
 
 def test_an_axis_from_a_file_without_an_end_is_refused_unread():
-    with pytest.raises(ValueError, match="d must name a file that can be read; got @/dev/zero"):
+    with pytest.raises(ValueError, match="d must name a file that can be read; got '@/dev/zero'"):
         parse_axis("d", "@/dev/zero")
 
 

@@ -55,7 +55,7 @@ BAD = [
     (["--d", "0.1:0.2:0"], "N in LO:HI:N"),
     (["--u0=-1:1:5:log"], "log axis"),
     (["--d", "0.1:0.2"], "d must be a number, a comma list"),
-    (["--d", "@nowhere"], "can be read; got @nowhere"),
+    (["--d", "@nowhere"], "can be read; got '@nowhere'"),
     (["--d", "0.1", "--s", "0.3"], "d and s give the same quantity"),
     (["--wall", "rigid", "--u0", "0.2", "--d", "0.1,0.2"], "u0 must lie in the gap"),
     (["--wall", "hard"], "wall must be"),

@@ -109,7 +109,9 @@ def _from_file(name: str, path: str) -> list[float]:
         items = _text(Path(path)).replace(",", " ").split()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
-        raise ValueError(f"{name} must name a file that can be read; got @{path[:100]} ({reason})") from None
+        raise ValueError(
+            f"{name} must name a file that can be read; got {checks.shown(f'@{path}')} ({reason})"
+        ) from None
     return [_number(name, item, f"@{path}") for item in items]
 
 
@@ -223,7 +225,7 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
         if len(rivals) > 1:
             raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
     if "r" in given and not restitution:
-        raise ValueError(f"r must be left out with a membrane that has no restitution of its own; got {given['r']!r}")
+        raise ValueError(f"r must be left out with a membrane that has no restitution; got {checks.shown(given['r'])}")
     arrays = {name: check_axis(name, values) for name, values in given.items()}
     values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
     sizes = {name: array.size for name, array in arrays.items() if array.ndim}

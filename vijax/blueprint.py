@@ -49,6 +49,7 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
     Raises:
         ValueError: If the path does not end as a picture does.
     """
+    checks.record("report", report, ("best",), "vijax.report.describe")
     checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
     if path is not None:
         check_format(path)
@@ -190,9 +191,9 @@ def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure
     Raises:
         ValueError: If the path does not end as a picture does.
     """
-    checks.instance("report", report, dict, "scripts/design.py --over")
     if path is not None:
         check_format(path)
+    checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
     over, designs = report["over"], report["designs"]
     tuned = designs[0]["tune"][0]
     found = [(x, one) for x, one in zip(over["values"], designs, strict=True) if one["best"]]

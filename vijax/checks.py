@@ -98,12 +98,12 @@ def positive(name: str, value: Any) -> float:
     return real(name, value, "a positive finite number", lambda x: 0 < x < math.inf)
 
 
-def numbers(name: str, value: Any, advice: str = "") -> np.ndarray:
-    """The value as an array of at least one real number, NaN and infinity among them."""
+def numbers(name: str, value: Any, advice: str = "", *, some: bool = True) -> np.ndarray:
+    """The value as an array of real numbers, NaN and infinity among them; of at least one unless not `some`."""
     known(name, value)
     array = _array(value)
     hint = advice and f"; {advice}"
-    if array.size == 0:
+    if some and array.size == 0:
         raise ValueError(f"{name} must hold at least one number; got shape {array.shape}{hint}")
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{name} must be a real number or an array of them; got {shown(value)}{hint}")
@@ -203,6 +203,14 @@ def variables(name: str, value: Any, needed: Iterable[str], made: str) -> Any:
     missing = [one for one in needed if one not in value]
     if missing:
         raise ValueError(f"{name} must hold {', '.join(needed)}; got a dataset without {', '.join(missing)}")
+    return value
+
+
+def record(name: str, value: Any, needed: Iterable[str], made: str) -> dict[str, Any]:
+    """The value, if it is a dict that holds some entries; `made` is what returns such."""
+    missing = list(needed) if not isinstance(value, dict) else [one for one in needed if one not in value]
+    if missing:
+        raise ValueError(f"{name} must be a dict with {joined(missing)}, as {made} gives it; got {shown(value)}")
     return value
 
 

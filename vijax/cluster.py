@@ -115,17 +115,18 @@ def _joined(address: str) -> "Iterator[Client]":
         dask.comm.get_address_host_port(address)
     except ValueError:
         raise ValueError(
-            f"scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}"
+            f"workers or scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}"
         ) from None
     try:
         client = dask.Client(address, timeout=_ANSWER, set_as_default=False)
     except TypeError as error:  # of TLS without certificates
         raise ValueError(
-            f"scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
+            f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
         ) from None
     except OSError:
         raise ConnectionError(
-            f"scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give its address"
+            f"workers or scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give "
+            "its address"
         ) from None
     with client:
         yield client

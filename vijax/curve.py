@@ -53,6 +53,8 @@ def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[n
     """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
     check_pair(pair)
     when = checks.numbers("when", when)
+    if when.ndim != 1:
+        raise ValueError(f"when must be a 1-D array of times; got shape {when.shape}")
     (t, side, v_in, v_out, duration), count = _padded(t=t, side=side, v_in=v_in, v_out=v_out, duration=duration)
     index = np.searchsorted(t[:count], when, side="right") - 1
     last = np.maximum(index, 0)
@@ -62,7 +64,8 @@ def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[n
 
 def _padded(**given) -> tuple[list[np.ndarray], int]:
     """Rows without what is not there, repeated to a power of two, as every new length would compile anew."""
-    rows = [_row(name, row, np.shape(given["t"])) for name, row in given.items()]
+    shape = checks.numbers("t", given["t"], some=False).shape
+    rows = [_row(name, row, shape) for name, row in given.items()]
     there = np.isfinite(rows[0])
     count = int(there.sum())
     width = 1 << max(count - 1, 0).bit_length()
@@ -71,7 +74,7 @@ def _padded(**given) -> tuple[list[np.ndarray], int]:
 
 def _row(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """One number an impact; there may be none."""
-    row = np.asarray(values if np.shape(values) == (0,) else checks.numbers(name, values), float)
+    row = checks.numbers(name, values, some=False).astype(float)
     if row.ndim != 1 or row.shape != shape:
         raise ValueError(f"{name} must be a 1-D array of as many numbers as t; got shape {row.shape}")
     return row

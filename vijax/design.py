@@ -149,7 +149,7 @@ def optimise_all(
     """
     devices = checks.sequence("devices", devices, Harvester, "vijax.Harvester records")
     tune, bounds = checks.words("tune", tune, NAMES), {} if bounds is None else bounds
-    scatter = tuple(checks.sequence("tolerances", tolerances, Tolerance, "vijax.tolerance.Tolerance records"))
+    scatter = check_tolerances(tolerances)
     looks, far = checks.whole("looks", looks, 2, _MOST_LOOKS), effort(steps, balls, impacts, periods)
     box = check(devices, tune, bounds, objective, scatter)
     if (asked := expected(len(devices), far)).long:
@@ -199,8 +199,7 @@ def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None
         ValueError: A tolerance that cannot be.
     """
     checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best")
-    scatter = tuple(checks.sequence("tolerances", tolerances, Tolerance, "vijax.tolerance.Tolerance records"))
-    check_tolerances(scatter, bounded=False)
+    scatter = check_tolerances(tolerances)
     cloud, none = nodes(scatter, samples), jnp.zeros((1, 0))
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), (), cloud.names, "P")
     device = jax.tree.map(lambda x: jnp.array([x], float), optimum.device)

@@ -1,6 +1,7 @@
 """Energy of an impact: what the membrane's capacitance harvests, what the ball gives to it, and if that suffices."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -61,8 +62,11 @@ def harvested_energy(device: Harvester, depth: Values) -> Values:
     Source: Eq. (34).
     """
     check_device(device)
-    if checks.is_concrete(depth) and np.size(depth):
-        checks.numbers("depth", depth)
+    given: Any = depth
+    if checks.is_concrete(given):
+        found = checks.numbers("depth", given, some=False)
+        # A number and an array of JAX stay what they are: their precision is the result's.
+        depth = jnp.asarray(found, float) if isinstance(given, list | tuple) else depth
     return _harvested(device, depth)
 
 

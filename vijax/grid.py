@@ -290,10 +290,10 @@ def check_workers(planned: Plan, workers: cluster.Workers, out: str | Path | Non
         ValueError, OSError, ModuleNotFoundError: As `cluster.check`; ValueError without a store, and with refinement.
     """
     if out is None:
-        raise ValueError(f"workers must come with out, the store that they write; got {workers!r} alone")
+        raise ValueError(f"workers must come with out, the store that they write; got {checks.shown(workers)} alone")
     if planned.refine:
         raise ValueError(
-            f"workers must be left out with refine, which goes on from all that was found; got {workers!r}"
+            f"workers must be left out with refine, which goes on from all that was found; got {checks.shown(workers)}"
         )
     cluster.check(workers)
 

@@ -128,9 +128,8 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
     for name in given:
         takers = [taker for taker, taken in OPTIONS.items() if name in taken]
         if method not in takers and name != "membrane":
-            raise ValueError(
-                f"{name} must be left out unless method is {' or '.join(map(_quoted, takers))}; got {given[name]!r}"
-            )
+            theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
+            raise ValueError(f"{name} must be left out unless method is {theirs}; got {got}")
     if method == "exact":
         return None
     if wall != "soft":

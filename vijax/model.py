@@ -158,7 +158,7 @@ class Harvester(eqx.Module):
         if is_concrete(self.r_b, self.R0) and not np.all(np.asarray(self.r_b) < np.asarray(self.R0)):
             raise ValueError(
                 f"r_b must be smaller than R0, the radius of the membrane that the ball sinks into; "
-                f"got r_b = {self.r_b}, R0 = {self.R0}"
+                f"got r_b = {checks.shown(self.r_b)}, R0 = {checks.shown(self.R0)}"
             )
 
     @property

@@ -372,8 +372,10 @@ def halved(orbit: Orbit) -> Orbit:
     Raises:
         ValueError: An orbit that is not symmetric.
     """
-    if not bool(symmetric(orbit).all()):
-        raise ValueError(f"orbit must be symmetric to be closed half way; got {np.asarray(symmetric(orbit))}")
+    good = symmetric(orbit)
+    if not good.all():
+        index = int(np.argmin(good))
+        raise ValueError(f"orbit must be symmetric to be closed half way; got one that is not at index {index}")
     if bool(orbit.sequence.mirrored.all()):
         return orbit
     host = jax.tree.map(np.asarray, orbit)

@@ -166,7 +166,7 @@ def quantity(name: str, value: float) -> str:
 
 def lines(report: dict[str, Any]) -> Iterator[str]:
     """What a builder needs to know before trusting a design, from what `describe` returned."""
-    checks.instance("report", report, dict, "vijax.report.describe(...)")
+    checks.record("report", report, ("bounds", "objective", "best"), "vijax.report.describe")
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in report["bounds"].items())
     yield f"tuned: {ranges}; objective {report['objective']}, {report['objective_means']}"
     yield f"survey: {report['attractors']:,} periodic attractors met, {report['starts']:,} climbed"
@@ -275,7 +275,7 @@ def _unconstrained(report: dict[str, Any]) -> Iterator[str]:
 
 def table(report: dict[str, Any]) -> Iterator[str]:
     """The best designs along an axis, a line each: `over`, its name and values, and `designs`, of `describe` each."""
-    checks.instance("report", report, dict, "scripts/design.py --over")
+    checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
     name, values = report["over"]["name"], report["over"]["values"]
     for value, one in zip(values, report["designs"], strict=True):
         best = one["best"]

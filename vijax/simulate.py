@@ -183,6 +183,8 @@ def summarise(
     periods, transient = checks.whole("periods", periods, 1), checks.whole("transient", transient, 0)
     checks.choice("until", until, ("attractor", "window"))
     outputs = frozenset(checks.words("outputs", outputs, _FIELDS))
+    if on is not None:
+        checks.instance("on", on, jax.Device, "jax.devices()[0]")
     count = pair.d.shape[0] if count is None else checks.whole("count", count, 0, pair.d.shape[0])
     dtype = pair.d.dtype
     plan = Plan(

@@ -235,7 +235,9 @@ def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any]) -> Method |
         method = choose(method, options, wall=_wall(pair), dtype=_precision(pair))
     lossy = method is None or not isinstance(method.law, HuntCrossley)
     if (pair.r is None) == lossy:
-        raise ValueError(f"r must be None with a Hunt-Crossley membrane, and a number with others; got {pair.r}")
+        raise ValueError(
+            f"r must be None with a Hunt-Crossley membrane, and a number with others; got {checks.shown(pair.r)}"
+        )
     return method
 
 
