@@ -433,7 +433,11 @@ CALLS: Table = {
     ),
     "report.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design(), {})}),
     "report.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
-    "blueprint.design": (blueprint.design, {"diagram": a_map(), "report": {"best": None}}, {"diagram": (*DATASET, a_map())}),
+    "blueprint.design": (
+        blueprint.design,
+        {"diagram": a_map(), "report": {"best": None}},
+        {"diagram": (*DATASET, a_map())},
+    ),
     "blueprint.design_map": (blueprint.design_map, {}, {"report": (3, None, "best")}),
     "report.optimum": (report.optimum, {}, {"one": (3, None, "best")}),
     **{
