@@ -59,17 +59,18 @@ def branch(
     With neither --out nor --plot, branch.zarr and branch.png are written.
     """
     from vijax import branch as branches
-    from vijax import chart, orbit
+    from vijax import chart, checks, orbit
     from vijax.style import check_format
 
     with command.door():
         store, picture = command.targets(out, plot, _DEFAULT_FILES, overwrite)
         pair, device = command.at_one_point(command.take_axes(given, _START), command.device(constants), wall)
         name, within = _bounds(along)
-        if guesses < 1 or generations < 0:
-            raise ValueError(f"guesses must be at least 1 and generations at least 0; got {guesses}, {generations}")
-        orbit.sequences(impacts)
-        branches.check_bounds(pair, name, within, device)
+        checks.whole("generations", generations, 0, branches.MOST_GENERATIONS)
+        walls, _ = orbit.sequences(impacts)
+        orbit.check_guesses(guesses, len(walls))
+        with command.about("along"):
+            branches.check_bounds(pair, name, within, device)
         chart.check_branch_quantity(quantity)
         if picture is not None:
             check_format(picture)
@@ -97,7 +98,8 @@ def _bounds(along: str) -> tuple[str, tuple[float, float]]:
     name, sign, text = along.partition("=")
     if not sign or name not in AXES or text.count(":") != 1:
         raise ValueError(f"along must be NAME=LO:HI, as in d=0.1:0.3; got {along!r}")
-    low, high = parse_axis(name, text.replace(":", ","))
+    with command.about("along"):
+        low, high = parse_axis(name, text.replace(":", ","))
     return name, (float(low), float(high))
 
 

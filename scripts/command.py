@@ -22,6 +22,7 @@ import click
 if TYPE_CHECKING:
     import xarray as xr
 
+    from vijax.estimate import Estimate
     from vijax.model import Harvester, ImpactPair
 
 _STARTED = time.perf_counter()
@@ -72,6 +73,20 @@ def file_options(ending: str = ".zarr", what: str = "store") -> list[click.Param
     ]
 
 
+def size_option() -> click.Parameter:
+    """Whether a run may take more than an hour or 10 GB."""
+    return click.Option(["--yes"], is_flag=True, help="begin also what takes more than an hour or 10 GB")
+
+
+def agree(expected: "Estimate", yes: bool) -> None:
+    """Ask whether a long run is meant, or refuse it where nobody can answer."""
+    if not expected.long or yes:
+        return
+    if not sys.stdin.isatty():
+        raise ValueError(f"yes must be given beyond an hour or 10 GB; got {expected}; add --yes, or ask for less")
+    click.confirm(f"{expected}: begin?", abort=True, err=True)
+
+
 def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, Any]:
     """Values of the axes, taken out of what was given.
 
@@ -96,6 +111,8 @@ def device(constants: Iterable[str]) -> "Harvester":
     values = {}
     for text in constants:
         name, _, value = text.partition("=")
+        if not name:
+            raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}")
         if name in AXES:
             raise ValueError(
                 f"set must name a constant that has no option of its own; got {text!r}; give --{name}={value}"
@@ -104,19 +121,37 @@ def device(constants: Iterable[str]) -> "Harvester":
             values[name] = float(value)
         except ValueError:
             raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}") from None
-    return with_constants(Harvester(), **values)
+    with about("set"):
+        return with_constants(Harvester(), **values)
+
+
+@contextmanager
+def about(option: str) -> Iterator[None]:
+    """Whatever is found wrong within names the option that it came by."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"--{option}: {error}") from None
+
+
+def part(option: str, text: str) -> float:
+    """A part of a whole, written 5% or 0.05."""
+    try:
+        return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        raise ValueError(f"{option} must be a part such as 5% or 0.05; got {text!r}") from None
 
 
 def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft") -> "tuple[ImpactPair, Harvester]":
     """The pair that the axes give, each by one number, and the device that has it."""
+    from vijax import checks
     from vijax.axes import cells
-    from vijax.model import impact_pair, with_constants, with_pair
+    from vijax.model import WALLS, impact_pair, with_constants, with_pair
 
     for name, values in axes.items():
         if values.size != 1:
             raise ValueError(f"{name} must be one number here; got {values.size} of them")
-    if wall not in ("soft", "rigid"):
-        raise ValueError(f'wall must be "soft" or "rigid"; got {wall!r}')
+    checks.choice("wall", wall, WALLS)
     given = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
     d, kappa, r, gamma, A, omega = (float(given[name]) for name in ("d", "kappa", "r", "gamma", "A", "omega"))
     device = with_constants(device, A=A, omega=omega, omega0=kappa * omega / math.pi)

@@ -103,10 +103,10 @@ def test_the_dataset_and_its_picture(family, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"along": "omega0"}, "along must be one of"),
+        ({"along": "omega0"}, "along must be among"),
         ({"along": "kappa"}, "a rigid wall has no kappa"),
-        ({"within": (0.3, 0.1)}, "within must be two bounds"),
-        ({"within": (0.1,)}, "within must be two bounds"),
+        ({"within": (0.3, 0.1)}, "within must be two finite bounds"),
+        ({"within": (0.1,)}, "within must be two finite bounds"),
         ({"points": 1}, "points must be a whole number"),
         ({"within": (0.25, 0.3)}, "within must hold the start"),
         ({"direction": "sideways"}, "direction must be"),

@@ -164,7 +164,7 @@ BAD = [
     ({"v0": [0.0, np.nan]}, "v0 must be finite"),
     ({"d": "0.1"}, "d must be a real number"),
     ({"d": [[0.1]]}, "d must be a number or a 1-D array"),
-    ({"d": []}, "d must be a number or a 1-D array"),
+    ({"d": []}, "d must hold at least one number; got shape"),
     ({"d": 0.1, "s": 0.3}, "d and s"),
     ({"omega0": 100.0, "k": 500.0}, "omega0 and k"),
     ({"gamma": 0.1, "beta": 0.1}, "gamma and beta"),

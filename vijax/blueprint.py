@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vijax import checks
 from vijax.report import UNITS, amount, factors
 from vijax.style import STYLE, axis_label, check_format, save_figure, symbol
 from vijax.tuning import LINEAR, constant
@@ -47,6 +48,8 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
     Raises:
         ValueError: If the path does not end as a picture does.
     """
+    checks.record("report", report, ("best",), "vijax.report.describe")
+    checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
     if path is not None:
         check_format(path)
     along, best = str(diagram.attrs["along"]), report["best"]
@@ -188,6 +191,7 @@ def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure
     """
     if path is not None:
         check_format(path)
+    checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
     over, designs = report["over"], report["designs"]
     tuned = designs[0]["tune"][0]
     found = [(x, one) for x, one in zip(over["values"], designs, strict=True) if one["best"]]

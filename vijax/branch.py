@@ -11,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vijax import flow, shooting
+from vijax import checks, flow, shooting
 from vijax import orbit as orbits
 from vijax.arc import ALONG, CLOSE, FIRST_END, FOLD, PLUS, Arc, Place, Tests, advance, unpack
 from vijax.axes import AXES
-from vijax.method import whole
-from vijax.model import Harvester, ImpactPair, Status, check
-from vijax.orbit import Orbit
+from vijax.model import Harvester, ImpactPair, Status, check, one_device
+from vijax.orbit import Orbit, check_orbit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -30,6 +29,8 @@ _EASY = 0.2  # share of that bend after which the next step is longer
 _ZERO = 1e-3  # part of a test function's ends that is zero
 _LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
 _AWAY = 20  # steps before a branch can have closed
+_WAYS = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
+_MOST_POINTS, MOST_GENERATIONS = 10**6, 64
 _NARROWINGS = 40  # of an interval that holds an event: false position with every third step a bisection
 
 
@@ -175,15 +176,13 @@ def follow(
         ValueError: An unknown parameter or direction, bounds in the wrong order or without the start, or an orbit that
             is none.
     """
+    checks.choice("direction", direction, _WAYS)
+    points = checks.whole("points", points, 2, _MOST_POINTS)
     arcs, y = _set_out(orbit, along, within, device)
-    ways = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
-    if direction not in ways:
-        raise ValueError(f'direction must be "up", "down" or "both"; got {direction!r}')
-    points = whole("points", points, 2)
     ahead = np.zeros_like(y)
     ahead[:, -1] = 1.0
     first = advance(arcs, y, ahead, np.zeros(len(orbit)))
-    found = [_follow(arcs, _heading(first, sign), along, points) for sign in ways[direction]]
+    found = [_follow(arcs, _heading(first, sign), along, points) for sign in _WAYS[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]
 
 
@@ -196,12 +195,12 @@ def _heading(place: Place, sign: float) -> Place:
 
 def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None):
     """Arcs and unknowns of the starts; what cannot be followed is refused."""
-    if not len(orbit):
+    if not len(check_orbit(orbit)):
         raise ValueError("orbit must hold an orbit to follow; got none; search with more guesses")
     if (np.asarray(orbit.status) != Status.OK).any():
         index = int(np.argmax(np.asarray(orbit.status) != Status.OK))
         raise ValueError(f"orbit must hold orbits only; got {Status(int(orbit.status[index])).name} at index {index}")
-    device = Harvester() if device is None else device
+    device = one_device(device)
     x = check_bounds(orbit.pair, along, within, device)
     if along == "gamma" and bool(orbit.sequence.mirrored.any()):
         raise ValueError("orbit must be closed in full to be followed along gamma; got one closed half way; unfold it")
@@ -216,18 +215,16 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
 
 def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> Array:
     """The parameter's value at a pair, or ValueError unless it can be followed from there within the bounds."""
-    if along not in ALONG or (along == "kappa" and pair.kappa is None):
-        rigid = "; a rigid wall has no kappa" if pair.kappa is None else ""
-        raise ValueError(f"along must be one of {', '.join(ALONG)}; got {along!r}{rigid}")
-    if len(within) != 2 or not within[0] < within[1]:
-        raise ValueError(f"within must be two bounds, the lower first; got {within}")
-    low, high = within
-    for bound in within:
-        check(along, bound)
+    rigid = pair.kappa is None
+    allowed = [name for name in ALONG if name != "kappa" or not rigid]
+    checks.choice("along", along, allowed, "a rigid wall has no kappa" if rigid else "")
+    low, high = bounds = checks.bounds("within", within)
+    for bound in bounds:
+        check(along, bound, "within")
     # The frequency at which the device's gap is d.
     x = flow.PI * jnp.sqrt(pair.d * device.A / device.s) if along == "omega" else getattr(pair, along)
     if not bool(((x >= low) & (x <= high)).all()):
-        raise ValueError(f"within must hold the start; got {within} and {along} = {float(jnp.ravel(x)[0]):.6g}")
+        raise ValueError(f"within must hold the start; got {bounds} and {along} = {float(jnp.ravel(x)[0]):.6g}")
     return x
 
 
@@ -322,11 +319,14 @@ def switch(
     Raises:
         ValueError: A point at which nothing of the kind begins.
     """
+    checks.instance("point", point, Point, "branch.follow")
+    points = checks.whole("points", points, 2, _MOST_POINTS)
     if not _begins(point):
         raise ValueError(
             f"point must be a flip, or a pitchfork of orbits closed half way (orbit.halved); got a {point.kind} of "
             f"orbits closed {'half way' if point.orbit.sequence.mirrored[0] else 'in full'}"
         )
+    check_bounds(point.orbit.pair, along, within, one_device(device))
     doubled = orbits.doubled(point.orbit)
     arcs, y = _set_out(doubled, along, within, device)
     knots = y[0, :-1].reshape(-1, 3)
@@ -357,7 +357,13 @@ def family(
     Args:
         orbit, along, within, device, points: As in `follow`; symmetric orbits are closed half way.
         generations: How often to switch; 0 follows the given orbits alone.
+
+    Raises:
+        ValueError: As `follow`.
     """
+    generations = checks.whole("generations", generations, 0, MOST_GENERATIONS)
+    points = checks.whole("points", points, 2, _MOST_POINTS)
+    _set_out(orbit, along, within, device)
     grown: list[Branch] = []
     for index in range(len(orbit)):
         one = orbit[index : index + 1]
@@ -407,9 +413,9 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     """
     import xarray as xr  # here, as importing vijax must not load it
 
-    if not branches:
+    if not checks.sequence("branches", branches, Branch, "branches, as branch.follow returns them"):
         raise ValueError("branches must hold at least one; got none")
-    device = Harvester() if device is None else device
+    device = one_device(device)
     along = branches[0].along
     columns = [_columns(branch, device) for branch in branches]
     found = {name: _padded([column[name] for column in columns]) for name in columns[0]}

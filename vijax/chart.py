@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
+from vijax import checks
 from vijax.style import STYLE, axis_label, check_format, save_figure, symbol, title, units
 
 if TYPE_CHECKING:
@@ -93,6 +94,7 @@ def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantit
         ValueError: A quantity that is none, more axes or values than a picture can hold, a format that is none.
     """
     check_quantity(quantity)
+    checks.variables("dataset", dataset, ("P", quantity), "orbit_diagram")
     along = dataset.attrs["along"]
     others = check_layout(along, {str(dim): dataset.sizes[dim] for dim in dataset["P"].dims})
     if path is not None:
@@ -126,8 +128,7 @@ def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantit
 
 def check_quantity(quantity: str) -> None:
     """Raise ValueError unless an orbit diagram can be drawn of it."""
-    if quantity not in _QUANTITIES:
-        raise ValueError(f"quantity must be one of {', '.join(_QUANTITIES)}; got {quantity!r}")
+    checks.choice("quantity", quantity, _QUANTITIES)
 
 
 def check_layout(along: str, sizes: Mapping[str, int]) -> list[str]:
@@ -346,6 +347,7 @@ def branches(dataset: "xr.Dataset", path: str | Path | None = None, quantity: st
         ValueError: A quantity that is none, a format that is none.
     """
     check_branch_quantity(quantity)
+    checks.variables("dataset", dataset, (quantity, "stable", "event"), "vijax.branch.dataset")
     if path is not None:
         check_format(path)
     along = dataset[dataset.attrs["along"]]
@@ -373,8 +375,7 @@ def branches(dataset: "xr.Dataset", path: str | Path | None = None, quantity: st
 
 def check_branch_quantity(quantity: str) -> None:
     """Raise ValueError unless branches have the quantity."""
-    if quantity not in _BRANCH_QUANTITIES:
-        raise ValueError(f"quantity must be one of {', '.join(_BRANCH_QUANTITIES)}; got {quantity!r}")
+    checks.choice("quantity", quantity, _BRANCH_QUANTITIES)
 
 
 def _mark(kind: str, label: str | None = None) -> Line2D:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 
-from vijax.method import whole
+from vijax import checks
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -27,6 +27,7 @@ Task = TypeVar("Task")
 Workers = int | str
 """So many processes of this machine, among which its cores are divided; or the address of a scheduler."""
 
+_MOST_WORKERS = 4096  # processes of one machine
 _ANSWER = 10  # seconds that a scheduler has to answer
 _WAITING = 2  # tasks a thread of a worker: one runs and one waits, so that nobody does
 _LOGS = ("distributed.batched", "distributed.client", "distributed.core", "distributed.utils", "tornado.application")
@@ -46,7 +47,7 @@ def check(workers: Workers) -> None:
             pass
     else:
         _dask()
-        whole("workers", workers, 1)
+        checks.whole("workers", workers, 1, _MOST_WORKERS)
 
 
 def done(work: Callable[[Task], None], tasks: Iterable[Task], workers: Workers) -> Iterator[Task]:
@@ -117,12 +118,19 @@ def _joined(address: str) -> "Iterator[Client]":
     try:
         dask.comm.get_address_host_port(address)
     except ValueError:
-        raise ValueError(f"scheduler must be an address such as tcp://10.0.0.1:8786; got {address!r}") from None
+        raise ValueError(
+            f"workers or scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}"
+        ) from None
     try:
         client = dask.Client(address, timeout=_ANSWER, set_as_default=False)
+    except TypeError as error:  # of TLS without certificates
+        raise ValueError(
+            f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
+        ) from None
     except OSError:
         raise ConnectionError(
-            f"scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give its address"
+            f"workers or scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give "
+            "its address"
         ) from None
     with _quiet(), client:
         yield client

@@ -6,6 +6,7 @@ import math
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,14 +14,16 @@ from typing import Any
 
 import numpy as np
 
+from vijax import checks
+
 _LOG = logging.getLogger(__name__)
 _WRITING: set[Path] = set()  # what this process has under way
 
 
 def check_ending(name: str, path: str | Path, ending: str) -> None:
     """Raise ValueError unless a path ends so; `name` is the argument that an error speaks of."""
-    if Path(path).suffix != ending:
-        raise ValueError(f"{name} must end in {ending}; got {str(path)!r}")
+    if checks.path(name, path).suffix != ending:
+        raise ValueError(f"{name} must end in {ending}; got {checks.shown(str(path))}")
 
 
 def check_output(name: str, path: str | Path, overwrite: bool = False) -> Path:
@@ -48,14 +51,18 @@ def check_folder(name: str, path: str | Path) -> Path:
     Raises:
         FileNotFoundError, PermissionError: If its folder is missing or closed.
     """
-    target = Path(path)
+    target = checks.path(name, path)
     folder = target.absolute().parent
     if not target.name:
         raise FileNotFoundError(f"{name} must name a file; got {str(path)!r}")
     if not folder.is_dir():
         raise FileNotFoundError(f"{name} must lie in a folder that exists; got {path}; make {folder} first")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{name} must lie in a folder that can be written; got {path}")
+    try:
+        # Leaves no name behind. To ask for permission is not enough: all is allowed to root, and nothing in /proc.
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        reason = error.strerror
+        raise PermissionError(f"{name} must lie in a folder that can be written; got {path} ({reason})") from None
     return target
 
 

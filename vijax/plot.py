@@ -17,6 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import EngFormatter
 
+from vijax import checks
 from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.label import label
@@ -69,10 +70,14 @@ class _Mark(NamedTuple):
 
 
 class _Kind(NamedTuple):
-    """A kind of picture: what it colours and how, the variables it needs and those it can do without, its marks."""
+    """A kind of picture: what it colours and how, which function makes such maps, the variables that it needs.
+
+    And those that it can do without, its marks.
+    """
 
     coloured: str
     label: str
+    made: str
     needs: tuple[str, ...]
     optional: tuple[str, ...]
     colours: "Callable[[xr.Dataset], LogNorm]"
@@ -110,7 +115,7 @@ def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     Raises:
         ValueError: As `power_map`.
     """
-    _need(dataset, LABEL_NEEDS)
+    checks.variables("dataset", dataset, LABEL_NEEDS, "sweep")
     period = dataset["period"]
     level = (dataset["gamma"] == 0).broadcast_like(period).transpose(*period.dims)
     words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
@@ -131,7 +136,7 @@ def basin_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     Raises:
         ValueError: As `power_map`.
     """
-    _need(dataset, ("basin", "label", "fraction", "P"))
+    checks.variables("dataset", dataset, ("basin", "label", "fraction", "P"), "basins")
     further = [dim for dim in dataset["P"].dims if dim not in (*dataset["basin"].dims, "attractor")]
     dataset = dataset.isel(dict.fromkeys(further, 0))
     drawn = dataset.assign(code=dataset["basin"].clip(max=_MOST_NAMED)).drop_vars("basin")
@@ -148,7 +153,7 @@ def multistability_map(dataset: "xr.Dataset", path: str | Path | None = None) ->
     Raises:
         ValueError: As `power_map`.
     """
-    _need(dataset, ("attractors",))
+    checks.variables("dataset", dataset, ("attractors",), "basin_fractions")
     number = dataset["attractors"]
     most = int(number.max())
     shades = mpl.colormaps["viridis_r"](np.linspace(0, 1, most + 1))
@@ -178,14 +183,8 @@ def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Fig
     return _picture(dataset, _DIFFERENCE, path)
 
 
-def _need(dataset: "xr.Dataset", names: tuple[str, ...]) -> None:
-    missing = [name for name in names if name not in dataset]
-    if missing:
-        raise ValueError(f"plot must have {', '.join(names)}; got a map without {', '.join(missing)}")
-
-
 def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
-    _need(dataset, kind.needs)
+    checks.variables("dataset", dataset, kind.needs, kind.made)
     if path is not None:
         check_format(path)
     whole = dataset[kind.coloured]
@@ -336,10 +335,11 @@ def _difference_marks(dataset: "xr.Dataset") -> list[_Mark]:
     return [*marks, _Mark(bare, "bare", _BARE, "no difference, or failed")]
 
 
-_POWER = _Kind("P", "$P$ [J per half period]", NEEDS, (), _power_colours, _power_marks)
+_POWER = _Kind("P", "$P$ [J per half period]", "sweep", NEEDS, (), _power_colours, _power_marks)
 _DIFFERENCE = _Kind(
     "relative_difference",
     r"$|P_\mathrm{rigid} - P_\mathrm{soft}| / P_\mathrm{soft}$",
+    "compare",
     ("relative_difference", "label"),
     ("cheapest_model",),
     _difference_colours,

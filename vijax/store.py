@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vijax import inventory
+from vijax import checks, inventory
 from vijax.files import check_ending, check_folder, recover, replacing_folder
 
 if TYPE_CHECKING:
@@ -68,7 +68,8 @@ def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) ->
     Raises:
         ValueError, FileExistsError, FileNotFoundError, PermissionError: As `check_store`.
     """
-    target = check_store("path", path, overwrite)
+    checks.variables("dataset", dataset, (), "sweep")
+    target = check_store("path", path, checks.flag("overwrite", overwrite))
     with replacing_folder(target) as part:
         write(dataset, part)
         seal(part)
@@ -117,8 +118,9 @@ def load(path: str | Path) -> "xr.Dataset":
         FileNotFoundError: If there is no store.
         ValueError: If a file of it is not what was written; FileExistsError if a folder stands in its place.
     """
+    path = checks.path("path", path)
     with view(path) as dataset:
-        _check(Path(path), inventory.records(Path(path)))
+        _check(path, inventory.records(path))
         with _in_one_line(path):
             return dataset.load()
 

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vijax import checks
 from vijax.files import replacing
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
 
 def check_format(path: str | Path) -> None:
     """Raise ValueError unless the path ends as a picture does."""
-    if Path(path).suffix not in _DRAWN_WITH:
-        raise ValueError(f"plot must end in {', '.join(_DRAWN_WITH)}; got {str(path)!r}")
+    if checks.path("plot", path).suffix not in _DRAWN_WITH:
+        raise ValueError(f"plot must end in {', '.join(_DRAWN_WITH)}; got {checks.shown(str(path))}")
 
 
 def save_figure(figure: Any, path: str | Path) -> None:
