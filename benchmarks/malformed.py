@@ -4,6 +4,7 @@ Building a case runs nothing; every case is alone with its mistake, all else in 
 """
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
@@ -583,4 +584,5 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _short(value: Any) -> str:
-    return " ".join(repr(value).split())[:60]
+    # Without addresses, which no two processes share.
+    return re.sub(r" at 0x[0-9a-f]+", "", " ".join(repr(value).split()))[:60]
