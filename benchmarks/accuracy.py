@@ -23,6 +23,7 @@ double or the reference cells; nothing against the engine itself. Typical printo
 """
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -33,8 +34,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import vijax
-from vijax import simulate
+from vijax import lanes, orbit, simulate, survey
 from vijax.model import Harvester, ImpactPair
+from vijax.shooting import Sequence
+from vijax.steady import Steady, find, response
 
 TESTS = Path(__file__).parent.parent / "tests"
 sys.path.insert(0, str(TESTS))
@@ -142,17 +145,62 @@ def gradients() -> None:
     say("second derivatives", worst[1], 1e-6)
 
 
+MOVED = 0.8, 0.95, 1.0, 1.05  # of d, from where each orbit was met
+WIDTH = 16  # impacts of an orbit at most
+
+
+def steady_states(count: int) -> None:
+    """Steady states beside the impact map's flight of the same orbits, from attractors of drawn cells, d moved."""
+    draw = np.random.default_rng(105)
+    d, kappa = (
+        np.exp(draw.uniform(np.log(0.005), np.log(0.6), count)),
+        np.exp(draw.uniform(np.log(5), np.log(5e3), count)),
+    )
+    gamma = np.where(draw.random(count) < 0.5, 0.0, draw.uniform(-1, 1, count))
+    pair = ImpactPair(d, kappa, draw.uniform(0.05, 0.93, count), gamma)
+    met = survey.survey(pair, 0.3 * d, np.full(count, -0.47), longest=1, periods=400).orbits(WIDTH)
+    sequence, device = met.sequence(WIDTH), Harvester()
+    said, wrong, lost, pressed, worst = 0, 0, 0, 0, 0.0
+    for moved in MOVED:
+        there = dataclasses.replace(met.pair, d=moved * met.pair.d)
+        state = _steadily(device, there, sequence, met.knots)
+        flown = orbit.proven(there, sequence, jnp.asarray(state.knots))
+        P, fine = np.asarray(orbit.power(flown, device)), np.asarray(flown.status) == vijax.Status.OK
+        ok = state.status == vijax.Status.OK
+        said += state.status.size
+        wrong += int((ok & ~fine).sum())
+        lost += int(((state.status == vijax.Status.VIRTUAL) & fine).sum())
+        worst = max(worst, np.abs(state.P / P - 1)[ok & fine].max())
+        pressed += int((ok & (state.knots[..., 2].max(axis=1) * there.kappa > 20)).sum())
+    note = f"{said:,} steady states, {pressed:,} of them OK and pressed on a wall for more than 20/kappa"
+    say("steady states called OK that the impact map does not fly", wrong, 0, note)
+    say("steady states called VIRTUAL that it flies", lost, 0)
+    say("largest relative difference of P from the flown orbit's", worst, 1e-10)
+
+
+def _steadily(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> Steady:
+    """Steady states of many orbits, in tiles."""
+    one = jax.jit(jax.vmap(lambda *orbit: response(device, *orbit[:2], *find(*orbit))))
+    rows = jax.tree.map(np.asarray, (pair, sequence, knots))
+    parts = []
+    for tile in lanes.tiles(knots.shape[0], (512,)):
+        part = one(*jax.tree.map(lambda leaf, tile=tile: leaf[tile.rows], rows))
+        parts.append(jax.tree.map(lambda leaf, tile=tile: np.asarray(leaf)[: tile.real], part))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
 def main() -> int:
     """Print the figures; 1 if one is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a small version")
-    parser.add_argument("--only", choices=["reference", "plane", "audit", "gradients"], help="one part")
+    parser.add_argument("--only", choices=["reference", "plane", "audit", "gradients", "steady"], help="one part")
     given = parser.parse_args()
     parts = {
         "reference": reference,
         "plane": lambda: plane(200 if given.quick else 2000),
         "audit": lambda: audit(0.05 if given.quick else 1.0),
         "gradients": gradients,
+        "steady": lambda: steady_states(350 if given.quick else 7000),
     }
     for name, part in parts.items():
         if given.only in (None, name):

@@ -1,16 +1,17 @@
 """What does a study lose when it is killed, its disk is full or its files are damaged?
 
     python benchmarks/faults.py                          # every fault, each from the start
-    python benchmarks/faults.py --only kill --kills 20   # one of them: kill, stop, worker, disk, readonly, chunks,
-                                                         # writers
+    python benchmarks/faults.py --only kill --kills 20   # one of them: kill, stop, worker, disk, readonly,
+                                                         # damages, overwrite, foreign, writers
     python benchmarks/faults.py --side 256               # a smaller plane
 
 Each fault befalls `scripts/grid.py` on the (d, kappa) plane of side x side cells. Said are the moments, what the script
-told, how many tiles were run more than once, and whether the data variables of the finished store are, bit for bit,
-those of a run that nothing befell. Exit code 1 if any is not.
+told, how many tiles were run more than once, and whether variables and coordinates of the finished store are, bit for
+bit, those of a run that nothing befell. Exit code 1 if any is not.
 """
 
 import argparse
+import json
 import os
 import random
 import re
@@ -26,10 +27,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import vijax
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SCRIPT = Path(__file__).parent.parent / "scripts" / "grid.py"
 # Says which tile begins, and hears Ctrl-C though a background job's children ignore it.
@@ -98,12 +103,26 @@ def finish(scene: Scene, out: Path) -> End:
     return ended(start(scene.side, out))
 
 
+def differing(scene: Scene, found: "xr.Dataset") -> list[str]:
+    """Variables and coordinates that are not, bit for bit and in their attributes, those of an undisturbed run."""
+
+    def same(one: "xr.DataArray", other: "xr.DataArray") -> bool:
+        return np.array_equal(one, other, equal_nan=True) and one.attrs == other.attrs
+
+    whole = vijax.load(scene.whole)
+    return [str(name) for name in whole.variables if name not in found or not same(found[name], whole[name])]
+
+
+def is_whole(scene: Scene, found: "xr.Dataset") -> bool:
+    """Whether a map is that of a run that nothing befell."""
+    return not differing(scene, found)
+
+
 def verdict(scene: Scene, out: Path, began: int | None = None) -> bool:
     """Say whether the finished store is as it should be, and how many tiles were run more than once."""
-    found, whole = vijax.load(out), vijax.load(scene.whole)
-    differ = [str(name) for name in whole if not np.array_equal(found[name], whole[name], equal_nan=True)]
+    differ = differing(scene, vijax.load(out))
     again = "" if began is None else f"; tiles run more than once: {began - done(out)} of {done(out)}"
-    print(f"    lost: {', '.join(differ) if differ else 'nothing, all data variables equal bit for bit'}{again}")
+    print(f"    lost: {', '.join(differ) if differ else 'nothing, all equal bit for bit'}{again}")
     shutil.rmtree(out)
     return not differ
 
@@ -226,18 +245,135 @@ def flip(chunk: Path) -> None:
     chunk.write_bytes(content)
 
 
-def chunks(scene: Scene) -> bool:
-    """A truncated, a flipped and a missing chunk of a finished store."""
+def pipe(file: Path) -> None:
+    """Put what takes for ever to read in place of a file."""
+    file.unlink()
+    os.mkfifo(file)
+
+
+def device(file: Path) -> None:
+    """Put what never ends in place of a file."""
+    file.unlink()
+    file.symlink_to("/dev/zero")
+
+
+def overwrite(file: Path) -> None:
+    """Write over a file what is no text."""
+    file.write_bytes(b"\xff\x00" * 40)
+
+
+def variable(file: Path) -> None:
+    """Take away the folder of a file."""
+    shutil.rmtree(file.parent)
+
+
+def exchange(file: Path) -> None:
+    """Put the values of another coordinate, a sound chunk, in place of these."""
+    shutil.copyfile(file.parent.parent.parent / "kappa" / "c" / "0", file)
+
+
+def entry(**entries: object) -> Callable[[Path], None]:
+    """Edit entries of a file of metadata."""
+
+    def edit(file: Path) -> None:
+        file.write_text(json.dumps(json.loads(file.read_text()) | entries))
+
+    return edit
+
+
+def attribute(name: str, value: object) -> Callable[[Path], None]:
+    """Edit an attribute in a file of metadata; None takes it away."""
+
+    def edit(file: Path) -> None:
+        content = json.loads(file.read_text())
+        content["attributes"] |= {name: value}
+        if value is None:
+            del content["attributes"][name]
+        file.write_text(json.dumps(content))
+
+    return edit
+
+
+_BIG_ENDIAN = [{"name": "bytes", "configuration": {"endian": "big"}}, {"name": "zstd"}, {"name": "crc32c"}]
+_SMALL_CHUNKS = {"name": "regular", "configuration": {"chunk_shape": [2, 2]}}
+_CHUNK = "P/c/*/*"
+DAMAGES: dict[str, tuple[str, Callable[[Path], None]]] = {
+    "a truncated chunk": (_CHUNK, truncate),
+    "a flipped chunk": (_CHUNK, flip),
+    "a missing chunk": (_CHUNK, Path.unlink),
+    "a pipe for a chunk": (_CHUNK, pipe),
+    "a device for a chunk": (_CHUNK, device),
+    "a variable gone": ("P/zarr.json", variable),
+    "another data type": ("P/zarr.json", entry(data_type="int64", fill_value=0)),
+    "another byte order": ("P/zarr.json", entry(codecs=_BIG_ENDIAN)),
+    "other codecs": ("P/zarr.json", entry(codecs=[{"name": "bytes"}])),
+    "other chunks": ("P/zarr.json", entry(chunk_grid=_SMALL_CHUNKS)),
+    "a scale": ("P/zarr.json", attribute("scale_factor", 2.0)),
+    "other units": ("P/zarr.json", attribute("units", "mJ")),
+    "no flags": ("status/zarr.json", attribute("flag_meanings", None)),
+    "an exchanged coordinate": ("d/c/0", exchange),
+    "a coordinate gone": ("d/c/0", variable),
+    "another setting": ("zarr.json", attribute("periods", 50)),
+    "no metadata": ("zarr.json", Path.unlink),
+    "a truncated record": ("status/tiles/0.json", truncate),
+    "a binary lock": ("status/tiles/lock", overwrite),
+    "no lock": ("status/tiles/lock", Path.unlink),
+    "a flipped list": ("vijax.json", flip),
+    "no list": ("vijax.json", Path.unlink),
+}
+
+
+def damages(scene: Scene) -> bool:
+    """Each kind of damage to a finished store, read and gone on with."""
     good = True
-    for damage in (truncate, flip, Path.unlink):
-        out = scene.store("chunk")
+    for name, (where, damage) in DAMAGES.items():
+        out = scene.store("damaged")
         shutil.copytree(scene.whole, out)
-        chunk = random.choice([path for path in (out / "P" / "c").rglob("*") if path.is_file()])
-        damage(chunk)
+        damage(random.choice(sorted(out.glob(where))))
+        try:
+            said = "nothing, and the numbers are right" if is_whole(scene, vijax.load(out)) else "NOTHING"
+        except ValueError as error:
+            said = str(error).replace(str(out), out.name)
         end = finish(scene, out)
-        print(f"    {damage.__name__}: exit code {end.code}: {end.said}; {end.began} tile run again")
+        print(f"    {name}: load says {said}; exit code {end.code}; tiles run again: {end.began}")
+        good &= said != "NOTHING" and "\n" not in said and end.code == 0
         good &= verdict(scene, out)
     return good
+
+
+def stopped_overwrite(scene: Scene) -> bool:
+    """SIGKILL while --overwrite puts a new store in the place of an old one; then a run, anew or not."""
+    good = True
+    for more in ((), ("--overwrite",)):
+        out = scene.store("overwritten")
+        shutil.copytree(scene.whole, out)
+        process = start(scene.side, out, "--overwrite")
+        while not left(out) and process.poll() is None:
+            time.sleep(0.001)
+        process.kill()
+        ended(process)
+        before, end = left(out), ended(start(scene.side, out, *more))
+        print(f"    left: {', '.join(before) or 'nothing'}; exit code {end.code}; {end.began} tiles run again")
+        good &= bool(before) and not left(out)
+        good &= verdict(scene, out)
+    return good
+
+
+def left(out: Path) -> list[str]:
+    """What a killed run left beside a store."""
+    return [path.name for path in out.parent.glob(f".{out.stem}.*")]
+
+
+def foreign(scene: Scene) -> bool:
+    """Somebody's file in a store: --overwrite is refused, a run goes on."""
+    out = scene.store("foreign")
+    shutil.copytree(scene.whole, out)
+    thesis = out / "notes.part1.txt"
+    thesis.write_text("precious")
+    end = ended(start(scene.side, out, "--overwrite"))
+    print(f"    --overwrite: exit code {end.code}: {end.said}")
+    good = end.code == 2 and finish(scene, out).code == 0 and thesis.read_text() == "precious"
+    return verdict(scene, out) and good
 
 
 def writers(scene: Scene) -> bool:
@@ -257,7 +393,9 @@ FAULTS: dict[str, Callable[[Scene], bool]] = {
     "worker": worker,
     "disk": full_disk,
     "readonly": readonly,
-    "chunks": chunks,
+    "damages": damages,
+    "overwrite": stopped_overwrite,
+    "foreign": foreign,
     "writers": writers,
 }
 

@@ -45,6 +45,7 @@ def _options() -> list[click.Parameter]:
         click.Option(["--periods"], default=400, show_default=True, help="forcing periods to look for an attractor"),
         click.Option(["--wall"], default="soft", show_default=True, help="soft or rigid"),
         *command.file_options(),
+        command.size_option(),
     ]
 
 
@@ -60,6 +61,7 @@ def basins(
     speed: float | None,
     seed: int | None,
     overwrite: bool,
+    yes: bool,
     **given: Any,
 ) -> None:
     """Find the attractors that coexist, their basins and the energy of each."""
@@ -69,7 +71,8 @@ def basins(
         planned = _plan(axes, device, starts, speed, seed, merge_mirrors=merge_mirrors, **given)
         if plot is not None:
             _check_picture(plot, planned)
-    keep_compiled()
+        keep_compiled()
+        _agree(planned, yes)
     began = time.perf_counter()
     with command.progress(planned.count, "starts") as show:
         from vijax import grid
@@ -92,8 +95,15 @@ def _plan(
         return plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, **settings)
     for name, value in (("speed", speed), ("seed", seed)):
         if value is not None:
-            raise ValueError(f"{name} must come with starts; got {value:g} alone; add --starts 64")
+            raise ValueError(f"{name} must come with starts; got {value} alone; add --starts 64")
     return plan_basins(axes, device, **settings)
+
+
+def _agree(planned: "Plan", yes: bool) -> None:
+    from vijax import estimate, grid
+
+    grid.check_room(planned)
+    command.agree(estimate.of(planned), yes)
 
 
 def _check_picture(path: Path, planned: "Plan") -> None:

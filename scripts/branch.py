@@ -66,7 +66,7 @@ def branch(
     With neither --out nor --plot, branch.zarr and branch.png are written.
     """
     from vijax import branch as branches
-    from vijax import chart, orbit
+    from vijax import chart, checks, orbit
     from vijax.style import check_format
 
     with command.door():
@@ -76,10 +76,11 @@ def branch(
         # Along a quantity of the device it is a device that is given, of Tables I and II unless otherwise.
         start = {} if name in command.DEVICE else _START
         pair, device = command.at_one_point(command.take_axes(given, start), command.device(constants), wall)
-        if guesses < 1 or generations < 0:
-            raise ValueError(f"guesses must be at least 1 and generations at least 0; got {guesses}, {generations}")
-        orbit.sequences(impacts)
-        branches.check_along(pair, name, within)
+        checks.whole("generations", generations, 0, branches.MOST_GENERATIONS)
+        walls, _ = orbit.sequences(impacts)
+        orbit.check_guesses(guesses, len(walls))
+        with command.about("along"):
+            branches.check_along(pair, name, within)
         places = list(_places(float(branches.value_at(pair, name, device)), name, within, chosen))
         chart.check_branch_quantity(quantity)
         if picture is not None:
@@ -109,7 +110,8 @@ def _bounds(along: str) -> tuple[str, tuple[float, float]]:
     name, sign, text = along.partition("=")
     if not sign or name not in AXES or text.count(":") != 1:
         raise ValueError(f"along must be NAME=LO:HI, as in d=0.1:0.3; got {along!r}")
-    low, high = parse_axis(name, text.replace(":", ","))
+    with command.about("along"):
+        low, high = parse_axis(name, text.replace(":", ","))
     return name, (float(low), float(high))
 
 

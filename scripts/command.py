@@ -3,6 +3,7 @@
 A script is a click command whose body is one `door`, one run under `progress`, and one `finish`.
 """
 
+import io
 import logging
 import math
 import os
@@ -23,6 +24,7 @@ import click
 if TYPE_CHECKING:
     import xarray as xr
 
+    from vijax.estimate import Estimate
     from vijax.model import Harvester, ImpactPair
 
 _STARTED = time.perf_counter()
@@ -76,6 +78,20 @@ def file_options(ending: str = ".zarr", what: str = "store") -> list[click.Param
     ]
 
 
+def size_option() -> click.Parameter:
+    """Whether a run may take more than an hour or 10 GB."""
+    return click.Option(["--yes"], is_flag=True, help="begin also what takes more than an hour or 10 GB")
+
+
+def agree(expected: "Estimate", yes: bool) -> None:
+    """Ask whether a long run is meant, or refuse it where nobody can answer."""
+    if not expected.long or yes:
+        return
+    if not sys.stdin.isatty():
+        raise ValueError(f"yes must be given beyond an hour or 10 GB; got {expected}; add --yes, or ask for less")
+    click.confirm(f"{expected}: begin?", abort=True, err=True)
+
+
 def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, Any]:
     """Values of the axes, taken out of what was given.
 
@@ -101,6 +117,8 @@ def device(constants: Iterable[str]) -> "Harvester":
     values = {}
     for text in constants:
         name, _, value = text.partition("=")
+        if not name:
+            raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}")
         if name in AXES:
             raise ValueError(
                 f"set must name a constant that has no option of its own; got {text!r}; give --{name}={value}"
@@ -112,19 +130,37 @@ def device(constants: Iterable[str]) -> "Harvester":
             raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}") from None
         if unit:
             values[name] = units.with_unit(name, values[name], unit)
-    return with_constants(Harvester(), **values)
+    with about("set"):
+        return with_constants(Harvester(), **values)
+
+
+@contextmanager
+def about(option: str) -> Iterator[None]:
+    """Whatever is found wrong within names the option that it came by."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"--{option}: {error}") from None
+
+
+def part(option: str, text: str) -> float:
+    """A part of a whole, written 5% or 0.05."""
+    try:
+        return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        raise ValueError(f"{option} must be a part such as 5% or 0.05; got {text!r}") from None
 
 
 def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft") -> "tuple[ImpactPair, Harvester]":
     """The pair that the axes give, each by one number, and the device that has it."""
+    from vijax import checks
     from vijax.axes import cells
-    from vijax.model import impact_pair, with_constants, with_pair
+    from vijax.model import WALLS, impact_pair, with_constants, with_pair
 
     for name, values in axes.items():
         if values.size != 1:
             raise ValueError(f"{name} must be one number here; got {values.size} of them")
-    if wall not in ("soft", "rigid"):
-        raise ValueError(f'wall must be "soft" or "rigid"; got {wall!r}')
+    checks.choice("wall", wall, WALLS)
     given = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
     d, kappa, r, gamma, A, omega = (float(given[name]) for name in ("d", "kappa", "r", "gamma", "A", "omega"))
     device = with_constants(device, A=A, omega=omega, omega0=kappa * omega / math.pi)
@@ -142,19 +178,34 @@ def targets(
 ) -> tuple[Path | None, Path | None]:
     """Store and picture to write, both defaults where neither was given; raises unless they can be written.
 
-    With `goes_on` a store that is there is left to `study.check`, and its picture is drawn again.
+    With `goes_on` a store that is there is left to `study.check`, and its picture is drawn again if vijax drew it.
     """
-    from vijax.store import check_output
-
     if out is None and plot is None:
         out, plot = defaults
-    if out is not None and not out.endswith(ending):
-        raise ValueError(f"out must end in {ending}; got {out!r}")
-    overwrite = overwrite or (goes_on and out is not None and Path(out).exists())
-    return (
-        None if out is None else check_output("out", out, overwrite),
-        None if plot is None else check_output("plot", plot, overwrite),
-    )
+    store = None if out is None else _store(out, ending, overwrite, goes_on)
+    again = goes_on and not overwrite and store is not None and store.exists()
+    return store, None if plot is None else _picture(plot, overwrite, again)
+
+
+def _store(out: str, ending: str, overwrite: bool, goes_on: bool) -> Path:
+    from vijax.files import check_ending, check_output
+    from vijax.store import check_place, check_store
+
+    if ending != ".zarr":
+        check_ending("out", out, ending)
+        return check_output("out", out, overwrite)
+    place = check_place("out", out)
+    return place if goes_on and not overwrite and place.exists() else check_store("out", out, overwrite)
+
+
+def _picture(plot: str, overwrite: bool, again: bool) -> Path:
+    from vijax.files import check_output
+    from vijax.style import is_drawn
+
+    picture = check_output("plot", plot, overwrite or again)
+    if again and picture.exists() and not is_drawn(picture):
+        raise FileExistsError(f"plot must be new or a picture drawn by vijax; got {plot}; take another name")
+    return picture
 
 
 @contextmanager
@@ -316,6 +367,9 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show must not end a finished run
     try:
         with _warnings_told():
             command.main(arguments, standalone_mode=False)

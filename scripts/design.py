@@ -55,6 +55,7 @@ def _options() -> list[click.Parameter]:
         *command.axis_options(**changed),
         *command.device_options(),
         *command.file_options(".json", "report"),
+        command.size_option(),
     ]
 
 
@@ -76,12 +77,13 @@ def design(
     out: str | None,
     plot: str | None,
     overwrite: bool,
+    yes: bool,
     **given: Any,
 ) -> None:
     """Find the membrane, and what else is tuned, that harvests most and can be built."""
     from vijax import blueprint, report
     from vijax import design as designs
-    from vijax.store import write_json
+    from vijax.files import write_json
     from vijax.style import check_format
 
     with command.door():
@@ -94,8 +96,8 @@ def design(
         within = _bounds(bounds)
         weighed = scatter if objective in _OVER_TOLERANCES else ()
         designs.check(devices, names, within, objective, weighed)
-        designs.effort(steps, balls, impacts)
-    command.keep_compiled()
+        command.keep_compiled()
+        command.agree(designs.expected(len(devices), designs.effort(steps, balls, impacts)), yes)
     stages = _STAGES if along is None else 2
     with command.progress(stages, "stages") as show:
         command.waiting("survey and ascents, compiled at first")
@@ -145,10 +147,11 @@ def _devices(
     if not sign or name not in AXES or name in ("u0", "v0"):
         raise ValueError(f"over must be NAME=VALUES, as in d=0.05:0.3:64; got {over!r}")
     if name in axes:
-        raise ValueError(f"{name} must not be given twice; got it as the axis of designs and as another")
+        raise ValueError(f"over must name an axis that is not given besides; got {name}, also given by --{name}")
     if constant(name) in map(constant, names):
         raise ValueError(f"over must name what is not tuned; got {name}, with {', '.join(names)} tuned")
-    values = np.atleast_1d(parse_axis(name, text))
+    with command.about("over"):
+        values = np.atleast_1d(parse_axis(name, text))
     return (name, values), [command.at_one_point({**axes, name: value}, device)[1] for value in values]
 
 
@@ -162,7 +165,8 @@ def _bounds(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
         name, sign, pair = text.partition("=")
         if not sign or name not in NAMES or pair.count(":") != 1:
             raise ValueError(f"bounds must be NAME=LO:HI of a tuned quantity, as in omega0=20:400; got {text!r}")
-        low, high = parse_axis(name, pair.replace(":", ","))
+        with command.about("bounds"):
+            low, high = parse_axis(name, pair.replace(":", ","))
         found[name] = (float(low), float(high))
     return found
 
@@ -175,13 +179,11 @@ def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
     for text in (item.strip() for several in texts for item in several.split(",")):
         name, _, rest = text.partition("=")
         spread, _, kind = rest.partition(":")
-        try:
-            value = float(spread.removesuffix("%")) / (100 if spread.endswith("%") else 1)
-        except ValueError:
-            raise ValueError(f"tolerance must be NAME=5%, with :lognormal or not; got {text!r}") from None
-        found.append(Tolerance(name, value, kind or "uniform"))
-    check_tolerances(tuple(found), bounded=False)
-    return tuple(found)
+        if not name or not spread:
+            raise ValueError(f"tolerance must be NAME=5%, with :lognormal or not; got {text!r}")
+        found.append(Tolerance(name, command.part("tolerance", spread), kind or "uniform"))
+    with command.about("tolerance"):
+        return check_tolerances(found)
 
 
 def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":

@@ -5,7 +5,7 @@
     python scripts/grid.py --omega pi:6pi:96 --omega0 20:400:96 --plot device.png
     python scripts/grid.py --show label --plot labels.png
     python scripts/grid.py --show max_penetration --plot depth.png
-    python scripts/grid.py --kappa 3:4000:128:log --compare rigid --tolerance 0.05
+    python scripts/grid.py --kappa 3:4000:128:log --compare rigid --tolerance 5%
 
 An axis is a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE; arrays become dimensions in the order given: x, y and
 panels of the picture. Write a range that begins with a minus as --u0=-0.1:0.1:9.
@@ -51,7 +51,7 @@ def _options() -> list[click.Parameter]:
         click.Option(["--transient"], default=0, show_default=True, help="forcing periods to drop first"),
         click.Option(["--wall"], default="soft", show_default=True, help="soft or rigid"),
         click.Option(["--compare"], metavar="rigid", help="map what rigid walls change instead: P and the label"),
-        click.Option(["--tolerance"], type=float, help="with --compare: part of P that they may change"),
+        click.Option(["--tolerance"], metavar="5%", help="with --compare: part of P that they may change"),
         click.Option(["--method"], default="exact", show_default=True, help="exact, ode or rk4"),
         click.Option(["--solver"], help="of ode: Tsit5, Dopri5, Dopri8, Kvaerno5 ... [Tsit5]"),
         click.Option(["--rtol"], type=float, help="of ode: relative tolerance of a step [1e-8]"),
@@ -76,6 +76,7 @@ def _options() -> list[click.Parameter]:
         *command.file_options(),
         click.Option(["--workers"], type=int, help="processes that share the cores and write the store, by Dask"),
         click.Option(["--scheduler"], metavar="ADDRESS", help="of Dask: its workers, which see the store, write it"),
+        command.size_option(),
     ]
 
 
@@ -90,11 +91,12 @@ def power_map(
     constants: tuple[str, ...],
     outputs: str | None,
     compare: str | None,
-    tolerance: float | None,
+    tolerance: str | None,
     show: str,
     overwrite: bool,
     workers: int | None,
     scheduler: str | None,
+    yes: bool,
     **given: Any,
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
@@ -105,7 +107,7 @@ def power_map(
         out, plot = command.targets(given.pop("out"), given.pop("plot"), files, overwrite, goes_on=compare is None)
         axes, device = command.take_axes(given, _DEFAULT_PLANE), command.device(constants)
         if compare is None and tolerance is not None:
-            raise ValueError(f"tolerance must come with compare; got {tolerance:g} alone; add --compare rigid")
+            raise ValueError(f"tolerance must come with compare; got {tolerance} alone; add --compare rigid")
         planned: Plan | Comparison
         if compare is None:
             planned = _plan(axes, device, _wanted(outputs, show), given)
@@ -114,9 +116,9 @@ def power_map(
         if plot is not None:
             _check_picture(plot, planned, show)
         crew = _crew(planned, workers, scheduler, out)
-        if compare is None and out is not None:
-            _check_store(planned, out, overwrite)
-    keep_compiled()
+        _check_room(planned, out, overwrite)
+        keep_compiled()
+        _agree(planned, yes)
     if plot is not None:
         command.import_beside("vijax.plot")
     dataset, pace = _run(planned, out, overwrite, crew)
@@ -143,10 +145,24 @@ def _crew(
     return crew
 
 
-def _check_store(planned: Any, out: Path, overwrite: bool) -> None:
+def _check_room(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> None:
     from vijax import grid
+    from vijax.compare import Comparison
 
-    grid.check(planned, out, overwrite)
+    if isinstance(planned, Comparison):
+        grid.check_room(planned.soft)
+    elif out is None:
+        grid.check_room(planned)
+    else:
+        grid.check(planned, out, overwrite)
+
+
+def _agree(planned: "Plan | Comparison", yes: bool) -> None:
+    from vijax import estimate
+    from vijax.compare import Comparison
+
+    plans = (planned.soft, planned.rigid) if isinstance(planned, Comparison) else (planned,)
+    command.agree(estimate.of(*plans), yes)
 
 
 def _check_show(show: str, compare: str | None, until: str) -> None:
@@ -181,7 +197,7 @@ def _comparison(
     device: Any,
     outputs: str | None,
     other: str,
-    tolerance: float | None,
+    tolerance: str | None,
     settings: dict[str, Any],
 ) -> "Comparison":
     from vijax.compare import plan
@@ -197,7 +213,7 @@ def _comparison(
     for name in _METHOD_OPTIONS:
         if (value := settings.pop(name)) not in (None, "exact"):
             raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
-    return plan(axes, tolerance, device, **settings)
+    return plan(axes, None if tolerance is None else command.part("tolerance", tolerance), device, **settings)
 
 
 def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:

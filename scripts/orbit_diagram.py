@@ -43,6 +43,7 @@ def _options() -> list[click.Parameter]:
             ["--quantity"], default="v_in", show_default=True, help="what the picture shows: v_in, E, phase ..."
         ),
         *command.file_options(),
+        command.size_option(),
     ]
 
 
@@ -54,6 +55,7 @@ def orbit_diagram(
     out: str | None,
     plot: str | None,
     overwrite: bool,
+    yes: bool,
     **given: Any,
 ) -> None:
     """Draw the impacts of attractors along an axis, each point starting where the last one ended.
@@ -72,7 +74,8 @@ def orbit_diagram(
             chart.check_quantity(quantity)
             chart.check_layout(diagram.along, diagram.dims)
             check_format(picture)
-    command.keep_compiled()
+        command.keep_compiled()
+        command.agree(diagram.expected, yes)
     began = time.perf_counter()
     dataset = _run(diagram)
     seconds = time.perf_counter() - began
@@ -90,7 +93,11 @@ def _plan(along: str, axes: dict[str, Any], device: Any, settings: dict[str, Any
     name, sign, text = along.partition("=")
     if not sign or name not in AXES:
         raise ValueError(f"along must be AXIS=VALUES, as in {_DEFAULT_ALONG}; got {along!r}")
-    return plan(name, parse_axis(name, text), axes, device, **settings)
+    with command.about("along"):
+        values = parse_axis(name, text)
+    if not values.ndim:
+        raise ValueError(f"along must have several values, as in {_DEFAULT_ALONG}; got {along!r}")
+    return plan(name, values, axes, device, **settings)
 
 
 def _run(diagram: "Diagram") -> "xr.Dataset":

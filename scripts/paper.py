@@ -55,7 +55,7 @@ def _numbers(text: str) -> list[int]:
 
 
 def _target(folder: str, name: str, overwrite: bool) -> Path:
-    from vijax.store import check_output
+    from vijax.files import check_output
 
     return check_output("into", Path(folder) / name, overwrite)
 
@@ -73,12 +73,14 @@ def _draw(number: int, file: Path) -> None:
 
 def _check(file: Path) -> None:
     from vijax import claims
+    from vijax.files import replacing
 
     rows = []
     for claim in claims.CLAIMS.values():
         rows.append((claim, claim.check()))
         click.echo(claims.line(*rows[-1]))
-    file.write_text(claims.markdown(rows), encoding="utf-8")
+    with replacing(file) as part:
+        part.write_text(claims.markdown(rows), encoding="utf-8")
     click.echo(f"wrote {file}")
 
 

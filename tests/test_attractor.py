@@ -163,7 +163,7 @@ def test_a_plane_covers_the_widest_gap_unless_told():
         (lambda: basins(d=0.2, periods=0), "periods must be"),
         (lambda: basin_fractions(d=0.2, u0=0.1), "u0 must be left out where starts are drawn"),
         (lambda: basin_fractions(d=0.2, starts=0), "starts must be a whole number of at least 1"),
-        (lambda: basin_fractions(d=0.2, speed=0.0), "speed must be positive"),
+        (lambda: basin_fractions(d=0.2, speed=0.0), "speed must be a positive finite number"),
         (lambda: basin_fractions(d=0.2, colour=1), "there is no axis 'colour'"),
     ],
 )

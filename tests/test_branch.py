@@ -104,11 +104,11 @@ def test_the_dataset_and_its_picture(family, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"along": "omega0"}, "a rigid wall has none"),
-        ({"along": "u0"}, "along must be one of d, kappa"),
-        ({"along": "kappa"}, "a rigid wall has none"),
-        ({"within": (0.3, 0.1)}, "within must be two bounds"),
-        ({"within": (0.1,)}, "within must be two bounds"),
+        ({"along": "omega0"}, "a rigid wall has no kappa or omega0 or k"),
+        ({"along": "u0"}, "along must be among d, r, gamma"),
+        ({"along": "kappa"}, "a rigid wall has no kappa"),
+        ({"within": (0.3, 0.1)}, "within must be two finite bounds"),
+        ({"within": (0.1,)}, "within must be two finite bounds"),
         ({"points": 1}, "points must be a whole number"),
         ({"within": (0.25, 0.3)}, "within must hold the start"),
         ({"direction": "sideways"}, "direction must be"),

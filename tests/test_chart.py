@@ -75,7 +75,7 @@ def test_energies_are_drawn_over_decades_and_speeds_are_not():
 @pytest.mark.parametrize(
     ("call", "say"),
     [
-        (lambda path: chart.orbit_diagram(drawn(), path, "speed"), "quantity must be one of v_in"),
+        (lambda path: chart.orbit_diagram(drawn(), path, "speed"), "quantity must be among v_in"),
         (lambda path: chart.orbit_diagram(drawn(kappa=range(1, 20)), path), "at most 10 values of kappa"),
         (lambda path: chart.orbit_diagram(drawn(), path.with_suffix(".txt")), "plot must end in"),
         (lambda path: chart.check_layout("d", {"direction": 2, "d": 9, "r": 2, "kappa": 3}), "besides d; got r, kappa"),

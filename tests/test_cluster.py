@@ -1,11 +1,14 @@
 """Planes on the workers of a cluster: what a task is, lost workers and drivers, what is refused at the door."""
 
 import itertools
+import logging
 import os
 import pickle
 import signal
 import socket
+import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -81,6 +84,33 @@ def test_tasks_are_taken_as_they_are_needed(scheduler):
     done = cluster.done(abs, itertools.count(), scheduler)
     assert len(set(itertools.islice(done, 20))) == 20
     done.close()
+
+
+SCHEDULER = """
+import sys
+import distributed
+options = {"processes": False, "dashboard_address": None, "protocol": "tcp"}
+with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **options) as made:
+    print(made.scheduler_address, flush=True)
+    input()
+"""
+
+
+@pytest.mark.parametrize("seconds", [0, 1])
+def test_a_scheduler_that_is_lost_is_one_line(capfd, seconds):
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    with subprocess.Popen([sys.executable, "-c", SCHEDULER], **pipes) as process:
+        try:
+            done = cluster.done(abs, itertools.count(), process.stdout.readline().strip())
+            assert next(done) >= 0
+            process.kill()
+            time.sleep(seconds)  # in which the client may give up by itself
+            with pytest.raises(ConnectionError, match="the scheduler was lost"):
+                list(done)
+        finally:
+            process.kill()
+    assert capfd.readouterr().err == ""
+    assert not any(logging.getLogger(name).filters for name in ("distributed.client", "distributed.batched"))
 
 
 # --- a tile that outlives its driver ---------------------------------------------------------------------------------

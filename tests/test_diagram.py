@@ -187,12 +187,12 @@ def test_progress_is_told():
 @pytest.mark.parametrize(
     ("changed", "say"),
     [
-        ({"along": "u0"}, "along must be one of d, kappa"),
-        ({"along": "x"}, "along must be one of d, kappa"),
+        ({"along": "u0"}, "along must be among d, kappa"),
+        ({"along": "x"}, "along must be among d, kappa"),
         ({"d": 0.2}, "d must not be given twice"),
         ({"s": 0.2}, "d and s give the same quantity"),
         ({"values": 0.2}, "values must be a 1-D array of d; got 0.2"),
-        ({"values": [0.2, -0.1]}, "d must be positive"),
+        ({"values": [0.2, -0.1]}, "values must be positive .* at index 1; it is the gap"),
         ({"periods": 0}, "periods must be a whole number of at least 1"),
         ({"keep": 30, "periods": 20}, "keep must be at most periods; got 30 of 20"),
         ({"direction": "left"}, 'direction must be "down" or "up" or "both"'),

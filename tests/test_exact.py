@@ -23,6 +23,7 @@ from helpers import (
     start,
 )
 
+from vijax import exact, flow
 from vijax.model import State
 
 CASES = reference_trajectories()
@@ -356,3 +357,38 @@ def test_extrema_near_a_wall_fall_on_the_right_side(build):
     assert len(extrema.height) == 4 * TILE
     assert np.abs(extrema.height).min() < 1e-13
     assert extrema.wrong() == 0
+
+
+def test_turning_points_are_those_of_a_dense_scan():
+    # Contacts that end where they would and others that go on, below zero too: what an orbit's equations may ask about.
+    rng = np.random.default_rng(37)
+    r, gamma = rng.uniform(0.05, 0.97, TILE), rng.uniform(-1.2, 1.2, TILE)
+    side, t, speed = rng.choice([-1.0, 1.0], TILE), rng.uniform(0, 2, TILE), 10.0 ** rng.uniform(-4, 0, TILE)
+    length = rng.uniform(0.1, 6, TILE)
+    kappa = np.minimum(10.0 ** rng.uniform(-0.3, 3.5, TILE), 250 / length)
+
+    @jax.jit
+    @jax.vmap
+    def turns(pair, side, t, speed, length):
+        wall, force = flow.membrane(pair), flow.contact_force(pair.gamma, side, t)
+        return exact.turning_points(wall, force, 0 * t, speed, length > 0, length=length)
+
+    got = jax.tree.map(np.asarray, turns(pairs(np.ones(TILE), kappa, r, gamma), side, t, speed, length))
+    s = length * np.linspace(0, 1, 8192)[:, None] ** 2  # a slow impact turns at once
+    w = long_contact(kappa, r, gamma, side, t, 0.0, speed, s)[0].astype(float)
+    tops, bottoms = (way * np.where(_tops(way * w), way * w[1:-1], -np.inf).max(axis=0) for way in (1, -1))
+    scale = np.abs(w).max(axis=0)
+    assert not got.lost.any()
+    assert (np.isfinite(tops) & np.isfinite(bottoms)).sum() > TILE // 3
+    # The scan's own peaks are off by the square of its spacing, and at the ends it has none.
+    for mine, when, wanted in ((got.highest, got.crest, tops), (got.lowest, got.trough, bottoms)):
+        there = np.isfinite(wanted)
+        assert (when[there] > 0).all()
+        assert np.max(np.abs(mine[there] - wanted[there]) / scale[there]) < 1e-3
+        unseen = ~there & (when > 0)
+        assert np.max(np.minimum(when, length - when)[unseen] / length[unseen], initial=0) < 4 / len(s)
+
+
+def _tops(w):
+    """Which inner samples along the first axis stand above their neighbours."""
+    return (w[1:-1] > w[:-2]) & (w[1:-1] >= w[2:])

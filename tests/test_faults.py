@@ -20,8 +20,9 @@ import pytest
 import xarray as xr
 from helpers import SCRIPTS, stand_in
 
-from vijax import calls, simulate, store, study
+from vijax import calls, files, grid, plot, simulate, study
 from vijax.grid import load, sweep
+from vijax.style import is_drawn
 
 AXES = {"d": np.linspace(0.1, 0.3, 8), "kappa": np.geomspace(3, 400, 6)}
 ARGUMENTS = ["--d", "0.1:0.3:8", "--kappa", "3:400:6:log", "--out", "map.zarr"]
@@ -139,14 +140,14 @@ def test_a_full_disk_is_one_line_and_what_is_done_stays(folder, capsys, monkeypa
     def write_json(report, path):
         if path.name == "3.json":
             raise full
-        store.write_json(report, path)
+        files.write_json(report, path)
 
     def _files(path, dims, place):
         if place == {"d": 1, "kappa": 1}:  # of tile 3
             raise full
-        return files(path, dims, place)
+        return chunks(path, dims, place)
 
-    files = study._files
+    chunks = study._files
     with monkeypatch.context() as disk:
         disk.setattr(*((study, "write_json", write_json) if at == "record" else (study, "_files", _files)))
         script.main(ARGUMENTS)
@@ -192,11 +193,25 @@ def exchange(chunk):
     chunk.write_bytes((chunk.parent.parent / "0" / "0").read_bytes())
 
 
+def pipe(chunk):
+    """What takes for ever to read."""
+    chunk.unlink()
+    os.mkfifo(chunk)
+
+
+def device(chunk):
+    """What never ends."""
+    chunk.unlink()
+    chunk.symlink_to("/dev/zero")
+
+
 DAMAGES = {
     truncate: "P/c/2/1 is not what was written",
     flip: "P/c/2/1 is not what was written",
     exchange: "P/c/2/1 is not what was written",
     Path.unlink: "P/c/2/1 is missing",
+    pipe: "P/c/2/1 is no regular file",
+    device: "P/c/2/1 is no regular file",
 }
 
 
@@ -205,6 +220,8 @@ def test_a_damaged_chunk_is_run_again(folder, caplog, damage):
     sweep(**AXES, out="map.zarr")
     before = study_records(folder)
     damage(folder / "map.zarr" / "P" / "c" / "2" / "1")
+    with pytest.raises(ValueError, match=f"where {DAMAGES[damage]}; run again, the call that made it mends it"):
+        load("map.zarr")
     with caplog.at_level(logging.WARNING):
         found = sweep(**AXES, out="map.zarr")
     assert [record.getMessage() for record in caplog.records] == [f"tile 5 of map.zarr is run again: {DAMAGES[damage]}"]
@@ -212,3 +229,64 @@ def test_a_damaged_chunk_is_run_again(folder, caplog, damage):
     assert [name for name in before if again[name] != before[name]] == ["5.json"]
     is_undisturbed("map.zarr")
     xr.testing.assert_identical(found.load(), load("map.zarr"))
+
+
+# --- what is not the run's own ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["map.png", "map.pdf", "map.svg", "map.eps"])
+def test_a_picture_is_drawn_again_unless_it_is_somebody_elses(folder, capsys, name):
+    assert script.main([*ARGUMENTS, "--plot", name]) == 0
+    drawn = (folder / name).read_bytes()
+    assert script.main([*ARGUMENTS, "--plot", name]) == 0
+    for foreign in (drawn.replace(b"vijax", b"dream"), b"precious"):
+        (folder / name).write_bytes(foreign)
+        capsys.readouterr()
+        assert script.main([*ARGUMENTS, "--plot", name]) == 2
+        said = f"error: plot must be new or a picture drawn by vijax; got {name}; take another name\n"
+        assert capsys.readouterr().err == said
+        assert (folder / name).read_bytes() == foreign
+    assert script.main([*ARGUMENTS, "--plot", name, "--overwrite"]) == 0
+    assert is_drawn(folder / name)
+
+
+@pytest.mark.parametrize("option", ["--out", "--plot"])
+def test_a_folder_of_somebody_else_is_not_overwritten(folder, capsys, option):
+    name = "map.zarr" if option == "--out" else "map.png"
+    (folder / name).mkdir()
+    for file in ("zarr.json", "thesis.tex"):
+        (folder / name / file).write_text("{}")
+    assert script.main([option, name, "--overwrite"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {option[2:]} must not replace")
+    assert said.count("\n") == 1
+    assert (folder / name / "thesis.tex").exists()
+
+
+def test_a_picture_never_replaces_a_folder(folder):
+    grid.save(sweep(**AXES), "map.zarr")
+    (folder / "map.png").mkdir()
+    (folder / "map.png" / "thesis.tex").write_text("precious")
+    with pytest.raises(IsADirectoryError):
+        plot.power_map(load("map.zarr"), "map.png")
+    assert [path.name for path in (folder / "map.png").iterdir()] == ["thesis.tex"]
+
+
+def test_what_a_killed_run_left_beside_a_picture_is_cleared_away(folder, capsys, caplog):
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+    left = folder / f".map.{process.pid}.part.png"
+    left.write_text("half")
+    assert script.main([*ARGUMENTS, "--plot", "map.png"]) == 0
+    assert [said.getMessage() for said in caplog.records] == [f"{left.name}, which a killed run had left, is removed"]
+    assert {path.name for path in folder.iterdir()} == {"map.zarr", "map.png"}
+
+
+@pytest.mark.parametrize("coding", ["latin-1", "ascii", "utf-8"])
+def test_a_terminal_that_cannot_show_a_name_ends_no_run(folder, monkeypatch, coding):
+    name = "\u03ba\udcff.zarr"  # a Greek letter, and a byte that is no letter
+    with open("told.txt", "w", encoding=coding) as terminal:
+        monkeypatch.setattr(sys, "stdout", terminal)
+        assert script.main([*ARGUMENTS[:-1], name]) == 0
+    assert b".zarr\n" in (folder / "told.txt").read_bytes()
+    is_undisturbed(name)

@@ -123,7 +123,7 @@ def test_the_path_is_the_motion():
     ("call", "message"),
     [
         (lambda p: orbits.search(p, "RXL"), "impacts must be walls"),
-        (lambda p: orbits.search(p, "0:0"), "impacts must be walls"),
+        (lambda p: orbits.search(p, "0:0"), "impacts must be 1 to 64"),
         (lambda p: orbits.search(p, "1:2/2T", 3), "period must agree"),
         (lambda p: orbits.search(p, "1:1/0T"), "impacts must be walls"),
         (lambda p: orbits.search(p, "RL", 1.5), "period must be a whole number"),

@@ -442,7 +442,7 @@ def test_few_admissible_cells_do_not_choose_the_colours():
 
 
 def test_a_map_without_what_is_asked_for_says_what_draws_the_others():
-    with pytest.raises(ValueError, match=r"plot must have P, .* without P; variable_map \(--show NAME\) draws any"):
+    with pytest.raises(ValueError, match=r"dataset must hold P, .* without P; variable_map \(--show NAME\) draws any"):
         plot.power_map(held_map().drop_vars("P"))
-    with pytest.raises(ValueError, match="plot must have lyapunov; got a map without lyapunov"):
+    with pytest.raises(ValueError, match=r"name must be among P, .* got 'lyapunov'"):
         plot.variable_map(held_map(), "lyapunov")

@@ -1,6 +1,8 @@
 """Steady states: values and gradients of 50-digit orbits, second derivatives, and NaN where none can be meant."""
 
 import dataclasses
+import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -131,3 +133,29 @@ def test_a_record_prints_its_status_by_name_and_what_to_do():
     assert f"'OK': {len(found)}" in repr(found)
     assert "status=" in repr(jax.eval_shape(lambda: state))
     assert all(status.advice for status in Status)
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """Period-1 orbits that end a chatter pressed on a wall, through a contact of many turning points."""
+    rows = json.loads((Path(__file__).parent / "data" / "long_contacts.json").read_text())
+    width = 16
+    pair = impact_pair(*(np.array([row[name] for row in rows]) for name in ("d", "kappa", "r", "gamma")))
+    side, knots = np.zeros((len(rows), width), np.int32), np.zeros((len(rows), width, 3))
+    for index, row in enumerate(rows):
+        side[index, : len(row["side"])], knots[index, : len(row["side"])] = row["side"], row["knots"]
+    sequence = Sequence(jnp.asarray(side), jnp.full(len(rows), 2.0, float), jnp.zeros(len(rows), bool))
+    return pair, sequence, jnp.asarray(knots)
+
+
+@pytest.mark.parametrize("off", [1.0, 1.05])
+def test_a_pressed_contact_is_what_the_impact_map_flies(pressed, off):
+    pair, sequence, knots = pressed
+    pair = dataclasses.replace(pair, d=off * pair.d)
+    flown = orbits.solve(pair, sequence, knots)
+    state = jax.jit(jax.vmap(lambda orbit: steady(DEVICE, orbit, pair=orbit.pair)))(flown)
+    # Off its place one of them would meet the wall twice more: that is no orbit, whatever its equations say.
+    np.testing.assert_array_equal(state.status, flown.status)
+    assert (np.asarray(flown.status) == Status.VIRTUAL).sum() == (off != 1.0)
+    good = np.asarray(flown.status) == Status.OK
+    np.testing.assert_allclose(state.P[good], orbits.power(flown, DEVICE)[good], rtol=1e-12)

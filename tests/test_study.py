@@ -2,6 +2,8 @@
 
 import json
 import logging
+import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -15,11 +17,12 @@ import xarray as xr
 import zarr
 from helpers import SETTINGS, stand_in
 
-from vijax import grid, simulate, study
+from vijax import dataset, grid, simulate, study
 from vijax.grid import load, sweep
 from vijax.model import Harvester, Status
 
 AXES = {"d": np.linspace(0.1, 0.3, 5), "kappa": np.geomspace(3, 400, 4)}
+FEW = AXES | {"outputs": ["P"]}
 MOST = 6  # cells of a tile, here
 
 
@@ -210,12 +213,63 @@ def test_a_store_that_was_saved_whole_does_not_go_on(calls, out):
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_what_is_no_store_stays(calls, out, overwrite):
-    out.mkdir()
-    (out / "thesis").write_text("precious")
-    with pytest.raises(FileExistsError, match="out must not"):
+@pytest.mark.parametrize(
+    "beside", ["", "{}", '{"attributes": {"source": "vijax 0.1.0"}}'], ids=["alone", "zarr", "ours"]
+)
+def test_what_vijax_did_not_write_stays(calls, out, overwrite, beside):
+    (out / "chapters").mkdir(parents=True)
+    thesis = out / "chapters" / "thesis.tex"
+    thesis.write_text("precious")
+    if beside:
+        (out / "zarr.json").write_text(beside)
+    with pytest.raises((FileExistsError, ValueError), match=r"thesis.tex; move it" if overwrite else "must"):
         sweep(**AXES, out=out, overwrite=overwrite)
-    assert (out / "thesis").read_text() == "precious"
+    assert thesis.read_text() == "precious"
+
+
+STRANGERS = ["thesis.tex", "P/notes.txt", "P/c/0/x", "status/tiles/mine.json", "mine/zarr.json", "mine/c/0"]
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+@pytest.mark.parametrize("whole", [False, True], ids=["study", "saved"])
+def test_a_foreign_file_within_a_store_keeps_it(calls, out, name, whole):
+    grid.save(sweep(**FEW), out) if whole else sweep(**FEW, out=out)
+    (out / name).parent.mkdir(parents=True, exist_ok=True)
+    (out / name).write_text("precious")
+    with pytest.raises(FileExistsError, match=f"which holds {name}; move it elsewhere") as error:
+        sweep(**AXES, out=out, overwrite=True)
+    assert "\n" not in str(error.value)
+    with pytest.raises(FileExistsError, match="path must not replace what vijax did not write"):
+        grid.save(sweep(**AXES), out, overwrite=True)
+    assert (out / name).read_text() == "precious"
+
+
+def test_a_store_of_somebody_else_stays(calls, out):
+    xr.Dataset({"P": ("d", np.arange(3.0))}).to_zarr(out, consolidated=False)
+    for overwrite in (False, True):
+        with pytest.raises(FileExistsError, match=r"out must not .*map\.zarr"):
+            sweep(**AXES, out=out, overwrite=overwrite)
+    assert xr.open_zarr(out, consolidated=False)["P"].size == 3
+
+
+def test_a_link_goes_on_pointing_where_it_does(calls, out):
+    place = out.with_name("disk.zarr")
+    sweep(**AXES, out=place)
+    out.symlink_to(place.name)
+    sweep(**AXES, r=0.4, out=out, overwrite=True)
+    assert out.is_symlink()
+    xr.testing.assert_identical(load(place), sweep(**AXES, r=0.4))
+    assert {path.name for path in out.parent.iterdir()} == {"map.zarr", "disk.zarr"}
+
+
+@pytest.mark.parametrize("name", ["map.nc", "map", "map.zarr.json"])
+def test_a_store_ends_in_zarr(calls, tmp_path, name):
+    for overwrite in (False, True):
+        with pytest.raises(ValueError, match=f"out must end in .zarr; got '.*{name}'"):
+            sweep(**AXES, out=tmp_path / name, overwrite=overwrite)
+    with pytest.raises(ValueError, match=f"path must end in .zarr; got '.*{name}'"):
+        grid.save(sweep(**AXES), tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -286,13 +340,17 @@ def test_quantities_are_taken_cell_by_cell(calls, out):
     xr.testing.assert_identical(sweep(**axes, out=out).load(), sweep(**axes))
 
 
-def test_files_of_a_killed_process_are_cleared(calls, out):
+def test_files_of_a_killed_process_are_cleared_and_no_others(calls, out):
     stopped_after(8, out, **AXES)
-    left = [out / "P" / "c" / "0" / "1.abc.partial", out / "status" / "tiles" / ".3.99.part.json"]
-    for path in left:
+    left = [out / "P" / "c" / "0" / ".1.99.part", out / "status" / "tiles" / ".3.99.part.json"]
+    others = [out / "notes.part1.txt", out / "P" / "c" / ".notes.99.part", out / "x.part" / "thesis.tex"]
+    others[-1].parent.mkdir()
+    for path in (*left, *others):
         path.write_text("half")
     sweep(**AXES, out=out)
     assert not any(path.exists() for path in left)
+    assert all(path.read_text() == "half" for path in others)
+    xr.testing.assert_identical(load(out), sweep(**AXES))
 
 
 def test_what_is_run_again_is_said(calls, out, caplog):
@@ -303,6 +361,232 @@ def test_what_is_run_again_is_said(calls, out, caplog):
     assert [record.getMessage() for record in caplog.records] == [
         f"tile 0 of {out} is run again: its record cannot be read"
     ]
+
+
+@pytest.mark.parametrize("files", [5, [], {"P/c/0/0": 5}], ids=str)
+def test_a_record_of_nonsense_is_written_again(calls, out, files):
+    whole = sweep(**FEW, out=out).load()
+    change(files=files)(records(out)[0])
+    with pytest.raises(ValueError, match=r"where (P/c/0/0|status/tiles/0.json) (is not what|cannot be)"):
+        load(out)
+    xr.testing.assert_identical(sweep(**FEW, out=out).load(), whole)
+    assert json.loads(records(out)[0].read_text())["files"] != files
+
+
+# --- left by killed runs ---------------------------------------------------------------------------------------------
+
+
+def nobody() -> int:
+    """The number of a process that has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("kind", ["part", "old"])
+@pytest.mark.parametrize("who", [nobody, os.getpid], ids=["another", "as this one"])  # in containers numbers come again
+def test_what_a_killed_run_left_is_cleared_away(calls, out, caplog, kind, overwrite, who):
+    sweep(**AXES, out=out)
+    left = out.with_name(f".map.{who()}.{kind}.zarr")
+    left.mkdir()
+    (left / "zarr.json").write_text("{")
+    sweep(**AXES, out=out, overwrite=overwrite)
+    assert [said.getMessage() for said in caplog.records] == [f"{left.name}, which a killed run had left, is removed"]
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_what_a_killed_run_had_put_aside_is_back(calls, out, caplog):
+    whole = sweep(**AXES, out=out).load()
+    left = out.with_name(f".map.{nobody()}.old.zarr")
+    out.rename(left)
+    calls.clear()
+    xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
+    assert sum(calls) == 0
+    assert [said.getMessage() for said in caplog.records] == [
+        f"map.zarr, which a killed run had put aside as {left.name}, is back"
+    ]
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_what_a_living_run_is_at_stays(calls, out):
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        left = out.with_name(f".map.{process.pid}.part.zarr")
+        left.mkdir()
+        sweep(**AXES, out=out)
+        assert left.is_dir()
+        process.communicate(b"\n")
+
+
+# --- damage ----------------------------------------------------------------------------------------------------------
+
+
+def change(**entries):
+    """Other entries of a file of metadata."""
+
+    def edit(file):
+        file.write_text(json.dumps(json.loads(file.read_text()) | entries))
+
+    return edit
+
+
+def attribute(name, value):
+    """Another attribute in a file of metadata; none if the value is None."""
+
+    def edit(file):
+        content = json.loads(file.read_text())
+        content["attributes"] = {k: v for k, v in (content["attributes"] | {name: value}).items() if v is not None}
+        file.write_text(json.dumps(content))
+
+    return edit
+
+
+def exchange(file):
+    """The values of another coordinate, a sound chunk."""
+    file.write_bytes((file.parent.parent.parent / "kappa" / "c" / "0").read_bytes())
+
+
+BIG_ENDIAN = [{"name": "bytes", "configuration": {"endian": "big"}}, {"name": "zstd"}, {"name": "crc32c"}]
+EDITS = {
+    "data type": ("P/zarr.json", change(data_type="int64", fill_value=0)),
+    "byte order": ("P/zarr.json", change(codecs=BIG_ENDIAN)),
+    "no codec": ("P/zarr.json", change(codecs=[{"name": "bytes"}])),
+    "chunk shape": ("P/zarr.json", change(chunk_grid={"name": "regular", "configuration": {"chunk_shape": [2, 2]}})),
+    "scale": ("P/zarr.json", attribute("scale_factor", 2.0)),
+    "units": ("P/zarr.json", attribute("units", "mJ")),
+    "flags": ("status/zarr.json", attribute("flag_meanings", None)),
+    "a coordinate's units": ("kappa/zarr.json", attribute("units", "m")),
+    "a coordinate": ("d/c/0", exchange),
+    "a scalar coordinate": ("r/c", Path.unlink),
+    "a setting": ("zarr.json", attribute("periods", 50)),
+    "metadata kept together": ("zarr.json", change(consolidated_metadata=None)),
+    "the list": ("vijax.json", change(birth="another")),
+    "text": ("P/zarr.json", lambda file: file.write_bytes(b"\xff{")),
+    "no metadata": ("zarr.json", Path.unlink),
+    "a list": ("vijax.json", lambda file: file.write_text("[]")),
+}
+
+
+@pytest.mark.parametrize(("name", "edit"), EDITS.values(), ids=EDITS)
+def test_an_edit_is_noticed_and_mended(calls, out, caplog, name, edit):
+    whole = sweep(**FEW, out=out).load()
+    before = (out / name).read_bytes()
+    edit(out / name)
+    with pytest.raises(ValueError, match=f"where {name} is .*; run again, the call that made it mends it") as error:
+        load(out)
+    assert "\n" not in str(error.value)
+    with pytest.raises(FileExistsError, match=r"out must .*, where .*, allow overwriting|; allow overwriting") as error:
+        sweep(**FEW | {"d": np.linspace(0.1, 0.29, 5)}, r=0.4, periods=40, out=out)
+    assert "\n" not in str(error.value)
+    calls.clear()
+    xr.testing.assert_identical(sweep(**FEW, out=out).load(), whole)
+    xr.testing.assert_identical(load(out), whole)
+    assert (out / name).read_bytes() == before
+    assert sum(calls) == 0
+    assert [said.getMessage().partition(" is written again")[0] for said in caplog.records] == [f"{name} of {out}"]
+
+
+def test_metadata_are_mended_by_whatever_version(calls, out, monkeypatch):
+    whole = sweep(**FEW, out=out).load()
+    monkeypatch.setattr(dataset, "made_by", lambda: {"source": "vijax 9"})
+    for name in ("zarr.json", "P/zarr.json"):
+        (out / name).unlink()
+    xr.testing.assert_identical(sweep(**FEW, out=out).load(), whole)
+
+
+def test_an_edit_of_a_saved_map_is_noticed(calls, out):
+    grid.save(sweep(**AXES), out)
+    (out / "P" / "c" / "0" / "0").unlink()
+    with pytest.raises(ValueError, match="where P/c/0/0 is missing; make it anew"):
+        load(out)
+
+
+def test_a_variable_that_is_gone_is_run_again(calls, out):
+    whole = sweep(**AXES, out=out).load()
+    shutil.rmtree(out / "P")
+    with pytest.raises(ValueError, match=r"where P/zarr.json is missing"):
+        load(out)
+    xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
+
+
+@pytest.mark.parametrize("damage", [lambda file: file.write_text("{}"), Path.unlink])
+def test_a_store_without_its_list_is_mended_as_far_as_its_metadata_tell(calls, out, caplog, damage):
+    whole = sweep(**FEW, out=out).load()
+    damage(out / "vijax.json")
+    attribute("units", "mJ")(out / "P" / "zarr.json")
+    calls.clear()
+    xr.testing.assert_identical(sweep(**FEW, out=out).load(), whole)
+    xr.testing.assert_identical(load(out), whole)
+    assert sum(calls) == 0
+    names = [said.getMessage().partition(f" of {out} is written again")[0] for said in caplog.records]
+    assert names == ["P/zarr.json", "vijax.json"]
+    damage(out / "vijax.json")
+    exchange(out / "d" / "c" / "0")
+    with pytest.raises(FileExistsError, match=r"where vijax.json .* tell whether d/c/0 is what was written; allow"):
+        sweep(**FEW, out=out)
+
+
+@pytest.mark.parametrize("damage", [lambda lock: lock.write_bytes(b"\xff\x00"), Path.unlink])
+def test_a_lock_that_is_lost_is_made_again(calls, out, damage):
+    whole = sweep(**AXES, out=out).load()
+    lock = out / "status" / "tiles" / "lock"
+    before = lock.read_bytes()
+    damage(lock)
+    calls.clear()
+    xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
+    assert sum(calls) == 0
+    assert lock.read_bytes() == before
+
+
+def test_a_folder_in_place_of_a_file_is_named_and_stays(calls, out):
+    sweep(**AXES, out=out)
+    for name in ("P/c/0/0", "P/zarr.json", "status/tiles/0.json", "status/tiles/lock"):
+        (out / name).rename(out / "kept")
+        (out / name).mkdir()
+        with pytest.raises(FileExistsError, match=f"{name} must be a file that vijax wrote; got a folder; remove it"):
+            sweep(**AXES, out=out)
+        (out / name).rmdir()
+        (out / "kept").rename(out / name)
+
+
+def as_before(out):
+    """Make a store what an earlier version wrote: no list, no metadata kept together, records by variable."""
+    (out / "vijax.json").unlink()
+    root = json.loads((out / "zarr.json").read_text())
+    del root["consolidated_metadata"]
+    (out / "zarr.json").write_text(json.dumps(root))
+    for record in records(out):
+        content = json.loads(record.read_text())
+        content["files"] = {name.partition("/")[0]: value for name, value in content["files"].items()}
+        record.write_text(json.dumps(content))
+
+
+def test_a_store_of_an_earlier_version_opens_and_goes_on(calls, out):
+    whole = sweep(**AXES)
+    stopped_after(8, out, **AXES)
+    as_before(out)
+    before, done = len(calls), len(records(out))
+    assert (load(out)["status"] == Status.NOT_RUN).any()
+    xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
+    assert len(calls) - before == len(records(out)) - done
+    for damage, say in (("{}", "path must name a store that can be read"), ("{", "where P/zarr.json cannot be read")):
+        (out / "P" / "zarr.json").write_text(damage)
+        with pytest.raises(ValueError, match=say) as error:
+            load(out)
+        assert "\n" not in str(error.value)
+    sweep(**AXES, out=out, overwrite=True)
+
+
+def test_a_store_opens_anywhere_without_a_warning(calls, out):
+    stopped_after(8, out, **AXES)
+    whole = sweep(**AXES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (xr.open_zarr(out)["status"] == Status.NOT_RUN).any()
+        sweep(**AXES, out=out)
+        xr.testing.assert_identical(xr.open_zarr(out, chunks=None).load(), whole)
+        grid.save(whole, out.with_name("saved.zarr"))
+        xr.testing.assert_identical(xr.open_zarr(out.with_name("saved.zarr"), chunks=None).load(), whole)
 
 
 # --- with the engine -------------------------------------------------------------------------------------------------

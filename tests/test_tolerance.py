@@ -53,9 +53,9 @@ def test_samples_are_drawn_alike_every_time():
 @pytest.mark.parametrize(
     ("tolerance", "bounded", "words"),
     [
-        (Tolerance("omega_0", 0.05), False, "tolerances must be those of"),
+        (Tolerance("omega_0", 0.05), False, "tolerances: name must be among"),
         (Tolerance("omega0", 0.0), False, "between 0 and 1"),
-        (Tolerance("omega0", 0.05, "normal"), False, "uniform or lognormal"),
+        (Tolerance("omega0", 0.05, "normal"), False, '"uniform" or "lognormal"'),
         (Tolerance("omega0", 0.05, "lognormal"), True, "worst case must be uniform"),
     ],
 )

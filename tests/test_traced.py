@@ -29,7 +29,7 @@ class Work:
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     place = tmp_path / "compiled"
-    monkeypatch.setattr(traced, "_folder", lambda: place)
+    monkeypatch.setattr(traced, "cache_folder", lambda: place)
     return place
 
 
@@ -62,7 +62,7 @@ def test_another_program_or_shape_is_another_one(folder, changed):
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
-    monkeypatch.setattr(traced, "_folder", lambda: tmp_path if kept else None)
+    monkeypatch.setattr(traced, "cache_folder", lambda: tmp_path if kept else None)
     program = traced.Program(lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop")
     compiled, ready = [], threading.Barrier(4)
 
@@ -106,7 +106,7 @@ def test_where_nothing_can_be_kept_it_is_traced_every_time(tmp_path, monkeypatch
     taken = tmp_path / "file"
     taken.touch()
     for place in (taken, None):
-        monkeypatch.setattr(traced, "_folder", lambda place=place: place)
+        monkeypatch.setattr(traced, "cache_folder", lambda place=place: place)
         assert called()[1] == called()[1] == 1
     assert taken.read_bytes() == b""
 
@@ -117,11 +117,11 @@ def test_the_folder_is_that_of_compiled_programs(tmp_path):
         for asked, kept, expected in ((str(tmp_path), True, tmp_path), (str(tmp_path), False, None)):
             jax.config.update("jax_compilation_cache_dir", asked)
             jax.config.update("jax_enable_compilation_cache", kept)
-            assert traced._folder() == expected
+            assert traced.cache_folder() == expected
         jax.config.update("jax_enable_compilation_cache", True)
         for asked in (None, "gs://bucket/compiled"):
             jax.config.update("jax_compilation_cache_dir", asked)
-            assert traced._folder() is None
+            assert traced.cache_folder() is None
     finally:
         for name, value in before.items():
             jax.config.update(name, value)

@@ -1,5 +1,6 @@
 """Derivatives of impacts against 50-digit differences, stroboscopic states, and errors at the door."""
 
+import math
 from functools import cache
 
 import jax
@@ -158,3 +159,20 @@ def test_bad_input_is_named(arguments, says):
     given = {"pair": ImpactPair(0.2, 40.0, 0.5, 0.0), "u0": 0.0, "v0": 0.3, "periods": 4} | arguments
     with pytest.raises(ValueError, match=says):
         vijax.trajectory(**given)
+
+
+RELEASED = math.acos(0.196) / math.pi  # where gravity of 0.196 is all that acts
+
+
+@pytest.mark.parametrize("kappa", [None, 3.0, math.pi * (1 - 1e-9), 40.0])
+def test_a_start_at_rest_on_a_wall_is_no_impact(kappa):
+    # Where the force is zero at the start, what it is about to do decides: 1e-16 of a period of flight is none.
+    phases = [0.0, 0.5, 1.0, 1.5, RELEASED, 2 - RELEASED]
+    gamma, t0, r, side = (x.ravel() for x in np.meshgrid([-1.0, -0.196, 0.0, 0.196, 1.0], phases, [0.5, 1.0], [-1, 1]))
+    some = (np.abs(gamma) < 1) | (r < 1)  # an elastic wall that holds the ball for ever is never left
+    gamma, t0, r, side = (x[some] for x in (gamma, t0, r, side))
+    pair = impact_pair(0.3, kappa, r, gamma)
+    hits = vijax.trajectory(pair, 0.15 * side, 0.0, periods=1, t0=t0, max_impacts=2).impacts
+    speed = np.abs(hits.v_in)
+    assert np.isfinite(speed).any()
+    assert not (speed < 1e-6).any()

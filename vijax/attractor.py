@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax import grid
-from vijax.axes import cells
+from vijax import checks, grid
+from vijax.axes import cells, check_axis
 from vijax.dataset import Plan
 from vijax.label import FAILED, label, ordered
-from vijax.method import whole
-from vijax.model import Harvester, Status
+from vijax.model import Harvester, Status, one_device
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,6 +25,7 @@ __all__ = ["basin_fractions", "basins", "label"]
 
 SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
 _START_POINTS = 256
+MOST_STARTS = 10**7  # of a cell
 # Invariants of polished orbits agree to 3e-11 from start to start on a dozen planes of 4096 starts, and differ between
 # attractors by 2e-2 and more. In single precision an orbit passes for one of twice its period: there is no `dtype`.
 _SAME = 1e-6
@@ -105,10 +105,9 @@ def plan_basins(
     """
     others = {name: values for name, values in axes.items() if values is not None and name not in ("u0", "v0")}
     u0, v0 = axes.get("u0"), axes.get("v0")
-    if v0 is None:
-        v0 = np.linspace(-SPEED, SPEED, _START_POINTS)
+    v0 = np.linspace(-SPEED, SPEED, _START_POINTS) if v0 is None else check_axis("v0", v0)
     if u0 is None:
-        gap = cells(others, Harvester() if device is None else device, "soft").quantities["d"].values.max()
+        gap = cells(others, one_device(device), "soft").quantities["d"].values.max()
         u0 = gap * _middles(max(np.size(v0), 2))
     return _plan({"u0": u0, "v0": v0} | others, device, merge_mirrors, settings)
 
@@ -176,15 +175,17 @@ def plan_fractions(
     """
     for name in ("u0", "v0"):
         if axes.get(name) is not None:
-            raise TypeError(f"{name} must be left out where starts are drawn; got {axes[name]!r}")
-    if not 0 < speed < np.inf:
-        raise ValueError(f"speed must be positive and finite; got {speed!r}")
-    place = spread(whole("starts", starts, 1), seed)
+            raise TypeError(f"{name} must be left out where starts are drawn; got {checks.shown(axes[name])}")
+    speed, seed = checks.positive("speed", speed), checks.seed(seed)
+    starts = checks.whole("starts", starts, 1, MOST_STARTS)
     planned = _plan(axes, device, merge_mirrors, settings)
+    check_starts(planned, starts)
+    place = spread(starts, seed)
     return started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
 
 
 def _plan(axes: Mapping[str, Any], device: Harvester | None, merge_mirrors: bool, settings: dict[str, Any]) -> Plan:
+    checks.flag("merge_mirrors", merge_mirrors)
     planned = grid.plan(
         axes, _OUTPUTS, device, until="attractor", transient=0, method="exact", dtype="float64", **settings
     )
@@ -212,6 +213,12 @@ def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
         points = np.random.default_rng(seed).random((2, count))
     first, second = points - 0.5
     return xr.Variable("start", first), xr.Variable("start", second)
+
+
+def check_starts(planned: Plan, starts: int) -> None:
+    """Raise ValueError unless a plan's cells fit in memory with so many starts each."""
+    names = ["starts", *(dim for dim, size in planned.cells.sizes.items() if size > 1)]
+    checks.fits(names, starts * planned.size, f"{planned.count:,} cells of {starts:,} starts")
 
 
 def started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:

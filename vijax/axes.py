@@ -3,6 +3,7 @@
 This is the door of `grid.sweep` and of the scripts: whatever can be wrong with an axis is found here.
 """
 
+import errno
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from vijax import units
+from vijax import checks, units
 from vijax.model import Harvester, check
 
 if TYPE_CHECKING:
@@ -48,6 +49,10 @@ START = (0.05853, -0.47898)
 _START_REACH = 0.49
 
 _FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
+_MOST_VALUES = 10**7  # of an axis: the largest planes have some 10^6 a side
+_MOST_CELLS = 10**12  # of a plane, whose store is then some 80 TB
+_BYTES = 8  # of a number
+_MOST_TEXT = 32 * _MOST_VALUES  # bytes of a file that holds them
 
 
 def parse_axis(name: str, text: str) -> np.ndarray:
@@ -93,8 +98,13 @@ def _from_range(name: str, text: str) -> np.ndarray:
     low, high, count, *spacing = text.split(":") if text.count(":") > 1 else [text, text, ""]
     if not count or spacing not in ([], ["log"]):
         raise ValueError(f"{name} must be {_FORMS}; got {text!r}")
-    if not count.strip().isdecimal() or int(count) < 1:
-        raise ValueError(f"{name}: N in LO:HI:N must be a whole number of at least 1; got {count!r} in {text!r}")
+    digits = count.strip()
+    # Thousands of digits are more than Python takes for a number.
+    if not digits.isdecimal() or len(digits) > len(str(_MOST_VALUES)) or not 1 <= int(digits) <= _MOST_VALUES:
+        raise ValueError(
+            f"{name}: N in LO:HI:N must be a whole number of at least 1 and at most {_MOST_VALUES:,}; "
+            f"got {count[:20]!r} in {checks.shown(text)}"
+        )
     first, last = _numbers(name, [low, high], text)
     check_axis(name, [first, last])
     if not spacing:
@@ -106,29 +116,44 @@ def _from_range(name: str, text: str) -> np.ndarray:
 
 def _from_file(name: str, path: str) -> list[float]:
     try:
-        items = Path(path).read_text(encoding="utf-8").replace(",", " ").split()
-    except (OSError, UnicodeDecodeError) as error:
+        items = _text(Path(path)).replace(",", " ").split()
+    except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
-        raise ValueError(f"{name} must name a file that can be read; got @{path} ({reason})") from None
+        raise ValueError(
+            f"{name} must name a file that can be read; got {checks.shown(f'@{path}')} ({reason})"
+        ) from None
     return _numbers(name, items, f"@{path}")
 
 
-def check_axis(name: str, values: Any) -> np.ndarray:
-    """The values of the axis `name` as a float64 array of at most one dimension.
+def _text(path: Path) -> str:
+    """What a file holds, unless it is none or too large to be an axis: a device may have no end."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "not a plain file")
+    if path.stat().st_size > _MOST_TEXT:
+        raise OSError(errno.EFBIG, f"more than {checks.gigabytes(_MOST_TEXT)}")
+    return path.read_text(encoding="utf-8")
+
+
+def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarray:
+    """The values of an axis as a float64 array of at most one dimension.
+
+    Args:
+        name: Of the argument that an error speaks of.
+        values: What came.
+        quantity: That they are of, unless it is `name`.
 
     Raises:
         ValueError: With what must hold, what came and where, if they are not allowed.
     """
-    array = np.asarray(units.plain(name, values))
-    if array.dtype.kind not in "iuf":
-        raise ValueError(f"{name} must be a real number or an array of them; got {values!r}")
-    if array.ndim > 1 or array.size == 0:
-        raise ValueError(f"{name} must be a number or a 1-D array of at least one; got shape {array.shape}")
+    array = checks.numbers(name, units.plain(quantity or name, values))
+    if array.ndim > 1:
+        raise ValueError(f"{name} must be a number or a 1-D array; got shape {array.shape}")
+    if array.size > _MOST_VALUES:
+        raise ValueError(f"{name} must have at most {_MOST_VALUES:,} values; got {array.size:,}")
     array = array.astype(np.float64)
-    if name not in ("u0", "v0"):
-        check(name, array)
-    elif not np.all(np.isfinite(array)):
-        raise ValueError(f"{name} must be finite; got {array[~np.isfinite(array)].flat[0]}")
+    if name in ("u0", "v0"):
+        return checks.finite(name, array)
+    check(quantity or name, array, name)
     return array
 
 
@@ -210,10 +235,11 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
         if len(rivals) > 1:
             raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
     if "r" in given and not restitution:
-        raise ValueError(f"r must be left out with a membrane that has no restitution of its own; got {given['r']!r}")
+        raise ValueError(f"r must be left out with a membrane that has no restitution; got {checks.shown(given['r'])}")
     arrays = {name: check_axis(name, values) for name, values in given.items()}
     values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
     sizes = {name: array.size for name, array in arrays.items() if array.ndim}
+    _check_sizes(sizes)
     quantities = _quantities(values, device, xr)
     if not restitution:
         quantities["r"] = xr.Variable((), np.nan)
@@ -234,14 +260,23 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
     )
 
 
+def _check_sizes(sizes: dict[str, int]) -> None:
+    """Raise unless there is room for the quantities that follow from several axes, and for the indices of cells."""
+    for rows in (("s", "omega", "A"), ("omega0", "k", "omega"), ("beta", "A")):
+        along = [name for name in rows if name in sizes]
+        checks.fits(along, _BYTES * math.prod(sizes[name] for name in along), "the quantities of cells")
+    if (count := math.prod(sizes.values())) > _MOST_CELLS:
+        names = checks.joined(name for name, size in sizes.items() if size > 1)
+        raise ValueError(
+            f"{names} must make at most {_MOST_CELLS:.0e} cells; got {count:.1e}; cut the plane into several"
+        )
+
+
 def _quantities(values: "dict[str, xr.Variable]", device: Harvester, xr: Any) -> "dict[str, xr.Variable]":
     def own(name: str) -> "xr.Variable":
         if name in values:
             return values[name]
-        constant = np.asarray(getattr(device, name))
-        if constant.ndim:
-            raise ValueError(f"device.{name} must be one number; got shape {constant.shape}; give it as an axis")
-        return xr.Variable((), check_axis(name, constant))
+        return xr.Variable((), check_axis(name, getattr(device, name)))
 
     r, omega, amplitude, beta = own("r"), own("omega"), own("A"), own("beta")
     omega0 = np.sqrt(values["k"] / float(device.m_b)) if "k" in values else own("omega0")

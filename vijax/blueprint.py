@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vijax import checks
 from vijax.report import amount, factors
-from vijax.store import replacing
-from vijax.style import STYLE, axis_label, check_format, symbol
+from vijax.style import STYLE, axis_label, check_format, save_figure, symbol
 from vijax.tuning import LINEAR, constant
 from vijax.units import UNITS
 
@@ -49,6 +49,8 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
     Raises:
         ValueError: If the path does not end as a picture does.
     """
+    checks.record("report", report, ("best",), "vijax.report.describe")
+    checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
     if path is not None:
         check_format(path)
     along, best = str(diagram.attrs["along"]), report["best"]
@@ -67,8 +69,7 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | Non
         handles, texts = panels[0].get_legend_handles_labels()
         figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -191,6 +192,7 @@ def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure
     """
     if path is not None:
         check_format(path)
+    checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
     over, designs = report["over"], report["designs"]
     tuned = designs[0]["tune"][0]
     found = [(x, one) for x, one in zip(over["values"], designs, strict=True) if one["best"]]
@@ -211,8 +213,7 @@ def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure
         lower.set(yscale="log", ylabel="$P$ [J per half period]", xlabel=_named(over["name"]))
         figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 

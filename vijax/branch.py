@@ -12,13 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vijax import checks, shooting, units
 from vijax import orbit as orbits
-from vijax import shooting, units
 from vijax.arc import CLOSE, FIRST_END, FOLD, MOVED, PLUS, Arc, Place, Tests, advance, moved, unpack
 from vijax.axes import AXES
-from vijax.method import whole
-from vijax.model import Harvester, ImpactPair, Status, check, with_constants
-from vijax.orbit import Orbit
+from vijax.model import Harvester, ImpactPair, Status, check, one_device, with_constants
+from vijax.orbit import Orbit, check_orbit
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,6 +30,8 @@ _EASY = 0.2  # share of that bend after which the next step is longer
 _ZERO = 1e-3  # part of a test function's ends that is zero
 _LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
 _AWAY = 20  # steps before a branch can have closed
+_WAYS = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
+_MOST_POINTS, MOST_GENERATIONS = 10**6, 64
 _NARROWINGS = 40  # of an interval that holds an event: false position with every third step a bisection
 
 
@@ -178,15 +179,13 @@ def follow(
         ValueError: An unknown parameter or direction, bounds in the wrong order or without the start, or an orbit that
             is none.
     """
+    checks.choice("direction", direction, _WAYS)
+    points = checks.whole("points", points, 2, _MOST_POINTS)
     arcs, y = _set_out(orbit, along, within, device)
-    ways = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
-    if direction not in ways:
-        raise ValueError(f'direction must be "up", "down" or "both"; got {direction!r}')
-    points = whole("points", points, 2)
     ahead = np.zeros_like(y)
     ahead[:, -1] = 1.0
     first = advance(arcs, y, ahead, np.zeros(len(orbit)))
-    found = [_follow(arcs, _heading(first, sign), along, points) for sign in ways[direction]]
+    found = [_follow(arcs, _heading(first, sign), along, points) for sign in _WAYS[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]
 
 
@@ -199,13 +198,13 @@ def _heading(place: Place, sign: float) -> Place:
 
 def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None):
     """Arcs and unknowns of the starts; what cannot be followed is refused."""
-    if not len(orbit):
+    if not len(check_orbit(orbit)):
         raise ValueError("orbit must hold an orbit to follow; got none; search with more guesses")
     if (np.asarray(orbit.status) != Status.OK).any():
         index = int(np.argmax(np.asarray(orbit.status) != Status.OK))
         got = Status(int(orbit.status[index]))
         raise ValueError(f"orbit must hold orbits only; got {got.name} at index {index}; {got.advice}")
-    device = Harvester() if device is None else device
+    device = one_device(device)
     within = check_along(orbit.pair, along, within)
     x = check_bounds(orbit.pair, along, within, device)
     if _tilts(along) and bool(orbit.sequence.mirrored.any()):
@@ -228,25 +227,22 @@ def _tilts(along: str) -> bool:
 
 def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> Array:
     """The parameter's value at a pair, or ValueError unless it can be followed from there within the bounds."""
-    low, high = check_along(pair, along, within)
+    low, high = bounds = check_along(pair, along, within)
     x = value_at(pair, along, device)
     if not bool(((x >= low) & (x <= high)).all()):
-        raise ValueError(f"within must hold the start; got {within} and {along} = {float(jnp.ravel(x)[0]):.6g}")
+        raise ValueError(f"within must hold the start; got {bounds} and {along} = {float(jnp.ravel(x)[0]):.6g}")
     return x
 
 
 def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tuple[float, float]:
     """Bounds of a parameter, or ValueError unless branches of a pair with such walls can be followed between them."""
-    soft_only = pair.kappa is None and set(MOVED.get(along, ())) == {"kappa"}
-    if along not in MOVED or soft_only:
-        rigid = "; a rigid wall has none" if soft_only else ""
-        raise ValueError(f"along must be one of {', '.join(MOVED)}; got {along!r}{rigid}")
-    within = units.plain(along, within)
-    if len(within) != 2 or not within[0] < within[1]:
-        raise ValueError(f"within must be two bounds, the lower first; got {within}")
-    for bound in within:
-        check(along, bound)
-    return float(within[0]), float(within[1])
+    stiff = [name for name, moved in MOVED.items() if moved == ("kappa",) and pair.kappa is None]
+    hint = f"a rigid wall has no {' or '.join(stiff)}" if stiff else ""
+    checks.choice("along", along, [name for name in MOVED if name not in stiff], hint)
+    bounds = checks.bounds("within", units.plain(along, within))
+    for bound in bounds:
+        check(along, bound, "within")
+    return bounds
 
 
 def value_at(pair: ImpactPair, along: str, device: Harvester) -> Array:
@@ -362,11 +358,14 @@ def switch(
     Raises:
         ValueError: A point at which nothing of the kind begins.
     """
+    checks.instance("point", point, Point, "branch.follow")
+    points = checks.whole("points", points, 2, _MOST_POINTS)
     if not _begins(point):
         raise ValueError(
             f"point must be a flip, or a pitchfork of orbits closed half way (orbit.halved); got a {point.kind} of "
             f"orbits closed {'half way' if point.orbit.sequence.mirrored[0] else 'in full'}"
         )
+    check_bounds(point.orbit.pair, along, within, one_device(device))
     doubled = orbits.doubled(point.orbit)
     arcs, y = _set_out(doubled, along, within, device)
     knots = y[0, :-1].reshape(-1, 3)
@@ -397,7 +396,13 @@ def family(
     Args:
         orbit, along, within, device, points: As in `follow`; symmetric orbits are closed half way.
         generations: How often to switch; 0 follows the given orbits alone.
+
+    Raises:
+        ValueError: As `follow`.
     """
+    generations = checks.whole("generations", generations, 0, MOST_GENERATIONS)
+    points = checks.whole("points", points, 2, _MOST_POINTS)
+    _set_out(orbit, along, within, device)
     grown: list[Branch] = []
     for index in range(len(orbit)):
         one = orbit[index : index + 1]
@@ -447,9 +452,9 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     """
     import xarray as xr  # here, as importing vijax must not load it
 
-    if not branches:
+    if not checks.sequence("branches", branches, Branch, "branches, as branch.follow returns them"):
         raise ValueError("branches must hold at least one; got none")
-    device = Harvester() if device is None else device
+    device = one_device(device)
     along = branches[0].along
     columns = [_columns(branch, device) for branch in branches]
     found = {name: _padded([column[name] for column in columns]) for name in columns[0]}

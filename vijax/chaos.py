@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from vijax import grid
-from vijax.attractor import SPEED, described, plan_fractions, spread, started
+from vijax import checks, grid
+from vijax.attractor import MOST_STARTS, SPEED, check_starts, described, plan_fractions, spread, started
 from vijax.grid import Axes
-from vijax.method import whole
 from vijax.model import Harvester
 
 if TYPE_CHECKING:
@@ -59,13 +58,14 @@ def lyapunov(
     """
     import xarray as xr  # here, as importing vijax must not load it
 
-    periods = whole("periods", periods, 1)
-    place = spread(whole("starts", starts, 2), None)
+    periods = checks.whole("periods", periods, 1)
+    place = spread(checks.whole("starts", starts, 2, MOST_STARTS), None)
     settings = {"until": "window", "transient": transient, "wall": wall, "method": "exact", "dtype": "float64"}
     growths = []
     for done, window in enumerate((_WARM_UP, _WARM_UP + periods)):
         planned = grid.plan(axes, ("lyapunov",), device, periods=window, **settings)
         of = planned.cells.quantities
+        check_starts(planned, starts)
         near = started(planned, of["u0"] * (1 - _NEAR * (0.5 + place[0])), of["v0"] + _NEAR * place[1])
         tell = _share_of(progress, done, 2)
         run = grid.run(near, tell)
@@ -87,7 +87,8 @@ def lyapunov(
 
 def _share_of(progress: Callable[[int, int], None] | None, done: int, runs: int) -> Callable[[int, int], None] | None:
     """The progress of one of several equal runs, `done` of them over, as that of all."""
-    return progress and (lambda now, total: progress(done * total + now, runs * total))
+    tell = checks.function("progress", progress)
+    return tell and (lambda now, total: tell(done * total + now, runs * total))
 
 
 def survival(
@@ -124,7 +125,7 @@ def survival(
     """
     import xarray as xr  # here, as importing vijax must not load it
 
-    step = whole("periods", periods, _INSTANTS) // _INSTANTS
+    step = checks.whole("periods", periods, _INSTANTS) // _INSTANTS
     after = step * np.arange(1, _INSTANTS + 1)
     planned = plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, periods=_WATCHED, wall=wall)
     alive = []

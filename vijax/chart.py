@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
-from vijax.store import replacing
-from vijax.style import STYLE, axis_label, check_format, symbol, title, units
+from vijax import checks
+from vijax.style import STYLE, axis_label, check_format, save_figure, symbol, title, units
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -52,8 +52,7 @@ def stability_map(found: Any, path: str | Path | None = None) -> Figure:
         texts = ["bounded", "blown up within 50 periods", "theory"]
         figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -95,6 +94,7 @@ def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantit
         ValueError: A quantity that is none, more axes or values than a picture can hold, a format that is none.
     """
     check_quantity(quantity)
+    checks.variables("dataset", dataset, ("P", quantity), "orbit_diagram")
     along = dataset.attrs["along"]
     others = check_layout(along, {str(dim): dataset.sizes[dim] for dim in dataset["P"].dims})
     if path is not None:
@@ -122,15 +122,13 @@ def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantit
         figure.suptitle(title(dataset, _FURTHER), fontsize="medium")
         _explain(figure, dataset, others, ways)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
 def check_quantity(quantity: str) -> None:
     """Raise ValueError unless an orbit diagram can be drawn of it."""
-    if quantity not in _QUANTITIES:
-        raise ValueError(f"quantity must be one of {', '.join(_QUANTITIES)}; got {quantity!r}")
+    checks.choice("quantity", quantity, _QUANTITIES)
 
 
 def check_layout(along: str, sizes: Mapping[str, int]) -> list[str]:
@@ -252,8 +250,7 @@ def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figur
         figure.suptitle(_HOW_TO_READ, fontsize="medium")
         figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -350,6 +347,7 @@ def branches(dataset: "xr.Dataset", path: str | Path | None = None, quantity: st
         ValueError: A quantity that is none, a format that is none.
     """
     check_branch_quantity(quantity)
+    checks.variables("dataset", dataset, (quantity, "stable", "event"), "vijax.branch.dataset")
     if path is not None:
         check_format(path)
     along = dataset[dataset.attrs["along"]]
@@ -371,15 +369,13 @@ def branches(dataset: "xr.Dataset", path: str | Path | None = None, quantity: st
         lines += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
         figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
 def check_branch_quantity(quantity: str) -> None:
     """Raise ValueError unless branches have the quantity."""
-    if quantity not in _BRANCH_QUANTITIES:
-        raise ValueError(f"quantity must be one of {', '.join(_BRANCH_QUANTITIES)}; got {quantity!r}")
+    checks.choice("quantity", quantity, _BRANCH_QUANTITIES)
 
 
 def _mark(kind: str, label: str | None = None) -> Line2D:

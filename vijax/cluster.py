@@ -4,7 +4,9 @@ Dask finds who is idle, runs again what a lost worker was at, and says what is d
 that they are done goes over the network: a task writes its own results.
 """
 
+import asyncio
 import itertools
+import logging
 import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
@@ -16,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 
-from vijax.method import whole
+from vijax import checks
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -25,8 +27,10 @@ Task = TypeVar("Task")
 Workers = int | str
 """So many processes of this machine, among which its cores are divided; or the address of a scheduler."""
 
+_MOST_WORKERS = 4096  # processes of one machine
 _ANSWER = 10  # seconds that a scheduler has to answer
 _WAITING = 2  # tasks a thread of a worker: one runs and one waits, so that nobody does
+_LOGS = ("distributed.batched", "distributed.client", "distributed.core", "distributed.utils", "tornado.application")
 _CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
@@ -43,7 +47,7 @@ def check(workers: Workers) -> None:
             pass
     else:
         _dask()
-        whole("workers", workers, 1)
+        checks.whole("workers", workers, 1, _MOST_WORKERS)
 
 
 def done(work: Callable[[Task], None], tasks: Iterable[Task], workers: Workers) -> Iterator[Task]:
@@ -58,7 +62,10 @@ def done(work: Callable[[Task], None], tasks: Iterable[Task], workers: Workers) 
         As `check`; ChildProcessError if a task lost one worker after another; ConnectionError if the scheduler is lost.
     """
     with _joined(workers) if isinstance(workers, str) else _local(workers) as client:
-        yield from _in_turn(client, work, iter(tasks))
+        try:
+            yield from _in_turn(client, work, iter(tasks))
+        except (_dask().comm.CommClosedError, CancelledError):
+            raise ConnectionError("the scheduler was lost") from None
 
 
 def _in_turn(client: "Client", work: Callable[[Task], None], tasks: Iterator[Task]) -> Iterator[Task]:
@@ -94,8 +101,6 @@ def _check_ended(future: "Future") -> None:
     except KilledWorker as error:
         lost = error.allowed_failures + 1
         raise ChildProcessError(f"{lost} workers were lost, one after another, at the same tile") from None
-    except CancelledError:
-        raise ConnectionError("the scheduler was lost") from None
 
 
 def _dask() -> ModuleType:
@@ -113,15 +118,39 @@ def _joined(address: str) -> "Iterator[Client]":
     try:
         dask.comm.get_address_host_port(address)
     except ValueError:
-        raise ValueError(f"scheduler must be an address such as tcp://10.0.0.1:8786; got {address!r}") from None
+        raise ValueError(
+            f"workers or scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}"
+        ) from None
     try:
         client = dask.Client(address, timeout=_ANSWER, set_as_default=False)
+    except TypeError as error:  # of TLS without certificates
+        raise ValueError(
+            f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
+        ) from None
     except OSError:
         raise ConnectionError(
-            f"scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give its address"
+            f"workers or scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give "
+            "its address"
         ) from None
-    with client:
+    with _quiet(), client:
         yield client
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from the logs the tracebacks of connections that are lost: what is raised here says it in one line."""
+
+    def other(record: logging.LogRecord) -> bool:
+        return not (record.exc_info and isinstance(record.exc_info[1], OSError | asyncio.CancelledError))
+
+    loggers = [logging.getLogger(name) for name in _LOGS]
+    for logger in loggers:
+        logger.addFilter(other)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(other)
 
 
 @contextmanager

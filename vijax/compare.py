@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from vijax import grid
+from vijax import checks, grid
 from vijax.dataset import Plan
 from vijax.grid import Axes
 from vijax.label import ordered
@@ -111,23 +111,23 @@ def plan(
         ValueError, TypeError: Which argument, what must hold, what came.
     """
     if tolerance is not None:
-        tolerance = _positive(tolerance)
+        tolerance = _checked(tolerance)
     soft, rigid = (
         grid.plan(axes, COMPARED, device, method="exact", wall=wall, **settings) for wall in ("soft", "rigid")
     )
     return Comparison(soft, rigid, tolerance)
 
 
-def _positive(tolerance: Any) -> float:
-    number = np.asarray(tolerance)
-    if number.ndim or number.dtype.kind not in "iuf" or not 0 < number < np.inf:
-        raise ValueError(f"tolerance must be a positive number, a part of P (0.05 for 5 %); got {tolerance!r}")
-    return float(number)
+def _checked(tolerance: Any) -> float:
+    must = "a positive number, a part of P (0.05 for 5 %)"
+    return checks.real("tolerance", tolerance, must, lambda x: 0 < x < np.inf)
 
 
 def run(planned: Comparison, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
     """The comparison of a plan, soft cells first; see `compare`."""
     before = planned.soft.cells.count
+
+    checks.function("progress", progress)
 
     def tell(offset: int) -> Callable[[int, int], None] | None:
         return progress and (lambda done, _: progress(offset + done, planned.count))
@@ -188,7 +188,8 @@ def cheapest_model(found: "xr.Dataset", tolerance: float) -> "xr.DataArray":
     Raises:
         ValueError: If the tolerance is not a positive number.
     """
-    tolerance = _positive(tolerance)
+    tolerance = _checked(tolerance)
+    checks.variables("found", found, ("relative_difference", "relative_difference_stderr", "status_soft"), "compare")
     difference, doubt = found["relative_difference"], SURE * found["relative_difference_stderr"]
     ended = found["status_soft"].isin(_SETTLED) & found["status_rigid"].isin(_SETTLED)
     enough, short = difference + doubt <= tolerance, difference - doubt > tolerance

@@ -1,15 +1,17 @@
 """The motion between impacts as a dense curve: what a phase plane or a time series draws."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax import flow
-from vijax.model import ImpactPair
+from vijax import checks, flow
+from vijax.model import ImpactPair, check_pair
+
+MOST_SAMPLES = 10**6  # of a piece
 
 
 class Curve(NamedTuple):
@@ -36,7 +38,9 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
 
     Source: `vijax.flow`, Eqs. (6)-(7) and (20)-(21) corrected.
     """
-    (t, side, v_in, v_out, duration), count = _padded(t, side, v_in, v_out, duration)
+    checks.whole("samples", samples, 1, MOST_SAMPLES)
+    check_pair(pair)
+    (t, side, v_in, v_out, duration), count = _padded(t=t, side=side, v_in=v_in, v_out=v_out, duration=duration)
     if not count:
         return Curve(*np.empty((3, 0)))
     until = np.append(t[1:], t[-1])
@@ -47,20 +51,33 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
 
 def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
     """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
-    (t, side, v_in, v_out, duration), count = _padded(t, side, v_in, v_out, duration)
+    check_pair(pair)
+    when = checks.numbers("when", when)
+    if when.ndim != 1:
+        raise ValueError(f"when must be a 1-D array of times; got shape {when.shape}")
+    (t, side, v_in, v_out, duration), count = _padded(t=t, side=side, v_in=v_in, v_out=v_out, duration=duration)
     index = np.searchsorted(t[:count], when, side="right") - 1
     last = np.maximum(index, 0)
     u, v = _at(pair, *(row[last] for row in (t, side, v_in, v_out, duration)), np.asarray(when, float))
     return np.where(index < 0, np.nan, u), np.where(index < 0, np.nan, v)
 
 
-def _padded(*given) -> tuple[list[np.ndarray], int]:
+def _padded(**given) -> tuple[list[np.ndarray], int]:
     """Rows without what is not there, repeated to a power of two, as every new length would compile anew."""
-    rows = [np.asarray(row, float) for row in given]
+    shape = checks.numbers("t", given["t"], some=False).shape
+    rows = [_row(name, row, shape) for name, row in given.items()]
     there = np.isfinite(rows[0])
     count = int(there.sum())
     width = 1 << max(count - 1, 0).bit_length()
     return [np.resize(row[there], width) for row in rows], count
+
+
+def _row(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """One number an impact; there may be none."""
+    row = checks.numbers(name, values, some=False).astype(float)
+    if row.ndim != 1 or row.shape != shape:
+        raise ValueError(f"{name} must be a 1-D array of as many numbers as t; got shape {row.shape}")
+    return row
 
 
 @jax.jit

@@ -45,6 +45,14 @@ class Plan:
         return self.cells.count
 
     @property
+    def size(self) -> int:
+        """Bytes of the variables wanted, at eight a number; a store compresses them."""
+        of = self.cells
+        variants = math.prod(of.sizes[dim] for dim in of.variant)
+        varied = sum(bool(_VARIED & set(OUTPUTS[name].needs)) for name in self.outputs)
+        return 8 * self.count * (varied * variants + len(self.outputs) - varied)
+
+    @property
     def needs(self) -> frozenset[str]:
         """Fields of `Summary` that the outputs are made of."""
         return frozenset(need for name in self.outputs for need in OUTPUTS[name].needs)
@@ -111,6 +119,8 @@ OUTPUTS = {
     "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
     "status": Output("1", "how the cell ended", ("status",)),
 }
+# Their units vary where the motion does not.
+_VARIED = {"P", "P_stderr", "energy_ratio", "deepest", "fastest"}
 # Few ask for them.
 ON_REQUEST = ("asymmetry", "lyapunov")
 

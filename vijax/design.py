@@ -5,6 +5,7 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 """
 
 import itertools
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,24 +16,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import lanes, xla
+from vijax import checks, estimate, lanes, xla
 from vijax import objective as aims
 from vijax import orbit as orbits
 from vijax.ascent import Box, Climb, ascend, converged
-from vijax.method import whole
-from vijax.model import Harvester, Status
+from vijax.estimate import Estimate
+from vijax.model import Harvester, Status, one_device
 from vijax.objective import OBJECTIVES, Batch, Scene
 from vijax.orbit import Orbit
 from vijax.starts import Effort, Looked, Met, find
 from vijax.steady import Steady, steady
 from vijax.tolerance import Tolerance, check_tolerances, nodes
-from vijax.tuning import check_names, limits, tuned, values, variables
+from vijax.tuning import NAMES, check_names, limits, tuned, values, variables
 
+_LOG = logging.getLogger(__name__)
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
 _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
 _FEW = (16, 256)  # optima of one
 _SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
+_MOST_LOOKS, _MOST_STEPS, _MOST_IMPACTS = 10**5, 10**7, 256
+_BALL = 1000  # bytes that a survey keeps of a ball
 _ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
 
 
@@ -100,7 +104,7 @@ class Design:
 
 def optimise(device: Harvester | None = None, **settings: Any) -> Design:
     """The admissible design that harvests most; see `optimise_all`, which takes many devices at once."""
-    return optimise_all([Harvester() if device is None else device], **settings)[0]
+    return optimise_all([one_device(device)], **settings)[0]
 
 
 def optimise_all(
@@ -143,9 +147,13 @@ def optimise_all(
     Raises:
         ValueError: Which argument, what must hold, what came.
     """
-    devices, tune, scatter = list(devices), tuple(tune), tuple(tolerances)
-    looks, far = whole("looks", looks, 2), effort(steps, balls, impacts, periods)
-    box = check(devices, tune, bounds or {}, objective, scatter)
+    devices = checks.sequence("devices", devices, Harvester, "vijax.Harvester records")
+    tune, bounds = checks.words("tune", tune, NAMES), {} if bounds is None else bounds
+    scatter = check_tolerances(tolerances)
+    looks, far = checks.whole("looks", looks, 2, _MOST_LOOKS), effort(steps, balls, impacts, periods)
+    box = check(devices, tune, bounds, objective, scatter)
+    if (asked := expected(len(devices), far)).long:
+        _LOG.warning("a long run begins: %s", asked)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
     starts, looked = find(devices, tune, box, objective, far)
@@ -190,8 +198,8 @@ def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None
     Raises:
         ValueError: A tolerance that cannot be.
     """
-    scatter = tuple(tolerances)
-    check_tolerances(scatter, bounded=False)
+    checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best")
+    scatter = check_tolerances(tolerances)
     cloud, none = nodes(scatter, samples), jnp.zeros((1, 0))
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), (), cloud.names, "P")
     device = jax.tree.map(lambda x: jnp.array([x], float), optimum.device)
@@ -202,8 +210,20 @@ def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None
 
 def effort(steps: int, balls: int, impacts: int, periods: int = 200) -> Effort:
     """How far a survey looks; raises ValueError as `optimise_all` does."""
-    values, starts = whole("steps", steps, 2), whole("balls", balls, 1)
-    return Effort(values, starts, whole("impacts", impacts, 1), whole("periods", periods, 1))
+    steps, balls = checks.whole("steps", steps, 2, _MOST_STEPS), checks.whole("balls", balls, 1, _MOST_STEPS)
+    longest = checks.whole("impacts", impacts, 1, _MOST_IMPACTS)
+    return Effort(steps, balls, longest, checks.whole("periods", periods, 1))
+
+
+def expected(devices: int, far: Effort) -> Estimate:
+    """What the survey of so many devices asks of the machine; ascents take less.
+
+    Raises:
+        ValueError: If its balls do not fit in memory.
+    """
+    count = devices * far.steps * far.balls
+    checks.fits(("devices", "steps", "balls"), count * _BALL, f"{count:,} balls")
+    return estimate.of_recorded(count, far.periods, count * _BALL)
 
 
 def check(
@@ -217,13 +237,9 @@ def check(
     check_names(tune)
     if not devices:
         raise ValueError("devices must hold at least one; got none")
-    if objective not in OBJECTIVES:
-        raise ValueError(f"objective must be among {', '.join(OBJECTIVES)}; got {objective!r}")
+    checks.choice("objective", objective, OBJECTIVES)
     for device in devices:
-        shapes = {np.shape(x) for x in jax.tree.leaves(device)}
-        if shapes != {()}:
-            raise ValueError(f"device must hold numbers; got shapes {shapes}; give many devices as a list")
-        if not float(device.V):
+        if not float(one_device(device).V):
             raise ValueError("V must not be zero for a design to harvest; got 0")
     over = objective in ("mean", "worst")
     if over != bool(tolerances):

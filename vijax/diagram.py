@@ -15,21 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax import energy, simulate
+from vijax import checks, energy, estimate, simulate
 from vijax.axes import AXES, cells, check_axis
 from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
-from vijax.grid import Axes
+from vijax.grid import Axes, most_periods
 from vijax.lanes import workers
-from vijax.method import whole
-from vijax.model import Harvester, ImpactPair, State, Status
+from vijax.model import WALLS, Harvester, ImpactPair, State, Status, one_device
 from vijax.record import Record, record
 
 if TYPE_CHECKING:
     import xarray as xr
 
+_LOG = logging.getLogger(__name__)
 _WAITING = logging.getLogger("vijax.waiting")  # see `calls`
 _WAYS = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
-_CHOICES = {"direction": tuple(_WAYS), "wall": ("soft", "rigid"), "dtype": ("float64", "float32")}
+_CHOICES = {"direction": tuple(_WAYS), "wall": WALLS, "dtype": ("float64", "float32")}
 # A call takes chains so many points further: one compiled program for diagrams of every length.
 _LINKS = 64
 _FEWEST_LANES, _MOST_LANES = 8, 512
@@ -140,6 +140,16 @@ class Diagram:
         """Points in all."""
         return math.prod(self.dims.values())
 
+    @property
+    def expected(self) -> estimate.Estimate:
+        """What it asks of the machine."""
+        return estimate.of_recorded(self.count, self.planned.settings["periods"], self.size)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the dataset where there are two impacts a period."""
+        return 8 * self.count * (self.planned.settings["keep"] * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
+
 
 def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | None = None, **settings: Any) -> Diagram:
     """Check what an orbit diagram is asked for; runs nothing.
@@ -153,33 +163,35 @@ def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | N
         ValueError, TypeError: Which argument, what must hold, what came.
     """
     swept = [name for name in AXES if name not in ("u0", "v0")]
-    if along not in swept:
-        raise ValueError(f"along must be one of {', '.join(swept)}; got {along!r}")
+    checks.choice("along", along, swept)
+    for name, allowed in _CHOICES.items():
+        checks.choice(name, settings[name], allowed)
     given = {name: value for name, value in axes.items() if value is not None}
     if along in given:
         raise ValueError(f"{along} must not be given twice; got it as the axis swept and as another")
-    points = check_axis(along, values)
+    points = check_axis("values", values, along)
     if not points.ndim:
         raise ValueError(f"values must be a 1-D array of {along}; got {points}")
     for name in ("periods", "keep"):
-        settings[name] = whole(name, settings[name], 1)
+        settings[name] = checks.whole(name, settings[name], 1, most_periods(settings["dtype"]))
     if settings["keep"] > settings["periods"]:
         raise ValueError(f"keep must be at most periods; got {settings['keep']} of {settings['periods']}")
-    for name, allowed in _CHOICES.items():
-        if settings[name] not in allowed:
-            choices = " or ".join(f'"{choice}"' for choice in allowed)
-            raise ValueError(f"{name} must be {choices}; got {settings[name]!r}")
-    device = Harvester() if device is None else device
+    device = one_device(device)
     # A start that a rigid gap does not hold is put back into it: to this door all walls are soft.
     laid_out = cells({**given, along: points}, device, "soft")
     outputs = (*_POINTS, *_IMPACTS, *_STROBES)
     planned = Plan(laid_out, {"along": along, **settings}, None, outputs, device)
-    return Diagram(planned, along, _WAYS[settings["direction"]])
+    diagram = Diagram(planned, along, _WAYS[settings["direction"]])
+    names = ["keep", "values", *(name for name in diagram.dims if name in given)]
+    checks.fits(names, diagram.size, f"the impacts of {diagram.count:,} points")
+    return diagram
 
 
 def run(diagram: Diagram, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
     """The dataset of a plan, its chains run tile by tile on every core; see `orbit_diagram`."""
-    tell = progress or (lambda done, total: None)
+    tell = checks.function("progress", progress) or (lambda done, total: None)
+    if diagram.expected.long:
+        _LOG.warning("a long run begins: %s", diagram.expected)
     tell(0, diagram.count)
     table = _table(diagram)
     found: dict[int, dict[str, np.ndarray]] = {}

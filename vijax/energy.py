@@ -1,15 +1,16 @@
 """Energy of an impact: what the membrane's capacitance harvests, what the ball gives to it, and if that suffices."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vijax import units
+from vijax import checks, units
 from vijax.flow import half_turn
-from vijax.model import Harvester
+from vijax.model import Harvester, check_device
 from vijax.xla import once
 
 PI = math.pi
@@ -55,13 +56,22 @@ def harvested_energy(device: Harvester, depth: Values) -> Values:
     E = (C_max + C_T)/(C_min + C_T) (C_max - C_min) V^2/2, of full relative accuracy down to depth 0, where it and its
     gradient vanish.
 
+    Raises:
+        ValueError: If the device is none, or a depth no number (traced ones are not looked at).
+
     Source: Eq. (34).
     """
-    return _harvested_energy(device, units.plain("depth", depth))
+    check_device(device)
+    given: Any = units.plain("depth", depth)
+    if not checks.is_concrete(given):
+        return _harvested(device, given)
+    found = checks.numbers("depth", given, some=False)
+    # A number and an array of JAX stay what they are: their precision is the result's.
+    return _harvested(device, jnp.asarray(found, float) if isinstance(given, list | tuple) else given)
 
 
 @once
-def _harvested_energy(device: Harvester, depth: Values) -> Values:
+def _harvested(device: Harvester, depth: Values) -> Values:
     growth = stretch(device, depth)
     least = _rest_capacitance(device)
     gain = least * growth * (2 + growth)

@@ -220,17 +220,112 @@ def first_return(
     return jnp.where(found.running, jnp.nan, jnp.where(found.bracketed, exact, found.s))
 
 
-class _Visit(eqx.Module):
-    """A contact on its way: the exit first, then every extremum of w up to it, in order; s is the last one's time."""
+class Turns(eqx.Module):
+    """Where a contact is highest and lowest among the turning points inside it; a time is 0 where there is none.
 
-    number: Array
+    Attributes:
+        exit: When the contact ends.
+        crest, highest: When the penetration is largest, and how large.
+        trough, lowest: When it is least at a minimum inside, and how large then; inf without a minimum.
+        lost: The stages allowed did not do.
+    """
+
     exit: Scalar
-    s: Scalar
-    sign: Scalar  # of w' just after s
     crest: Scalar
     highest: Scalar
-    going: Flag
+    trough: Scalar
+    lowest: Scalar
     lost: Flag
+
+
+class _Visit(eqx.Module):
+    """A contact on its way: its exit first unless that is known, then every turning point up to it, in order."""
+
+    number: Array
+    s: Scalar  # of the last turning point
+    sign: Scalar  # of w' just after s
+    going: Flag
+    settled: Flag  # of the oscillation nothing is left but rounding
+    seen: Turns
+
+
+def turning_points(
+    m: Membrane,
+    force: Force,
+    w0: Scalar,
+    z0: Scalar,
+    wanted: Flag,
+    patience: int | Array = PATIENCE,
+    length: Scalar | None = None,
+) -> Turns:
+    """Visit every turning point of a contact, however many: none is lost between samples.
+
+    They are zeros of w', which obeys the same equation, so that one compiled search finds them and the exit. Once the
+    oscillation has decayed to rounding, what remains is the steady response, whose turning points are known.
+
+    Args:
+        m, force, w0, z0: As in `first_return`.
+        wanted: Whether to look at all.
+        patience: Stages of a search, and turning points, that are allowed.
+        length: When the contact is to end, at the first return of w to zero or not; looked for unless given.
+    """
+    steady = flow.steady_response(m, force)
+    eps = jnp.finfo(w0.dtype).eps
+    slope = force.slope()
+    zero, no = jnp.zeros_like(w0), jnp.zeros_like(wanted)
+    rising = (z0 > 0) | ((z0 == 0) & (force.at(zero) > m.kappa * m.kappa * w0))
+
+    def visit(v: _Visit) -> _Visit:
+        first, s, seen = v.number == 0, v.s, v.seen
+        w, z = flow.oscillate(m, force, w0, z0, s)
+        settled = _amplitude(m, steady, w, z, s) <= eps * (jnp.abs(steady.c) + jnp.abs(steady.q) + jnp.abs(w))
+        seeking = v.going & (first | ~settled)
+        rate = force.later(s).at(zero) - m.mu * z - m.kappa * m.kappa * w
+        z = jnp.where(s == 0, z, 0.0)  # at a turning point w' is zero, not its rounding error
+        later = slope.later(s)
+        sought = jax.tree.map(lambda x, slope: jnp.where(first, x, v.sign * slope), (force, w0, z0), (later, z, rate))
+        limit = jnp.where(first, jnp.inf, seen.exit - s)
+        ahead = s + first_return(m, *sought, seeking, patience, limit)
+        # An undamped contact that lasts for ever has no last turning point, nor may it have a largest penetration.
+        endless = first & jnp.isinf(ahead) & (m.zeta == 0)
+        lost = seeking & (jnp.isnan(ahead) | endless)
+        going = seeking & jnp.where(first, ~lost, ahead < seen.exit)
+        seen = _compared(seen, s, w, s > 0, (s > 0) & (v.sign > 0))
+        return _Visit(
+            number=v.number + 1,
+            s=jnp.where(going & ~first, ahead, s),
+            sign=jnp.where(first, v.sign, -v.sign),
+            going=going,
+            settled=settled,
+            seen=eqx.tree_at(lambda t: (t.exit, t.lost), seen, (jnp.where(first, ahead, seen.exit), lost)),
+        )
+
+    blank = Turns(zero if length is None else length, zero, w0, zero, jnp.full_like(w0, jnp.inf), no)
+    sign = jnp.where(rising, 1.0, -1.0).astype(w0.dtype)
+    start = _Visit(jnp.int32(length is not None), zero, sign, wanted, no, blank)
+    end = lax.while_loop(lambda v: v.going & (v.number <= patience), visit, start)
+    seen = end.seen
+    # The steady response is highest at this phase and lowest half a period later: each once, the first still ahead.
+    known = -jnp.arctan2(steady.q, steady.c) / PI
+    for when, low in ((known, no), (known + 1, ~no)):
+        ahead = when + 2 * jnp.ceil(0.5 * (end.s - when))
+        there = end.settled & (ahead > 0) & (ahead < seen.exit)
+        w, _ = flow.oscillate(m, force, w0, z0, jnp.where(there, ahead, 0.0))
+        seen = _compared(seen, ahead, w, there, there & low)
+    return eqx.tree_at(lambda t: t.lost, seen, end.going | seen.lost)
+
+
+def _compared(seen: Turns, s: Scalar, w: Scalar, turns: Flag, rises: Flag) -> Turns:
+    """The turning points seen, with one more where it `turns`: a minimum where it `rises` after."""
+    higher, lower = turns & (w > seen.highest), rises & (w < seen.lowest)
+    return Turns(
+        exit=seen.exit,
+        crest=jnp.where(higher, s, seen.crest),
+        highest=jnp.where(higher, w, seen.highest),
+        trough=jnp.where(lower, s, seen.trough),
+        lowest=jnp.where(lower, w, seen.lowest),
+        lost=seen.lost,
+    )
 
 
 def exit_and_crest(
@@ -238,50 +333,10 @@ def exit_and_crest(
 ) -> tuple[Scalar, Scalar]:
     """The first return of w to zero (see `first_return`), and when w is largest before.
 
-    Every extremum is visited: they are zeros of w', which obeys the same equation, so that one compiled search finds
-    them and the exit. Once the oscillation has decayed to rounding, what remains is the steady response, whose crest is
-    known. NaN for the crest if `patience` extrema do not get there, or if there is no telling the exit.
+    NaN for the crest if `patience` turning points do not get there, or if there is no telling the exit.
     """
-    steady = flow.steady_response(m, force)
-    eps = jnp.finfo(w0.dtype).eps
-    slope = force.slope()
-    zero, no = jnp.zeros_like(w0), jnp.zeros_like(wanted)
-    # A start at rest or already falling inside the wall is deepest where it begins.
-    rising = (z0 > 0) | ((z0 == 0) & (force.at(zero) > m.kappa * m.kappa * w0))
-
-    def visit(v: _Visit) -> _Visit:
-        first, s = v.number == 0, v.s
-        w, z = flow.oscillate(m, force, w0, z0, s)
-        settled = _amplitude(m, steady, w, z, s) <= eps * (jnp.abs(steady.c) + jnp.abs(steady.q) + jnp.abs(w))
-        better = (w > v.highest) & (s > 0)
-        seeking = v.going & (first | ~settled)
-        rate = force.later(s).at(zero) - m.mu * z - m.kappa * m.kappa * w
-        z = jnp.where(s == 0, z, 0.0)  # at an extremum w' is zero, not its rounding error
-        later = slope.later(s)
-        sought = jax.tree.map(lambda x, slope: jnp.where(first, x, v.sign * slope), (force, w0, z0), (later, z, rate))
-        limit = jnp.where(first, jnp.inf, v.exit - s)
-        ahead = s + first_return(m, *sought, seeking, patience, limit)
-        lost = seeking & jnp.isnan(ahead)
-        going = jnp.where(first, seeking & rising & ~lost, seeking & (ahead < v.exit))
-        return _Visit(
-            number=v.number + 1,
-            exit=jnp.where(first, ahead, v.exit),
-            s=jnp.where(going & ~first, ahead, s),
-            sign=jnp.where(first, v.sign, -v.sign),
-            crest=jnp.where(better, s, v.crest),
-            highest=jnp.where(better, w, v.highest),
-            going=going,
-            lost=lost,
-        )
-
-    start = _Visit(jnp.int32(0), zero, zero, jnp.ones_like(w0), zero, w0, wanted, no)
-    seen = lax.while_loop(lambda v: v.going & (v.number <= patience), visit, start)
-    known = -jnp.arctan2(steady.q, steady.c) / PI
-    known = jnp.where(known < 0, known + 2, known)
-    there = jnp.isfinite(known) & (known < seen.exit)
-    w, _ = flow.oscillate(m, force, w0, z0, jnp.where(there, known, 0.0))
-    crest = jnp.where(there & (w > seen.highest), known, seen.crest)
-    return seen.exit, jnp.where(seen.going | seen.lost, jnp.nan, crest)
+    seen = turning_points(m, force, w0, z0, wanted, patience)
+    return seen.exit, jnp.where(seen.lost, jnp.nan, seen.crest)
 
 
 # --- the next wall crossing of a flight -----------------------------------------------------------
@@ -298,6 +353,38 @@ class _Scan(eqx.Module):
     high: Scalar
 
 
+def next_turn(force: Force, s: Scalar) -> Scalar:
+    """The next zero of a flight's acceleration after s."""
+    return _spell(force, s).end
+
+
+LONGEST_PIECE = 1.0  # of a flight that is looked at at once, where the acceleration has no zero
+
+
+def monotone_piece(
+    gamma: Scalar, force: Force, t0: Scalar, v0: Scalar, s: Scalar, v: Scalar, end: Scalar, wanted: Flag
+) -> tuple[Scalar, Flag, Scalar]:
+    """The velocity at the end of a piece without a zero of the acceleration; whether and when the ball turns on it.
+
+    Args:
+        gamma, t0, v0: Of the flight; `force` is its `flow.flight_force`.
+        s, v: Where the piece begins, and the velocity there.
+        end: Where it ends.
+        wanted: Whether to look for the turn.
+    """
+
+    def velocity(s):
+        return flow.flight(gamma, t0, v0, s)[1]
+
+    v_end = velocity(end)
+    turns = v * v_end < 0
+    up = jnp.where(v > 0, 1.0, -1.0)
+    turn = bracketed_root(
+        lambda s: (up * velocity(s), up * force.at(s)), s, end, jnp.where(turns, s, end), turns & wanted
+    )
+    return v_end, turns, turn
+
+
 def next_wall(
     gamma: Scalar, room: tuple[Scalar, Scalar], t0: Scalar, v0: Scalar, horizon: Scalar, wanted: Flag
 ) -> tuple[Scalar, Scalar]:
@@ -308,27 +395,19 @@ def next_wall(
     """
     force = flow.flight_force(gamma, t0)
 
-    def velocity(s):
-        return flow.flight(gamma, t0, v0, s)[1]
-
     def scan(c: _Scan) -> _Scan:
-        end = jnp.minimum(c.turn, c.s + 1.0)
-        v_end = velocity(end)
-        turns = c.v * v_end < 0
-        up = jnp.where(c.v > 0, 1.0, -1.0)
-        turn = bracketed_root(
-            lambda s: (up * velocity(s), up * force.at(s)), c.s, end, jnp.where(turns, c.s, end), turns & wanted
-        )
+        end = jnp.minimum(c.turn, c.s + LONGEST_PIECE)
+        v_end, turns, turn = monotone_piece(gamma, force, t0, v0, c.s, c.v, end, wanted)
         middle = jnp.where(turns, turn, end)
         heading = jnp.where(c.v == 0, jnp.sign(v_end), jnp.sign(c.v))
         first = _beyond(gamma, room, t0, v0, heading, middle)
         second = _beyond(gamma, room, t0, v0, jnp.sign(v_end), end)
         side = jnp.where(first != 0, first, second)
         low, high = jnp.where(first != 0, c.s, middle), jnp.where(first != 0, middle, end)
-        return _Scan(end, v_end, _spell(force, end).end, side, low, high)
+        return _Scan(end, v_end, next_turn(force, end), side, low, high)
 
     zero = jnp.zeros_like(v0)
-    start = _Scan(zero, v0, _spell(force, zero).end, zero, zero, zero)
+    start = _Scan(zero, v0, next_turn(force, zero), zero, zero, zero)
     found = lax.while_loop(lambda c: wanted & (c.side == 0) & (c.s < horizon), scan, start)
     distance = jnp.where(found.side > 0, room[1], room[0])
 
@@ -496,11 +575,13 @@ def step(
 def start_mode(pair: ImpactPair, u: Scalar, v: Scalar, t: Scalar) -> Scalar:
     """Contact side (0: none) of a start: inside a soft wall; on a wall by the velocity, at rest by the acceleration.
 
-    A rigid wall holds only a ball that rests on it and is pushed against it.
+    A rigid wall holds only a ball that rests on it and is pushed against it. Where the acceleration is zero, or as good
+    as that, it counts as what it is about to be: a ball that is set free for 1e-16 of a period has no impact.
     """
     side = jnp.where(u > 0, 1.0, -1.0).astype(u.dtype)
     gap = 0.5 * pair.d - side * u
-    resting = (gap == 0) & (v == 0) & (side * flow.acceleration(pair.gamma, t) > 0)
+    pressed = _spell(flow.contact_force(pair.gamma, side, t), jnp.zeros_like(t)).positive
+    resting = (gap == 0) & (v == 0) & pressed
     held = resting if pair.kappa is None else (gap < 0) | resting | ((gap == 0) & (side * v > 0))
     return jnp.where(held, side, 0.0)
 

@@ -67,7 +67,7 @@ class Force(eqx.Module):
 
 def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
     """The soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
-    decrement = -jnp.log(pair.r)
+    decrement = 0.0 - jnp.log(pair.r)  # +0 at r = 1: a free half cycle that begins at -0 would be over at once
     scale = pair.kappa / jnp.sqrt(PI**2 + decrement * decrement)
     return Membrane(pair.kappa, decrement * scale, PI * scale, rolled)
 

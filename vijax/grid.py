@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax import calls, cluster, study
+from vijax import calls, checks, cluster, estimate, study
 from vijax import method as methods
 from vijax import refine as refinement
 from vijax.axes import Cells, cells
@@ -24,8 +24,8 @@ from vijax.calls import Call, Fields
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
 from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
-from vijax.model import Harvester
-from vijax.store import check_output, load, save, view
+from vijax.model import WALLS, Harvester, one_device
+from vijax.store import check_store, load, save, view
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -34,7 +34,7 @@ __all__ = ["Axes", "load", "plan", "run", "save", "sweep"]
 
 _CHOICES = {
     "until": ("attractor", "window"),
-    "wall": ("soft", "rigid"),
+    "wall": WALLS,
     "dtype": ("float64", "float32"),
 }
 _LOG = logging.getLogger(__name__)
@@ -116,10 +116,11 @@ def sweep(
             `computed` says which are which.
         progress: Called with (cells done, cells in all) from the calling thread, first before anything is run. While a
             plane is refined, all are those known to be needed, and grow.
-        out: Zarr store to write tile by tile, so that memory is set by a tile. It opens at any time, cells that were
-            not run yet by their `status`; stopped in whatever way, the same call goes on with what is left of it.
-            A refined plane is written when it is whole. Without, everything is in memory.
-        overwrite: Begin anew whatever the store holds.
+        out: Zarr store, named *.zarr, to write tile by tile, so that memory is set by a tile. It opens at any time,
+            cells that were not run yet by their `status`; stopped in whatever way, the same call goes on with what is
+            left of it, and mends what was damaged. A refined plane is written when it is whole. Without, everything is
+            in memory.
+        overwrite: Begin anew whatever the store holds; what vijax did not write is never replaced.
         workers: With `out`: who runs and writes the tiles, under Dask (extra `cluster`): so many new processes, which
             share the cores, or the address of a scheduler whose workers see `out` under the same path. A worker runs a
             tile a thread, on its first device. New processes import the calling script: what it does must stand under
@@ -177,22 +178,17 @@ def plan(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
-    for name, least in (("periods", 1), ("transient", 0)):
-        settings[name] = methods.whole(name, settings[name], least)
     for name, allowed in _CHOICES.items():
-        if settings[name] not in allowed:
-            choices = " or ".join(f'"{choice}"' for choice in allowed)
-            raise ValueError(f"{name} must be {choices}; got {settings[name]!r}")
+        checks.choice(name, settings[name], allowed)
+    for name, least in (("periods", 1), ("transient", 0)):
+        settings[name] = checks.whole(name, settings[name], least, most_periods(settings["dtype"]))
     refine = settings.pop("refine", None)
     options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
     method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
     if outputs is None:
         outputs = (name for name in OUTPUTS if name not in ON_REQUEST)
-    wanted = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    for name in wanted:
-        if name not in OUTPUTS:
-            raise ValueError(f"outputs must be among {', '.join(OUTPUTS)}; got {name!r}")
-    device = Harvester() if device is None else device
+    wanted = checks.words("outputs", outputs, OUTPUTS)
+    device = one_device(device)
     given = {name: values for name, values in axes.items() if values is not None}
     lossy = method is None or not isinstance(method.law, HuntCrossley)
     laid_out = cells(given, device, settings["wall"], restitution=lossy)
@@ -207,8 +203,13 @@ def plan(
     )
 
 
+def most_periods(dtype: str) -> int:
+    """Periods that a cell may be told to run: two such numbers together are still counted one by one."""
+    return min(checks.MOST, 1 << int(np.finfo(dtype).nmant))
+
+
 def _levels(refine: Any, of: Cells, until: str) -> int:
-    levels = methods.whole("refine", refine, 1)
+    levels = checks.whole("refine", refine, 1)
     if until != "attractor":
         raise ValueError(f"refine must be left out with until={until!r}, whose cells have no label; got {levels}")
     longest = max((of.sizes[dim] for dim in of.dynamic), default=1)
@@ -229,29 +230,37 @@ def run(
     workers: cluster.Workers | None = None,
 ) -> "xr.Dataset":
     """The map of a plan, its cells simulated tile by tile on every device; see `sweep`."""
-    found = _found(planned, progress or (lambda done, total: None), out, overwrite, workers)
+    watch = estimate.Watch(checks.function("progress", progress) or (lambda done, total: None))
+    checks.flag("overwrite", overwrite)
+    if workers is not None:
+        check_workers(planned, workers, out)
+    if out is None:
+        check_room(planned)
+    else:
+        check(planned, out, overwrite)
+    if (expected := estimate.of(planned)).long:
+        _LOG.warning("a long run begins: %s", expected)
+    found = _run(planned, watch, None if out is None else Path(out), overwrite, workers)
+    if not planned.refine:
+        watch.keep(planned)
     warn_if_held(found)
     return found
 
 
-def _found(
+def _run(
     planned: Plan,
     tell: Callable[[int, int], None],
-    out: str | Path | None,
+    out: Path | None,
     overwrite: bool,
     workers: cluster.Workers | None,
 ) -> "xr.Dataset":
-    """As `run`, nothing said of what was found."""
-    if workers is not None:
-        check_workers(planned, workers, out)
     if out is None:
         return _refined(planned, tell) if planned.refine else label(planned, _in_memory(planned, tell))
-    check(planned, out, overwrite)
     if planned.refine:
         # Which cells are computed depends on all that were: no part of it could be gone on with.
         save(_refined(planned, tell), out, overwrite=overwrite)
         return view(out)
-    if workers is None and not Path(out).exists():
+    if workers is None and not out.exists():
         _compile_ahead(planned)
     with study.opened(planned, out, overwrite) as plane:
         _fill(plane, tell, workers)
@@ -262,12 +271,20 @@ def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
     """Raise unless the map of a plan can be written there, or goes on there; makes nothing.
 
     Raises:
-        OSError: Of which kind `study.check` and `store.check_output` say.
+        ValueError, OSError: As `study.check`; of a refined map as `store.check_store`, or it does not fit in memory.
     """
     if planned.refine:
-        check_output("out", out, overwrite)
+        check_store("out", out, overwrite)
+        check_room(planned)
     else:
-        study.check(planned, out, overwrite)
+        study.check(planned, checks.path("out", out), overwrite)
+
+
+def check_room(planned: Plan) -> None:
+    """Raise ValueError unless the map of a plan fits in memory, where it is not written tile by tile."""
+    names = [name for name, size in planned.cells.sizes.items() if size > 1]
+    hint = "" if planned.refine else "; give out, a store that is written tile by tile"
+    checks.fits(names, planned.size, f"{planned.count:,} cells", hint)
 
 
 def check_workers(planned: Plan, workers: cluster.Workers, out: str | Path | None) -> None:
@@ -277,10 +294,10 @@ def check_workers(planned: Plan, workers: cluster.Workers, out: str | Path | Non
         ValueError, OSError, ModuleNotFoundError: As `cluster.check`; ValueError without a store, and with refinement.
     """
     if out is None:
-        raise ValueError(f"workers must come with out, the store that they write; got {workers!r} alone")
+        raise ValueError(f"workers must come with out, the store that they write; got {checks.shown(workers)} alone")
     if planned.refine:
         raise ValueError(
-            f"workers must be left out with refine, which goes on from all that was found; got {workers!r}"
+            f"workers must be left out with refine, which goes on from all that was found; got {checks.shown(workers)}"
         )
     cluster.check(workers)
 

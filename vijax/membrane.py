@@ -1,14 +1,14 @@
 """Membrane laws: the acceleration that a wall gives to a ball which has entered it by w at rate w'."""
 
+import math
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from vijax.model import ImpactPair, Real, is_concrete
+from vijax import checks
+from vijax.model import ImpactPair, Real
 
 Values = Float[Array, "..."]
 
@@ -67,18 +67,14 @@ class HuntCrossley(eqx.Module):
     def __check_init__(self):
         for name, least in (("chi", 0), ("exponent", 1)):
             value = getattr(self, name)
-            if is_concrete(value) and not _allowed(value, least):
-                raise ValueError(f"{name} must be one finite number of at least {least}; got {value!r}")
+            if checks.is_concrete(value):
+                must = f"one finite number of at least {least}"
+                checks.real(name, value, must, lambda x, least=least: least <= x < math.inf)
 
     def wall(self, pair: ImpactPair) -> Hertz:
         """The law with the numbers of a pair."""
         kappa = pair._soft_kappa()
         return Hertz(kappa * kappa, jnp.asarray(self.chi, kappa.dtype), jnp.asarray(self.exponent, kappa.dtype))
-
-
-def _allowed(value: Any, least: float) -> bool:
-    number = np.asarray(value)
-    return number.dtype.kind in "iuf" and number.ndim == 0 and bool(np.isfinite(number)) and bool(number >= least)
 
 
 Law = Linear | HuntCrossley

@@ -1,7 +1,6 @@
 """The methods that integrate a cell: the numbers each one is told, and the door that checks them."""
 
 import math
-import operator
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
+from vijax import checks
 from vijax.membrane import HuntCrossley, Law, Linear
 from vijax.model import Impact, Real, State
 
@@ -19,7 +19,7 @@ SOLVERS = ("Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaern
 OPTIONS = {"exact": (), "ode": ("solver", "rtol", "atol", "membrane"), "rk4": ("steps", "membrane")}
 _DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
 _STEPS = 1000
-_FEWEST_STEPS = 8
+_FEWEST_STEPS, _MOST_STEPS = 8, 10**6
 _FINEST = 8  # roundings: no error estimate is worth anything below
 
 
@@ -116,32 +116,33 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
     Raises:
         ValueError: Which argument, what must hold, what came.
     """
-    if method not in OPTIONS:
-        raise ValueError(f"method must be {' or '.join(map(_quoted, OPTIONS))}; got {method!r}")
+    checks.choice("method", method, OPTIONS)
     given = {name: value for name, value in options.items() if value is not None}
     law = given.get("membrane", Linear())
     if not isinstance(law, Linear | HuntCrossley):
-        raise ValueError(f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {law!r}")
+        raise ValueError(
+            f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {checks.shown(law)}"
+        )
     if method == "exact" and not isinstance(law, Linear):
         raise ValueError(f'membrane must be linear for method="exact"; got {describe(law)}; use method="ode"')
     for name in given:
         takers = [taker for taker, taken in OPTIONS.items() if name in taken]
         if method not in takers and name != "membrane":
-            raise ValueError(
-                f"{name} must be left out unless method is {' or '.join(map(_quoted, takers))}; got {given[name]!r}"
-            )
+            theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
+            raise ValueError(f"{name} must be left out unless method is {theirs}; got {got}")
     if method == "exact":
         return None
     if wall != "soft":
         raise ValueError(f'wall must be "soft" for method={_quoted(method)}; got {wall!r}; use method="exact"')
     if method == "rk4":
-        return Rk4(whole("steps", given.get("steps", _STEPS), _FEWEST_STEPS), law)
-    solver = given.get("solver", "Tsit5")
-    if solver not in SOLVERS:
-        raise ValueError(f"solver must be among {', '.join(SOLVERS)}; got {solver!r}")
+        return Rk4(checks.whole("steps", given.get("steps", _STEPS), _FEWEST_STEPS, _MOST_STEPS), law)
+    solver = checks.choice("solver", given.get("solver", "Tsit5"), SOLVERS)
     rtol, atol = _DEFAULTS[dtype]
     least = _FINEST * float(np.finfo(dtype).eps)
-    return Ode(solver, _least("rtol", given.get("rtol", rtol), least), _least("atol", given.get("atol", atol), 0), law)
+    must = f"a finite number of at least {least:.1e}"
+    rtol = checks.real("rtol", given.get("rtol", rtol), must, lambda x: least <= x < math.inf)
+    atol = checks.real("atol", given.get("atol", atol), "a finite number above 0", lambda x: 0 < x < math.inf)
+    return Ode(solver, rtol, atol, law)
 
 
 def describe(law: Law) -> str:
@@ -163,25 +164,3 @@ def record(method: Method | None) -> dict[str, Any]:
 
 def _quoted(name: str) -> str:
     return f'"{name}"'
-
-
-def whole(name: str, value: Any, least: int) -> int:
-    """The value as an int, or a ValueError that names the argument."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = least - 1
-    if number < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}")
-    return number
-
-
-def _least(name: str, value: Any, least: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (number > 0 and number >= least and math.isfinite(number)):
-        must = f"of at least {least:.1e}" if least else "above 0"
-        raise ValueError(f"{name} must be a finite number {must}; got {value!r}")
-    return number

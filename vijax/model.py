@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vijax import units
+from vijax import checks, units
+from vijax.checks import is_concrete
 
 Real = float | Float[Array, "..."]
 
@@ -142,6 +143,9 @@ def damping_ratio(r: Real) -> Float[Array, "..."]:
     return decrement / jnp.sqrt(math.pi**2 + decrement * decrement)
 
 
+WALLS = ("soft", "rigid")
+
+
 class Harvester(eqx.Module):
     """The device in SI units; the defaults are Tables I and II of the paper.
 
@@ -196,7 +200,7 @@ class Harvester(eqx.Module):
         if is_concrete(self.r_b, self.R0) and not np.all(np.asarray(self.r_b) < np.asarray(self.R0)):
             raise ValueError(
                 f"r_b must be smaller than R0, the radius of the membrane that the ball sinks into; "
-                f"got r_b = {self.r_b}, R0 = {self.R0}"
+                f"got r_b = {checks.shown(self.r_b)}, R0 = {checks.shown(self.R0)}"
             )
 
     @property
@@ -227,8 +231,7 @@ class Harvester(eqx.Module):
         Args:
             wall: "soft" for the membrane, "rigid" for the wall that it becomes as omega0 grows (kappa = None).
         """
-        if wall not in ("soft", "rigid"):
-            raise ValueError(f'wall must be "soft" or "rigid"; got {wall!r}')
+        checks.choice("wall", wall, WALLS)
         d, gamma = self.s / self.length_unit, self.g * jnp.sin(self.beta) / self.A
         d, kappa, r, gamma = jnp.broadcast_arrays(d, self.omega0 * (math.pi / self.omega), self.r, gamma)
         return ImpactPair(d, None if wall == "rigid" else kappa, r, gamma)
@@ -248,10 +251,11 @@ def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
     Raises:
         ValueError: No inclination gives gamma, or a field that cannot be (traced values leave beta = NaN instead).
     """
-    sine = pair.gamma * device.A / device.g
+    check_pair(pair)
+    sine = pair.gamma * check_device(device).A / device.g
     if is_concrete(sine) and np.any(np.abs(sine) > 1):
         raise ValueError(
-            f"gamma must lie in [-g/A, g/A] for an inclination to give it; got {_first(sine, np.abs(sine) <= 1)} "
+            f"gamma must lie in [-g/A, g/A] for an inclination to give it; got {checks.first(sine, np.abs(sine) <= 1)} "
             f"for gamma A/g; lower A or raise g"
         )
     omega0 = device.omega0 if pair.kappa is None else pair.kappa * device.omega / math.pi
@@ -264,7 +268,7 @@ def with_constants(device: Harvester, **constants: Real) -> Harvester:
     Raises:
         ValueError: An unknown constant, both k and omega0, or a value that cannot be.
     """
-    known = [field.name for field in dataclasses.fields(device)]
+    known = [field.name for field in dataclasses.fields(check_device(device))]
     for name in constants:
         if name not in (*known, "k"):
             raise ValueError(f"{name} must be a constant of the device; got {name!r}; known are k, {', '.join(known)}")
@@ -357,17 +361,13 @@ _RULES = {
 }
 
 
-def is_concrete(*values: Any) -> bool:
-    """Whether no value is traced, so that it may be looked at."""
-    return not any(isinstance(value, jax.core.Tracer) for value in values)
-
-
-def check(name: str, value: Any) -> None:
+def check(name: str, value: Any, argument: str | None = None) -> None:
     """Raise unless every element of `value` may be the quantity `name`; traced values pass unseen.
 
     Args:
         name: A field of `ImpactPair` or `Harvester`, or "k".
         value: A number or an array.
+        argument: That an error speaks of, unless it is called as the quantity is.
 
     Raises:
         ValueError: "r must lie in (0, 1]; got -0.2 at index (3, 7); an elastic wall is r = 1".
@@ -378,23 +378,58 @@ def check(name: str, value: Any) -> None:
     if not is_concrete(value):
         return
     rule = _RULES[name]
-    array = np.asarray(value)
-    if array.dtype.kind not in "iuf":
-        raise ValueError(f"{name} must be a number or an array of numbers; got {value!r}; {rule.advice}")
+    called = argument or name
+    array = checks.numbers(called, value, rule.advice)
     good = rule.holds(array)
     if not np.all(good):
-        raise ValueError(f"{name} {rule.must}; got {_first(array, good)}; {rule.advice}")
+        raise ValueError(f"{called} {rule.must}; got {checks.first(array, good)}; {rule.advice}")
     if name == "beta" and (steepest := np.abs(array).max()) > 0.5 * math.pi:
         advice = "20 degrees are 20deg on the command line, and numpy.deg2rad(20) in Python"
-        warnings.warn(f"beta is up to {steepest:.6g} rad, which is beyond pi/2; {advice}", stacklevel=2)
+        warnings.warn(f"{called} is up to {steepest:.6g} rad, which is beyond pi/2; {advice}", stacklevel=2)
 
 
-def _first(values: Any, good: Any) -> str:
-    """The first element that is not good, with its index where there is one."""
-    values, good = np.asarray(values), np.asarray(good)
-    index = tuple(int(i) for i in np.argwhere(~good)[0])
-    where = f" at index {index if len(index) > 1 else index[0]}" if index else ""
-    return f"{values[index]}{where}"
+def check_device(device: Any) -> Harvester:
+    """The device, if it is one."""
+    return checks.instance("device", device, Harvester, "vijax.Harvester(...)")
+
+
+def one_device(device: Any) -> Harvester:
+    """The device, each constant of it one number that is not traced; that of Tables I and II where none is given."""
+    if device is None:
+        return Harvester()
+    for name, value in vars(checks.known("device", check_device(device))).items():
+        if value is not None and np.ndim(value):
+            raise ValueError(
+                f"device.{name} must be one number; got shape {np.shape(value)}; give it as an axis, or one device each"
+            )
+    return device
+
+
+def check_pair(pair: Any) -> ImpactPair:
+    """The pair, if its fields may be; those of traced values pass unseen.
+
+    Raises:
+        ValueError: No pair, a field that cannot be, or fields that do not broadcast.
+    """
+    given = vars(checks.instance("pair", pair, ImpactPair, "vijax.impact_pair(...)"))
+    fields = {name: value for name, value in given.items() if value is not None}
+    for name, value in fields.items():
+        check(name, value)
+    checks.shapes(**fields)
+    return pair
+
+
+def check_start(pair: ImpactPair, name: str, u: Any) -> None:
+    """Raise ValueError unless a displacement lies between rigid walls; soft ones may be entered, traced ones pass."""
+    if pair.kappa is not None or not is_concrete(pair.d, u):
+        return
+    u, half = np.broadcast_arrays(np.asarray(u), 0.5 * np.asarray(pair.d))
+    good = np.abs(u) <= half
+    if not good.all():
+        raise ValueError(
+            f"{name} must lie within the gap of a rigid wall, |{name}| <= d/2; got {name} = {checks.first(u, good)} "
+            f"at d = {2 * half[~good].flat[0]:g}"
+        )
 
 
 def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
@@ -418,11 +453,6 @@ def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
     arrays = [np.asarray(value) if isinstance(value, list | tuple) else value for value in given.values()]
     dtype = jnp.result_type(float, *arrays)  # float64, or float32 where all arrays are
     arrays = [jnp.asarray(array, dtype) for array in arrays]
-    try:
-        fields = dict(zip(given, jnp.broadcast_arrays(*arrays), strict=True))
-    except ValueError:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(given, arrays, strict=True))
-        raise ValueError(
-            f"d, kappa, r and gamma must broadcast to one shape; got {shapes}; a plane of them is what sweep makes"
-        ) from None
+    shape = checks.shapes(**dict(zip(given, arrays, strict=True)))
+    fields = {name: jnp.broadcast_to(array, shape) for name, array in zip(given, arrays, strict=True)}
     return ImpactPair(fields["d"], fields.get("kappa"), fields["r"], fields["gamma"])

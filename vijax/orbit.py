@@ -1,6 +1,7 @@
 """Periodic orbits, stable and unstable: from states or impact sequences, by Newton, each verified by the impact map."""
 
 import itertools
+import math
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,13 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vijax import flow, lanes, shooting, xla
-from vijax.curve import pieces
+from vijax import checks, flow, lanes, shooting, xla
+from vijax.curve import MOST_SAMPLES, pieces
 from vijax.energy import harvested_energy
 from vijax.impact_map import Next, next_impacts
 from vijax.label import label
-from vijax.method import whole
-from vijax.model import Harvester, Impact, ImpactPair, Status, WithStatus, check
+from vijax.model import Harvester, Impact, ImpactPair, Status, WithStatus, check_device, check_pair, check_start
 from vijax.shooting import Sequence
 from vijax.trajectory import trajectory
 
@@ -26,6 +26,9 @@ _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion tha
 _SAME = 1e-6  # how closely the impact map must meet the next impact of a real orbit
 _FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
 _TILES = (32, 256, 4096)  # orbits of one compiled call
+_MOST_PERIOD = 1000  # forcing periods of an orbit
+_MOST_IMPACTS, _MOST_SEQUENCES = 64, 10_000  # that a text may ask for
+_MOST_GUESSES = 10**7  # of all sequences together
 
 
 class Orbit(WithStatus):
@@ -74,7 +77,29 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impac
     Returns:
         Orbits in the order of the guesses, each with its `status`.
     """
+    checks.known("pair", check_pair(pair))
+    checks.instance("sequence", sequence, Sequence, "vijax.shooting.Sequence(...)")
+    if np.shape(pair.d) != np.shape(sequence.side)[:1]:
+        raise ValueError(f"pair must be one cell an orbit; got shape {np.shape(pair.d)}; impact_pair broadcasts")
+    if checks.numbers("knots", knots).shape != (*np.shape(sequence.side), 3) or np.ndim(knots) != 3:
+        raise ValueError(f"knots must have the shape (orbit, impact, 3) of sequence.side; got {np.shape(knots)}")
+    return _solved(pair, sequence, knots)
+
+
+def _solved(pair: ImpactPair, sequence: Sequence, knots: Any) -> Orbit:
     return _by_tiles(partial(_tile, _compiled(_shoot), _level(pair)), (pair, sequence, knots))
+
+
+def check_orbit(orbit: Any) -> Orbit:
+    """The orbits, if they are some, along a leading axis.
+
+    Raises:
+        ValueError: Anything else; a single one without its axis, too.
+    """
+    made = "vijax.orbit.search(pair, impacts)"
+    if np.ndim(checks.known("orbit", checks.instance("orbit", orbit, Orbit, made)).knots) != 3:
+        raise ValueError(f"orbit must keep its leading axis; got knots of shape {np.shape(orbit.knots)}; take [0:1]")
+    return orbit
 
 
 def _level(pair: ImpactPair) -> bool:
@@ -193,14 +218,17 @@ def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 
     Raises:
         ValueError: period below 1, settle below 0, or an inadmissible pair or state.
     """
-    period, settle = whole("period", period, 1), whole("settle", settle, 0)
-    _check_pair(pair)
-    u, v, t = (jnp.atleast_1d(jnp.asarray(x, float)) for x in (u, v, t))
-    shape = jnp.broadcast_shapes(u.shape, v.shape, t.shape, *(jnp.shape(x) for x in jax.tree.leaves(pair)))
+    period, settle = checks.whole("period", period, 1, _MOST_PERIOD), checks.whole("settle", settle, 0)
+    checks.known("pair", check_pair(pair))
+    given = {"u": u, "v": v, "t": t}
+    u, v, t = (jnp.atleast_1d(jnp.asarray(checks.finite(name, x), float)) for name, x in given.items())
+    shape = checks.shapes(u=u, v=v, t=t, d=pair.d, kappa=0 if pair.kappa is None else pair.kappa, r=pair.r)
+    check_start(pair, "u", u)
     pair = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), pair)
     u, v, t = (jnp.broadcast_to(x, shape) for x in (u, v, t))
-    if not bool(((t >= 0) & (t < 2)).all()):
-        raise ValueError(f"t must lie in [0, 2); got {t}")
+    inside = np.asarray((t >= 0) & (t < 2))
+    if not inside.all():
+        raise ValueError(f"t must lie in [0, 2); got {checks.first(t, inside)}")
     lost = jnp.zeros(shape, bool)
     if settle:
         last = jax.tree.map(lambda x: x[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
@@ -210,13 +238,13 @@ def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
     found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
     onset = 2 * found.n.astype(found.t.dtype) + found.t
-    inside = np.asarray((onset < onset[:, :1] + 2 * period - _SAME) & ~lost[:, None])
-    width = 1 << max(int(inside.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
-    mask = jnp.asarray(inside[:, :width])
+    around = np.asarray((onset < onset[:, :1] + 2 * period - _SAME) & ~lost[:, None])
+    width = 1 << max(int(around.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
+    mask = jnp.asarray(around[:, :width])
     side = jnp.where(mask, found.side[:, :width], 0)
     knots = jnp.stack([onset[:, :width], jnp.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
     span = jnp.full(shape, 2.0 * period)
-    return solve(pair, Sequence(side, span, jnp.zeros(shape, bool)), knots)
+    return _solved(pair, Sequence(side, span, jnp.zeros(shape, bool)), knots)
 
 
 def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
@@ -238,37 +266,54 @@ def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses
 
     Source: Eqs. (28)-(29) ask for one sequence from one guess.
     """
-    guesses = whole("guesses", guesses, 1)
-    _check_pair(pair)
-    if jnp.ndim(pair.d):
-        raise ValueError(f"pair must be one cell; got {jnp.size(pair.d)} of them; search each")
+    checks.known("pair", check_pair(pair))
+    if any(np.ndim(x) for x in jax.tree.leaves(pair)):
+        raise ValueError(f"pair must be one cell; got shape {np.shape(pair.d)}; search each")
     every, period = sequences(impacts, period)
-    draw = np.random.default_rng(seed)
+    check_guesses(guesses, len(every))
+    draw = np.random.default_rng(checks.seed(seed))
     found = [_search(pair, walls, period, guesses, draw) for walls in every]
     return distinct(concatenate(found))
 
 
-def _check_pair(pair: ImpactPair) -> None:
-    for name in ("d", "kappa", "r", "gamma"):
-        if getattr(pair, name) is not None:
-            check(name, getattr(pair, name))
+def check_guesses(guesses: Any, sequences: int) -> None:
+    """Raise ValueError unless so many guesses can be tried of each of some sequences."""
+    checks.whole("guesses", guesses, 1, _MOST_GUESSES // sequences)
 
 
 def sequences(impacts: str, period: int | None = None) -> tuple[list[tuple[int, ...]], int]:
     """Cyclically distinct sequences of walls that a text asks for, and the period; see `search`."""
     walls = {"L": -1, "R": 1}
-    if impacts and set(impacts.upper()) <= set(walls):
-        return [tuple(walls[letter] for letter in impacts.upper())], 1 if period is None else whole("period", period, 1)
-    match = re.fullmatch(r"(\d+):(\d+)(?:/([1-9]\d*)T)?", impacts)
-    if match is None or int(match[1]) + int(match[2]) == 0:
-        raise ValueError(f"impacts must be walls such as RLL or a label such as 1:2/2T; got {impacts!r}")
-    named = int(match[3] or 1)
+    match = (
+        re.fullmatch(r"[LRlr]+|([0-9]+):([0-9]+)(?:/([1-9][0-9]*)T)?", impacts) if isinstance(impacts, str) else None
+    )
+    if match is None:
+        raise ValueError(f"impacts must be walls such as RLL or a label such as 1:2/2T; got {checks.shown(impacts)}")
+    period = None if period is None else checks.whole("period", period, 1, _MOST_PERIOD)
+    if match[1] is None:
+        _check_count(impacts, len(impacts), 1)
+        return [tuple(walls[letter] for letter in impacts.upper())], period or 1
+    left, right, named = (_number(impacts, digits) for digits in (match[1], match[2], match[3] or "1"))
+    _check_count(impacts, left + right, math.comb(left + right, left) if left + right <= _MOST_IMPACTS else 0)
     if period not in (None, named):
         raise ValueError(f"period must agree with the label {impacts}; got {period}")
-    left, right = int(match[1]), int(match[2])
     places = itertools.combinations(range(left + right), left)
     every = (tuple(-1 if i in lefts else 1 for i in range(left + right)) for lefts in places)
     return sorted({min(walls[i:] + walls[:i] for i in range(len(walls))) for walls in every}), named
+
+
+def _number(impacts: str, digits: str) -> int:
+    """A number of a label; thousands of digits are more than Python takes for one."""
+    return checks.whole(f"impacts {checks.shown(impacts)}: each number", int(digits[:10]), 0, _MOST_PERIOD)
+
+
+def _check_count(impacts: str, count: int, orders: int) -> None:
+    """Raise unless so many impacts, in so many orders, can be looked for."""
+    if not 1 <= count <= _MOST_IMPACTS or orders > _MOST_SEQUENCES:
+        raise ValueError(
+            f"impacts must be 1 to {_MOST_IMPACTS}, in at most {_MOST_SEQUENCES:,} orders; "
+            f"got {checks.shown(impacts)}; write the walls in their order, as in RLL"
+        )
 
 
 def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int, draw: np.random.Generator) -> Orbit:
@@ -282,12 +327,12 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     wide = jax.tree.map(lambda x: jnp.broadcast_to(x, guesses), pair)
     side = jnp.broadcast_to(jnp.asarray(walls, jnp.int32), (guesses, count))
     span = jnp.full(guesses, 2.0 * period)
-    return solve(wide, Sequence(side, span, jnp.zeros(guesses, bool)), jnp.asarray(knots))
+    return _solved(wide, Sequence(side, span, jnp.zeros(guesses, bool)), jnp.asarray(knots))
 
 
 def distinct(orbit: Orbit) -> Orbit:
     """The orbits that are there, each once whichever impact it was begun with."""
-    good = np.flatnonzero(np.asarray(orbit.status) == Status.OK)
+    good = np.flatnonzero(np.asarray(check_orbit(orbit).status) == Status.OK)
     rounded = np.round(np.asarray(marks(orbit))[good] / _SAME)
     _, first = np.unique(rounded, axis=0, return_index=True)
     return orbit[np.sort(good[first])]
@@ -308,7 +353,7 @@ def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
 
 def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"]:
     """Whether each orbit, run through once, is its own mirror image half a span later."""
-    host = jax.tree.map(np.asarray, orbit)
+    host, tolerance = jax.tree.map(np.asarray, check_orbit(orbit)), checks.positive("tolerance", tolerance)
     count = host.count
     index = np.arange(host.knots.shape[1])
     half = np.where(index < (count // 2)[:, None], index + (count // 2)[:, None], index)
@@ -326,8 +371,10 @@ def halved(orbit: Orbit) -> Orbit:
     Raises:
         ValueError: An orbit that is not symmetric.
     """
-    if not bool(symmetric(orbit).all()):
-        raise ValueError(f"orbit must be symmetric to be closed half way; got {np.asarray(symmetric(orbit))}")
+    good = symmetric(orbit)
+    if not good.all():
+        index = int(np.argmin(good))
+        raise ValueError(f"orbit must be symmetric to be closed half way; got one that is not at index {index}")
     if bool(orbit.sequence.mirrored.all()):
         return orbit
     host = jax.tree.map(np.asarray, orbit)
@@ -335,17 +382,17 @@ def halved(orbit: Orbit) -> Orbit:
     width = host.knots.shape[1] // 2
     side = np.where(kept, host.sequence.side, 0)[:, :width]
     sequence = Sequence(jnp.asarray(side), 0.5 * host.sequence.span, jnp.ones(len(orbit), bool))
-    return solve(host.pair, sequence, jnp.asarray(np.where(kept[..., None], host.knots, 0.0)[:, :width]))
+    return _solved(host.pair, sequence, jnp.asarray(np.where(kept[..., None], host.knots, 0.0)[:, :width]))
 
 
 def doubled(orbit: Orbit) -> Orbit:
     """Orbits run through twice, or in full where they were closed half way."""
-    return _unfolded(orbit, np.ones(len(orbit), bool))
+    return _unfolded(check_orbit(orbit), np.ones(len(orbit), bool))
 
 
 def unfolded(orbit: Orbit) -> Orbit:
     """Orbits in full, those closed half way too."""
-    mirrored = np.asarray(orbit.sequence.mirrored)
+    mirrored = np.asarray(check_orbit(orbit).sequence.mirrored)
     return _unfolded(orbit, mirrored) if mirrored.any() else orbit
 
 
@@ -430,7 +477,10 @@ def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
 
     Source: Eq. (36), corrected.
     """
-    energy = jnp.where(orbit.sequence.real, harvested_energy(device, orbit.depth * depth_unit(orbit, device)), 0.0)
+    check_device(device)
+    energy = jnp.where(
+        check_orbit(orbit).sequence.real, harvested_energy(device, orbit.depth * depth_unit(orbit, device)), 0.0
+    )
     return energy.sum(axis=1) / orbit.sequence.span
 
 
@@ -448,6 +498,7 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
         Time, displacement and velocity, each [orbit, instant], in order; NaN where padded. Velocity jumps at a rigid
         wall.
     """
+    samples = checks.whole("samples", samples, 1, MOST_SAMPLES)
     full, hits = unfolded(orbit), impacts(orbit)
     until = _compiled_passages(full.pair, full.sequence, full.knots).next_t
     t, stay, side = full.knots[..., 0], full.knots[..., 2], hits.side.astype(until.dtype)

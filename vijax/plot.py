@@ -18,12 +18,12 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import EngFormatter
 
+from vijax import checks
 from vijax.compare import Label, Model
 from vijax.dataset import best
 from vijax.label import label
 from vijax.panels import LABEL_NEEDS, NEEDS, is_kind, layout, layout_of_kinds
-from vijax.store import replacing
-from vijax.style import STYLE, axis_label, check_format, equations, title, units
+from vijax.style import STYLE, axis_label, check_format, equations, save_figure, title, units
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -74,10 +74,14 @@ class _Mark(NamedTuple):
 
 
 class _Kind(NamedTuple):
-    """A kind of picture: what it colours and how, the variables it needs and those it can do without, its marks."""
+    """A kind of picture: what it colours and how, which function makes such maps, the variables that it needs.
+
+    And those that it can do without, its marks.
+    """
 
     coloured: str
     label: str
+    made: str
     needs: tuple[str, ...]
     optional: tuple[str, ...]
     colours: "Callable[[xr.Dataset], Normalize]"
@@ -116,14 +120,17 @@ def variable_map(dataset: "xr.Dataset", name: str, path: str | Path | None = Non
     Raises:
         ValueError: As `power_map`.
     """
-    _need(dataset, (name,))
+    checks.variables("dataset", dataset, (), "sweep")
+    checks.choice("name", name, [str(one) for one in dataset])
     variable = dataset[name]
     if is_kind(variable):
         return _coded(*_kinds(dataset, name), path)
     if variable.dtype.kind == "i":
         dataset = dataset.assign({name: variable.where(variable >= 0)})  # -1 is none
     written = name.replace("_", " ") + (f" [{units(variable)}]" if units(variable) else "")
-    kind = _Kind(name, written, (name,), (*NEEDS,), partial(_number_colours, name), partial(_number_marks, name))
+    kind = _Kind(
+        name, written, "sweep", (name,), (*NEEDS,), partial(_number_colours, name), partial(_number_marks, name)
+    )
     return _picture(dataset, kind, path)
 
 
@@ -141,7 +148,7 @@ def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     Raises:
         ValueError: As `power_map`.
     """
-    _need(dataset, LABEL_NEEDS)
+    checks.variables("dataset", dataset, LABEL_NEEDS, "sweep")
     period = dataset["period"]
     level = (dataset["gamma"] == 0).broadcast_like(period).transpose(*period.dims)
     words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
@@ -162,7 +169,7 @@ def basin_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     Raises:
         ValueError: As `power_map`.
     """
-    _need(dataset, ("basin", "label", "fraction", "P"))
+    checks.variables("dataset", dataset, ("basin", "label", "fraction", "P"), "basins")
     further = [dim for dim in dataset["P"].dims if dim not in (*dataset["basin"].dims, "attractor")]
     dataset = dataset.isel(dict.fromkeys(further, 0))
     drawn = dataset.assign(code=dataset["basin"].clip(max=_MOST_NAMED)).drop_vars("basin")
@@ -179,7 +186,7 @@ def multistability_map(dataset: "xr.Dataset", path: str | Path | None = None) ->
     Raises:
         ValueError: As `power_map`.
     """
-    _need(dataset, ("attractors",))
+    checks.variables("dataset", dataset, ("attractors",), "basin_fractions")
     number = dataset["attractors"]
     most = int(number.max())
     shades = mpl.colormaps["viridis_r"](np.linspace(0, 1, most + 1))
@@ -209,17 +216,8 @@ def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Fig
     return _picture(dataset, _DIFFERENCE, path)
 
 
-def _need(dataset: "xr.Dataset", names: tuple[str, ...]) -> None:
-    missing = [name for name in names if name not in dataset]
-    if missing:
-        raise ValueError(
-            f"plot must have {', '.join(names)}; got a map without {', '.join(missing)}; "
-            "variable_map (--show NAME) draws any variable that there is"
-        )
-
-
 def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
-    _need(dataset, kind.needs)
+    checks.variables("dataset", dataset, kind.needs, kind.made, "variable_map (--show NAME) draws any that there is")
     if path is not None:
         check_format(path)
     whole = dataset[kind.coloured]
@@ -232,8 +230,7 @@ def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Fig
     with mpl.rc_context(STYLE):
         figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 
@@ -425,10 +422,11 @@ def _difference_marks(dataset: "xr.Dataset") -> list[_Mark]:
     return [*marks, _Mark(bare, "bare", _BARE, "no difference, or failed")]
 
 
-_POWER = _Kind("P", "$P$ [J per half period]", NEEDS, (), _power_colours, _power_marks)
+_POWER = _Kind("P", "$P$ [J per half period]", "sweep", NEEDS, (), _power_colours, _power_marks)
 _DIFFERENCE = _Kind(
     "relative_difference",
     r"$|P_\mathrm{rigid} - P_\mathrm{soft}| / P_\mathrm{soft}$",
+    "compare",
     ("relative_difference", "label"),
     ("cheapest_model",),
     _difference_colours,
@@ -470,8 +468,7 @@ def _coded(dataset: "xr.Dataset", categories: list[_Category] | None, path: str 
             _list_categories(figure, categories, loc="outside right upper")
         figure.suptitle(title(dataset), fontsize="medium")
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 

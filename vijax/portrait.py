@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from vijax.store import replacing
-from vijax.style import STYLE
+from vijax.style import STYLE, save_figure
 
 _STYLE: Any = STYLE | {
     "axes.titlesize": "medium",
@@ -146,8 +145,7 @@ def small_multiples(
         )
         legend.get_title().set_fontsize("small")
         if path is not None:
-            with replacing(Path(path)) as part:
-                figure.savefig(part)
+            save_figure(figure, path)
     return figure
 
 

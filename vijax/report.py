@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vijax.design import Design, Optimum
+from vijax import checks
+from vijax.design import Design, Optimum, Spread
 from vijax.energy import energy_ratio
 from vijax.model import CONSTANTS
 from vijax.objective import OBJECTIVES
@@ -29,7 +30,7 @@ def describe(
     surroundings: Surroundings | None = None,
     diagram: "xr.Dataset | None" = None,
     tolerances: Sequence[Tolerance] = (),
-    spread: Any = None,
+    spread: Spread | None = None,
 ) -> dict[str, Any]:
     """All of a design as nested dicts and lists of numbers and words.
 
@@ -43,6 +44,14 @@ def describe(
         `best` (None if no admissible orbit was found), `others`, and what was asked. With `diagram`, `highest`: the
         largest P it holds, admissible or not, which is what an optimiser without constraints would report.
     """
+    checks.instance("design", design, Design, "vijax.optimise(...)")
+    if surroundings is not None:
+        checks.instance("surroundings", surroundings, Surroundings, "vijax.surroundings.surroundings(...)")
+    if spread is not None:
+        checks.instance("spread", spread, Spread, "vijax.design.under(...)")
+    if diagram is not None:
+        checks.variables("diagram", diagram, ("P", "max_penetration", "energy_ratio", "admissible"), "orbit_diagram")
+    checks.sequence("tolerances", tolerances, Tolerance, "vijax.tolerance.Tolerance records")
     return {
         "tune": list(design.tune),
         "bounds": {name: list(pair) for name, pair in design.bounds.items()},
@@ -61,6 +70,7 @@ def describe(
 
 def optimum(one: Optimum) -> dict[str, Any]:
     """An optimum as plain data; per impact: penetration, energy, energy given to the membrane, their ratio."""
+    checks.instance("one", one, Optimum, "vijax.optimise(...).best")
     state, device = one.state, one.device
     count = int(np.asarray(one.orbit.count)[0])
     energy, work = state.energy[:count], state.work[:count]
@@ -141,6 +151,7 @@ def quantity(name: str, value: float) -> str:
 
 def lines(report: dict[str, Any]) -> Iterator[str]:
     """What a builder needs to know before trusting a design, from what `describe` returned."""
+    checks.record("report", report, ("bounds", "objective", "best"), "vijax.report.describe")
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in report["bounds"].items())
     yield f"tuned: {ranges}; objective {report['objective']}, {report['objective_means']}"
     yield f"survey: {report['survey']['orbits']:,} periodic attractors met, {report['starts']:,} climbed"
@@ -272,6 +283,7 @@ def _unconstrained(report: dict[str, Any]) -> Iterator[str]:
 
 def table(report: dict[str, Any]) -> Iterator[str]:
     """The best designs along an axis, a line each: `over`, its name and values, and `designs`, of `describe` each."""
+    checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
     name, values = report["over"]["name"], report["over"]["values"]
     for value, one in zip(values, report["designs"], strict=True):
         best = one["best"]

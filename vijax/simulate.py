@@ -1,6 +1,8 @@
 """Cells from start to summary: one compiled program for every kind of run, a tile of cells a call."""
 
+import dataclasses
 from functools import lru_cache, partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,14 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax import exact, lanes, quick, relay, traced, trips
+from vijax import checks, exact, lanes, quick, relay, traced, trips
 from vijax.cell import TRANSIENT_SHARE, Cell, Plan, Settings, blank_tally
+from vijax.membrane import HuntCrossley
 from vijax.method import Method, Ode
-from vijax.model import Harvester, ImpactPair
+from vijax.model import Harvester, ImpactPair, check_device, check_pair
 from vijax.quick import Lanes
 from vijax.recurrence import MAX_PERIOD, blank_candidate, recurrence, review, settled
 from vijax.summary import Summary, columns, pack, unload, unpack
 
+_FIELDS = tuple(field.name for field in dataclasses.fields(Summary))
 ENERGY = frozenset({"P", "P_stderr", "energy_ratio"})
 DEEP = ENERGY | {"deepest"}
 
@@ -122,6 +126,23 @@ def tolerances(dtype: str) -> dict[str, float]:
     }
 
 
+def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, Any], method: Method | None) -> None:
+    """Raise ValueError unless a tile of cells can be run: one-dimensional arrays of one length."""
+    if not isinstance(method, Method | None):
+        raise ValueError(f"method must be a record of vijax.method.choose, or None; got {checks.shown(method)}")
+    # Whoever carries cells of a Hunt-Crossley membrane has NaN for r.
+    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    checks.known("pair", check_pair(pair if lossy else dataclasses.replace(pair, r=None)))
+    check_device(device)
+    checks.instance("scale", scale, Scale, "vijax.simulate.Scale(...)")
+    cells = np.shape(pair.d)
+    if len(cells) != 1 or any(np.shape(field) != cells for field in jax.tree.leaves(pair)):
+        raise ValueError(f"pair must hold 1-D arrays of one length; got shape {cells}; impact_pair broadcasts them")
+    for name, start in starts.items():
+        if checks.finite(name, start).shape != cells:
+            raise ValueError(f"{name} must hold a number a cell, shape {cells}; got shape {np.shape(start)}")
+
+
 def summarise(
     pair: ImpactPair,
     u0: Float[Array, "cell"],
@@ -154,7 +175,17 @@ def summarise(
 
     Returns:
         The summary; a cell that fails says so in `status` and holds NaN.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
     """
+    _check(pair, device, scale, {"u0": u0, "v0": v0}, method)
+    periods, transient = checks.whole("periods", periods, 1), checks.whole("transient", transient, 0)
+    checks.choice("until", until, ("attractor", "window"))
+    outputs = frozenset(checks.words("outputs", outputs, _FIELDS))
+    if on is not None:
+        checks.instance("on", on, jax.Device, "jax.devices()[0]")
+    count = pair.d.shape[0] if count is None else checks.whole("count", count, 0, pair.d.shape[0])
     dtype = pair.d.dtype
     plan = Plan(
         until=until,
@@ -177,8 +208,7 @@ def summarise(
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
     )
-    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
-    given = cells, number, settings
+    given = cells, jnp.asarray(count, jnp.int32), settings
     given = given if on is None else jax.device_put(given, on)
     return unpack(plan, np.asarray(_compiled(plan, _width(pair.d.shape[0], plan.level))(*given)))
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import elimination, energy, flow, shooting
+from vijax import checks, elimination, energy, flow, shooting
 from vijax.clearance import Clearance, between
 from vijax.exact import implicit_root
-from vijax.model import Harvester, ImpactPair, Status, WithStatus
+from vijax.model import Harvester, ImpactPair, Status, WithStatus, check_device, check_pair
 from vijax.shooting import Knots, Sequence
 
 _CONVERGED = 1e-10  # residual of an orbit's equations
@@ -88,13 +88,28 @@ def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> 
 
     Returns:
         The record; NaN with a `status` where there is no attracting orbit.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
     """
+    _check(device, orbit, pair)
     rigid = orbit.pair.kappa is None
     pair = device.pair("rigid" if rigid else "soft") if pair is None else pair
     pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), pair)
     sequence = orbit.sequence
     guess = jnp.where(sequence.real[:, None], orbit.knots, 0.0)
     return response(device, pair, sequence, *find(pair, sequence, guess))
+
+
+def _check(device: Any, orbit: Any, pair: Any) -> None:
+    """Raise ValueError unless these are records of the right kind; what is traced passes unseen."""
+    check_device(device)
+    if not all(hasattr(orbit, name) for name in ("pair", "sequence", "knots")):
+        raise ValueError(f"orbit must be one of a vijax.orbit.Orbit; got {checks.shown(orbit)}; take found[0]")
+    if jnp.ndim(orbit.knots) != 2:
+        raise ValueError(f"orbit must be a single one; got knots of shape {jnp.shape(orbit.knots)}; take found[0]")
+    if pair is not None and (check_pair(pair).kappa is None) != (orbit.pair.kappa is None):
+        raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
 
 
 def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Float[Array, ""]]:

@@ -1,9 +1,7 @@
-"""Maps on disk: zarr stores that are whole or absent, each chunk with a checksum; reports as strict JSON."""
+"""Maps on disk: zarr stores that are whole or absent, each chunk with a checksum, every file in an inventory."""
 
-import json
-import math
 import os
-import shutil
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,56 +9,52 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vijax import checks, inventory
+from vijax.files import check_ending, check_folder, recover, replacing_folder
+
 if TYPE_CHECKING:
     import xarray as xr
 
 _LEVEL = 1  # of compression; 3 takes twice as long to save a thousandth
 
 
-def check_output(name: str, path: str | Path, overwrite: bool = False) -> Path:
-    """The path, if something can be written there; `name` is the argument that an error speaks of.
+def check_store(name: str, path: str | Path, overwrite: bool = False) -> Path:
+    """Check that a new store can be written, and give its path; `name` is the argument that an error speaks of.
 
     Raises:
-        FileExistsError: If it is taken, and not ours to overwrite.
+        ValueError: If it has another ending than stores have.
+        FileExistsError: If it is taken, and may not be replaced: what vijax did not write never.
         FileNotFoundError, PermissionError: If its folder is missing or closed.
     """
-    target = Path(path)
-    folder = target.absolute().parent
-    if not target.name:
-        raise FileNotFoundError(f"{name} must name a file; got {str(path)!r}")
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{name} must lie in a folder that exists; got {path}; make {folder} first")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise PermissionError(f"{name} must lie in a folder that can be written; got {path}")
-    if target.is_symlink() or target.exists():
+    target = check_place(name, path)
+    if os.path.lexists(target):
         if not overwrite:
             raise FileExistsError(f"{name} must not exist yet; got {path}; allow overwriting, or take another name")
-        # A slip of the hand must not delete a folder of other things.
-        if target.is_dir() and not (target / "zarr.json").is_file():
-            raise FileExistsError(f"{name} must not replace a folder that is no zarr store; got {path}")
+        check_ours(name, target)
     return target
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary sibling to write, renamed to `path` when the block succeeds and removed when it does not."""
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    old = path.with_name(f".{path.stem}.{os.getpid()}.old{path.suffix}")
-    try:
-        yield part
-        if path.is_dir():  # a folder cannot be renamed onto another
-            path.rename(old)
-        part.replace(path)
-    except BaseException:  # Ctrl-C too
-        if old.exists() and not path.exists():
-            old.rename(path)
-        raise
-    finally:
-        for leftover in (part, old):
-            if leftover.is_dir():
-                shutil.rmtree(leftover, ignore_errors=True)
-            else:
-                leftover.unlink(missing_ok=True)
+def check_place(name: str, path: str | Path) -> Path:
+    """Check that a store can have this name, and give its path; what a killed run left there is put right.
+
+    Raises:
+        ValueError, FileNotFoundError, PermissionError: As `check_store`.
+    """
+    check_ending(name, path, ".zarr")
+    target = check_folder(name, path)
+    recover(target)
+    return target
+
+
+def check_ours(name: str, target: Path) -> None:
+    """Raise FileExistsError unless something is a store and all that it holds was written by vijax."""
+    if target.is_dir() and (stranger := inventory.foreign(target)):
+        raise FileExistsError(
+            f"{name} must not replace what vijax did not write; got {target}, which holds {stranger}; "
+            "move it elsewhere, or take another name"
+        )
+    if not inventory.is_store(target):
+        raise FileExistsError(f"{name} must not replace what is no store of vijax; got {target}; take another name")
 
 
 def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) -> None:
@@ -68,21 +62,37 @@ def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) ->
 
     Args:
         dataset: What `sweep` returned, or any part of it.
-        path: Folder to make.
+        path: Folder to make; it ends in .zarr.
         overwrite: Replace a store that is there.
 
     Raises:
-        FileExistsError, FileNotFoundError, PermissionError: As `check_output`.
+        ValueError, FileExistsError, FileNotFoundError, PermissionError: As `check_store`.
     """
-    target = check_output("path", path, overwrite)
-    with replacing(target) as part:
+    checks.variables("dataset", dataset, (), "sweep")
+    target = check_store("path", path, checks.flag("overwrite", overwrite))
+    with replacing_folder(target) as part:
         write(dataset, part)
+        seal(part)
 
 
 def write(dataset: "xr.Dataset", path: Path) -> None:
-    """Write a new store."""
+    """Write a new store, which others may add to before it is sealed."""
     encoding = {name: {"compressors": compressors()} for name in dataset.variables}
     dataset.to_zarr(path, mode="w-", zarr_format=3, consolidated=False, encoding=encoding)
+
+
+def seal(path: Path, **facts: Any) -> None:
+    """Consolidate the metadata of a new store, so that it opens at once anywhere, and list its files; see `inventory`.
+
+    The metadata of a study do not change with its tiles: they are consolidated before there is any.
+    """
+    import zarr
+
+    with warnings.catch_warnings():
+        # A reader that does not know of them finds the same in every array.
+        warnings.filterwarnings("ignore", "Consolidated metadata", UserWarning)
+        zarr.consolidate_metadata(path)
+    inventory.write(path, **facts)
 
 
 def compressors() -> tuple[Any, ...]:
@@ -106,35 +116,43 @@ def load(path: str | Path) -> "xr.Dataset":
 
     Raises:
         FileNotFoundError: If there is no store.
-        ValueError: If a checksum does not match.
+        ValueError: If a file of it is not what was written; FileExistsError if a folder stands in its place.
     """
+    path = checks.path("path", path)
     with view(path) as dataset:
-        return dataset.load()
+        _check(path, inventory.records(path))
+        with _in_one_line(path):
+            return dataset.load()
 
 
 def view(path: str | Path) -> "xr.Dataset":
-    """As `load`, but nothing is read before it is looked at."""
+    """As `load`, but nothing is read before it is looked at, nor are the files of tiles compared with their records."""
     import xarray as xr  # here, as importing vijax must not load it
 
-    if not (Path(path) / "zarr.json").is_file():
+    target = Path(path)
+    if not (target / "zarr.json").is_file() and not inventory.is_store(target):
         raise FileNotFoundError(f"path must name a zarr store written by vijax; got {path}")
-    return xr.open_zarr(path, consolidated=False, chunks=None)
+    _check(target, inventory.listed(target))
+    # What has no list may be of an earlier version, whose metadata are not consolidated.
+    with _in_one_line(path):
+        return xr.open_zarr(path, consolidated=inventory.read(target) is not None, chunks=None)
 
 
-def write_json(report: Any, path: Path) -> None:
-    """Write nested dicts, sequences, arrays and numbers as strict JSON, whole or not at all; not finite is null."""
-    text = json.dumps(_plain(report), indent=1, allow_nan=False)
-    with replacing(path) as part:
-        part.write_text(text + "\n", encoding="utf-8")
+def _check(path: Path, faults: Iterator[tuple[str, str]]) -> None:
+    """Raise ValueError with the first of some faults, if there is any."""
+    name, reason = next(faults, ("", ""))
+    if reason:
+        remedy = "run again, the call that made it mends it" if inventory.is_study(path) else "make it anew"
+        raise ValueError(f"path must name a store as it was written; got {path}, where {name} {reason}; {remedy}")
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(name): _plain(one) for name, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    if hasattr(value, "__array__"):
-        return _plain(np.asarray(value).tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+@contextmanager
+def _in_one_line(path: str | Path) -> Iterator[None]:
+    """What zarr and xarray say of a store that has no list, and that they cannot read."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"path must name a store that can be read; got {path} ({said}); make it anew") from error

@@ -5,27 +5,26 @@ record is written last, after its chunks, and tells how and by what the tile was
 Records and lock lie beside the chunks of `status`, where no reader of zarr looks.
 """
 
-import json
+import logging
 import math
 import os
 import shutil
 import time
 import uuid
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vijax import frame, inventory
 from vijax.axes import Cells
-from vijax.dataset import Plan, asked, coordinates, made_by, provenance, specimen
+from vijax.dataset import Plan, made_by
+from vijax.files import beside, replacing, replacing_folder, write_json
 from vijax.lanes import places
-from vijax.model import Status
-from vijax.store import check_output, compressors, encoded, replacing, view, write_json
-from vijax.store import write as write_store
+from vijax.store import check_place, check_store, encoded, view
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,8 +34,8 @@ SMALLEST_TILE, LARGEST_TILE = 1024, 32768
 _SHARES = 2  # tiles of a small plane for everyone who takes some: blocks do not cost the same
 _ROUNDING = 1.1  # of such a share: halves of odd lengths are rounded up
 _LARGEST_CHUNK = 1 << 21  # numbers: of many variants a tile has fewer cells
-_RECORDS = Path("status", "tiles")
-_SHOWN = 3  # of the settings that differ
+_LONGEST_BIRTH = 100  # characters: of a lock file that somebody wrote over no more are read
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ class Tile:
 
 
 def _record(path: Path, tile: int) -> Path:
-    return path / _RECORDS / f"{tile}.json"
+    return path / inventory.TILES / f"{tile}.json"
 
 
 def extents(sizes: dict[str, int], most: int) -> dict[str, int]:
@@ -147,24 +146,25 @@ def blocks(of: Cells) -> dict[str, int]:
 
 
 def check(planned: Plan, path: str | Path, overwrite: bool = False) -> None:
-    """Raise unless the plane can be written there, or goes on there; makes nothing.
+    """Raise unless the plane can be written there, or goes on there; makes nothing, and mends what is damaged.
 
     Raises:
+        ValueError: If there is what is no name of a store.
         FileExistsError: If there is something else, or another plane, and it is not to be replaced.
         BlockingIOError: If another run writes there.
         FileNotFoundError, PermissionError: If the place cannot be written.
     """
     target = _target(path, overwrite)
-    if target.exists() and not overwrite:
-        _check_same(planned, target)
     if target.exists():
         with _locked(target, overwrite):
-            pass
+            if not overwrite:
+                _check_same(planned, target)
 
 
 def _target(path: str | Path, overwrite: bool) -> Path:
     """Where to write: nothing is there, or a store, or what may be replaced."""
-    return check_output("out", path, overwrite or (Path(path) / "zarr.json").is_file())
+    target = check_place("out", path)
+    return target if inventory.is_store(target) and not overwrite else check_store("out", path, overwrite)
 
 
 @contextmanager
@@ -178,7 +178,7 @@ def opened(planned: Plan, path: str | Path, overwrite: bool = False) -> Iterator
     if not target.exists():
         _make(planned, target)
     elif overwrite:
-        with _locked(target, overwrite), replacing(target) as part:
+        with _locked(target, overwrite), replacing_folder(target) as part:
             _write_blank(planned, part)
     with _locked(target):
         _check_same(planned, target)
@@ -187,7 +187,7 @@ def opened(planned: Plan, path: str | Path, overwrite: bool = False) -> Iterator
 
 def _make(planned: Plan, target: Path) -> None:
     """A store without any tile, unless another run was faster."""
-    part = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
+    part = beside(target, "part")
     try:
         _write_blank(planned, part)
         part.rename(target)
@@ -199,35 +199,20 @@ def _make(planned: Plan, target: Path) -> None:
 
 
 def _write_blank(planned: Plan, path: Path) -> None:
-    import xarray as xr
-    import zarr
-
-    of = planned.cells
-    write_store(xr.Dataset(coords=coordinates(of), attrs=provenance(planned)), path)
-    group = zarr.open_group(path, mode="r+")
-    tile = blocks(of)
-    for name, variable in specimen(planned).data_vars.items():
-        group.create_array(
-            str(name),
-            shape=tuple(of.sizes[str(dim)] for dim in variable.dims),
-            chunks=tuple(tile.get(str(dim), of.sizes[str(dim)]) for dim in variable.dims),
-            dtype=variable.dtype,
-            fill_value=_void(str(name), variable.dtype),
-            compressors=compressors(),
-            dimension_names=[str(dim) for dim in variable.dims],
-            attributes=variable.attrs,
-        )
-    (path / _RECORDS).mkdir()
-    _lock(path).write_text(uuid.uuid4().hex, encoding="utf-8")
+    birth = uuid.uuid4().hex
+    frame.write(planned, blocks(planned.cells), birth, path)
+    _lock(path).parent.mkdir()
+    _lock(path).write_text(birth, encoding="utf-8")
 
 
 def _lock(path: Path) -> Path:
     """The file that a writer of the store locks; within, the birth of the store."""
-    return path / _RECORDS / "lock"
+    return path / inventory.TILES / "lock"
 
 
 def _birth(path: Path) -> str:
-    return _lock(path).read_text(encoding="utf-8")
+    with _lock(path).open("rb") as lock:
+        return lock.read(_LONGEST_BIRTH).decode(errors="replace")
 
 
 def _most(of: Cells) -> int:
@@ -235,13 +220,6 @@ def _most(of: Cells) -> int:
     share = max(int(_ROUNDING * of.count / (_SHARES * len(places()))), SMALLEST_TILE)
     room = _LARGEST_CHUNK // math.prod(of.sizes[dim] for dim in of.variant)
     return min(share, LARGEST_TILE, max(room, 1))
-
-
-def _void(name: str, dtype: np.dtype) -> Any:
-    """What a variable holds where nothing was run."""
-    if name == "status":
-        return int(Status.NOT_RUN)
-    return {"f": np.nan, "i": -1, "b": False}[dtype.kind]
 
 
 def _found(planned: Plan, path: Path) -> Study:
@@ -257,8 +235,7 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
     """Alone with a store; the lock ends with its process, however that ends. What was saved whole nobody writes."""
     import fcntl
 
-    lock = _lock(path)
-    if not lock.exists():
+    if not inventory.is_study(path):
         if not overwrite:
             raise FileExistsError(
                 f"out must be new or the store of a run that can go on; got {path}, which was saved whole; "
@@ -266,7 +243,13 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
             )
         yield
         return
+    lock = _lock(path)
+    odd = inventory.fault(lock, None) in ("is missing", "is no regular file")
     try:
+        if odd:
+            lock.unlink(missing_ok=True)
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            lock.touch()
         file = lock.open("r+")
     except OSError as error:
         raise PermissionError(f"out must be a store that can be written; got {path} ({error.strerror})") from None
@@ -275,44 +258,17 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BlockingIOError(f"out must not be in use; got {path}, which another run is writing") from None
+        if (listed := inventory.read(path)) and listed["birth"] != _birth(path):
+            file.truncate(0)
+            file.write(listed["birth"])
+            file.flush()
         yield
 
 
 def _check_same(planned: Plan, path: Path) -> None:
-    with view(path) as store:
-        found = list(_differences(planned, store))
-    if found:
-        more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
-        raise FileExistsError(
-            f"out must be new or hold the same plane; got {path}, where {'; '.join(found[:_SHOWN])}{more}; "
-            "allow overwriting, or take another name"
-        )
-
-
-def _differences(planned: Plan, store: "xr.Dataset") -> Iterator[str]:
-    """What was asked otherwise than the store has it, a phrase each."""
-    for name, value in json.loads(json.dumps(asked(planned))).items():
-        if store.attrs.get(name, "left out") != value:
-            yield f"{name} is {store.attrs.get(name, 'left out')}, and not {value}"
-    axes = coordinates(planned.cells)
-    for name in dict.fromkeys([*axes, *map(str, store.coords)]):
-        here, there = axes.get(name), store.coords.get(name)
-        if here is None or there is None or here.dims != there.dims or not _equal(here.values, there.values):
-            yield f"{name} is {_words(there)}, and not {_words(here)}"
-
-
-def _equal(one: np.ndarray, other: np.ndarray) -> bool:
-    return np.array_equal(one, other, equal_nan=True)
-
-
-def _words(values: "xr.Variable | xr.DataArray | None") -> str:
-    """A coordinate in a few words."""
-    if values is None:
-        return "left out"
-    if values.ndim == 0:
-        return f"{float(values)}"
-    first, last = (float(values.values.flat[at]) for at in (0, -1))
-    return f"{values.size} values over {', '.join(map(str, values.dims))} from {first} to {last}"
+    """Raise unless a store holds this plane; what is damaged of it, but for its tiles, is mended."""
+    frame.mend(planned, blocks(planned.cells), _birth(path), path, _LOG.warning)
+    frame.check_same(planned, path)
 
 
 # --- what is done, what is left --------------------------------------------------------------------------------------
@@ -320,12 +276,12 @@ def _words(values: "xr.Variable | xr.DataArray | None") -> str:
 
 def left(study: Study, say: Callable[[str], None]) -> list[int]:
     """Tiles that are not done, and those whose files are no longer what was written; of these is said why."""
-    for half_written in study.path.rglob("*.part*"):  # what a killed process was at
-        half_written.unlink(missing_ok=True)  # a worker that lost its driver may still be writing
+    for file in inventory.half_written(study.path):
+        file.unlink(missing_ok=True)  # a worker that lost its driver may still be writing
     found = []
     for tile in study.tiles:
         record = study.record(tile)
-        if not record.exists():
+        if not os.path.lexists(record):
             found.append(tile)
         elif reason := _damage(study, tile):
             record.unlink()
@@ -336,18 +292,17 @@ def left(study: Study, say: Callable[[str], None]) -> list[int]:
 
 def _damage(study: Study, tile: int) -> str:
     """What is wrong with the files of a tile, nothing if all are as they were written."""
-    try:
-        record = json.loads(study.record(tile).read_text(encoding="utf-8"))
-        birth, prints = record["birth"], record["files"]
-    except (ValueError, KeyError, TypeError):
+    record = inventory.content(study.record(tile))
+    if record is None or not isinstance(record.get("files"), dict):
+        inventory.fault(study.record(tile), None)
         return "its record cannot be read"
-    if birth != study.birth:
+    if record.get("birth") != study.birth:
         return "its record is of another store"
     for name, file in _files(study.path, study.dims, study.place(tile)):
-        if not file.exists():
-            return f"{file.relative_to(study.path)} is missing"
-        if _print(file.read_bytes()) != prints.get(name):
-            return f"{file.relative_to(study.path)} is not what was written"
+        relative = file.relative_to(study.path).as_posix()
+        # Earlier versions wrote fingerprints under the names of variables.
+        if reason := inventory.fault(file, record["files"].get(relative, record["files"].get(name))):
+            return f"{relative} {reason}"
     return ""
 
 
@@ -355,11 +310,6 @@ def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, 
     """The chunk of every variable of a tile."""
     for name, along in dims.items():
         yield name, path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in along))
-
-
-def _print(content: bytes) -> str:
-    """Length and checksum of a file."""
-    return f"{len(content)} bytes, CRC-32 {zlib.crc32(content):08x}"
 
 
 def write(tile: Tile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
@@ -380,7 +330,7 @@ def write(tile: Tile, found: "Mapping[str, xr.Variable]", seconds: float) -> Non
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as part:
             part.write_bytes(content)
-        prints[name] = _print(content)
+        prints[file.relative_to(tile.path).as_posix()] = inventory.fingerprint(content)
     record = {
         "cells": tile.planned.count,
         "seconds": round(seconds, 3),
@@ -395,7 +345,7 @@ def write(tile: Tile, found: "Mapping[str, xr.Variable]", seconds: float) -> Non
 
 def _filled(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """A chunk of a variable, void where it reaches beyond the plane."""
-    chunk = np.full(shape, _void(name, values.dtype), values.dtype)
+    chunk = np.full(shape, frame.void(name, values.dtype), values.dtype)
     chunk[tuple(slice(size) for size in values.shape)] = values
     return chunk
 

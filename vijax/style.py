@@ -1,8 +1,11 @@
-"""What all pictures share: fonts, file endings, how quantities and their values are written."""
+"""What all pictures share: fonts, files and their mark, how quantities and their values are written."""
 
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from vijax import checks
+from vijax.files import replacing
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -15,15 +18,29 @@ STYLE: Any = {
     "hatch.linewidth": 0.4,
     "savefig.dpi": 250,
 }
-_ENDINGS = (".png", ".pdf", ".svg", ".eps")
+# Endings of pictures, each with the entry of its metadata that names what drew it.
+_DRAWN_WITH = {".png": "Software", ".pdf": "Creator", ".svg": "Creator", ".eps": "Creator"}
+_MARK = "drawn by vijax"
 # Worth a place in the title: neither the start, nor a quantity under a second name.
 CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
 
 
 def check_format(path: str | Path) -> None:
     """Raise ValueError unless the path ends as a picture does."""
-    if Path(path).suffix not in _ENDINGS:
-        raise ValueError(f"plot must end in {', '.join(_ENDINGS)}; got {str(path)!r}")
+    if checks.path("plot", path).suffix not in _DRAWN_WITH:
+        raise ValueError(f"plot must end in {', '.join(_DRAWN_WITH)}; got {checks.shown(str(path))}")
+
+
+def save_figure(figure: Any, path: str | Path) -> None:
+    """Save a picture, whole or not at all, with a mark by which `is_drawn` knows it."""
+    check_format(path)
+    with replacing(Path(path)) as part:
+        figure.savefig(part, metadata={_DRAWN_WITH[part.suffix]: _MARK})
+
+
+def is_drawn(path: Path) -> bool:
+    """Tell whether a file is a picture that vijax drew and nothing else has saved since."""
+    return path.is_file() and _MARK.encode() in path.read_bytes()
 
 
 def title(dataset: "xr.Dataset", further: tuple[str, ...] = ()) -> str:

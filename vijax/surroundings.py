@@ -2,17 +2,16 @@
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import branch
+from vijax import branch, checks
 from vijax import orbit as orbits
-from vijax.attractor import basin_fractions
+from vijax.attractor import MOST_STARTS, basin_fractions
 from vijax.design import Design, Optimum, states
-from vijax.method import whole
 from vijax.model import Harvester, Status
 from vijax.orbit import Orbit
 from vijax.tuning import tuned, values, variables
@@ -73,12 +72,16 @@ def surroundings(optimum: Optimum, *, starts: int = 2000, reach: float = 0.5, se
     Raises:
         ValueError: reach outside (0, 1), or starts that cannot be.
     """
-    if not 0 < reach < 1:
-        raise ValueError(f"reach must lie between 0 and 1; got {reach}")
-    attractors = _attractors(optimum.device, whole("starts", starts, 1), seed)
+    checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best")
+    reach, seed = _checked(reach), checks.seed(seed)
+    attractors = _attractors(optimum.device, checks.whole("starts", starts, 1, MOST_STARTS), seed)
     own = float(orbits.power(optimum.orbit, optimum.device)[0])
     share = sum(one.share for one in attractors if math.isclose(one.P, own, rel_tol=_SAME))
     return Surroundings(share, attractors, *(_edge(optimum, way, reach) for way in ("down", "up")))
+
+
+def _checked(reach: Any) -> float:
+    return checks.real("reach", reach, "a number between 0 and 1", lambda x: 0 < x < 1)
 
 
 def _attractors(device: Harvester, starts: int, seed: int | None) -> tuple[Neighbour, ...]:
@@ -119,8 +122,13 @@ def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int
 
     Returns:
         The optimum, its `height` P times share [J], without a gradient; None if the design has none.
+
+    Raises:
+        ValueError: As `surroundings`.
     """
-    starts, best = whole("starts", starts, 1), None
+    checks.instance("design", design, Design, "vijax.optimise(...)")
+    starts, reach, seed = checks.whole("starts", starts, 1, MOST_STARTS), _checked(reach), checks.seed(seed)
+    best: Optimum | None = None
     for one in design.optima:
         if best is None or float(one.state.P) > best.height:
             found = _searched(design, one, starts, reach, seed)

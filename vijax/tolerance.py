@@ -1,12 +1,15 @@
 """Tolerances of a device's constants as quadrature nodes: factors on the constants, and their weights."""
 
 import itertools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
+from vijax import checks
 from vijax.model import CONSTANTS
 
+_MOST_SAMPLES = 10**5
 _NODES = {1: 17, 2: 9, 3: 5}  # of each constant, by the number of them
 
 
@@ -28,24 +31,25 @@ class Tolerance(NamedTuple):
     kind: str = "uniform"
 
 
-def check_tolerances(tolerances: tuple[Tolerance, ...], bounded: bool) -> None:
-    """Raise ValueError unless these can be.
+def check_tolerances(tolerances: Iterable[Tolerance], bounded: bool = False) -> tuple[Tolerance, ...]:
+    """The tolerances, if they can be.
 
     Args:
+        tolerances: Of several constants.
         bounded: Whether the distribution must end: that of a worst case.
     """
-    for one in tolerances:
-        if one.name not in SCATTERED:
-            raise ValueError(f"tolerances must be those of {', '.join(SCATTERED)}; got {one.name!r}")
-        if one.kind not in ("uniform", "lognormal"):
-            raise ValueError(f"tolerances must be uniform or lognormal; got {one.kind!r} of {one.name}")
-        if not 0 < one.spread < 1:
-            raise ValueError(f"tolerances must lie between 0 and 1, relative; got {one.spread} of {one.name}")
+    found = tuple(checks.sequence("tolerances", tolerances, Tolerance, "vijax.tolerance.Tolerance records"))
+    for one in found:
+        checks.choice("tolerances: name", one.name, SCATTERED)
+        checks.choice(f"tolerances: kind of {one.name}", one.kind, ("uniform", "lognormal"))
+        must = "a number between 0 and 1, relative"
+        checks.real(f"tolerances: spread of {one.name}", one.spread, must, lambda x: 0 < x < 1)
         if bounded and one.kind != "uniform":
             raise ValueError(f"tolerances of a worst case must be uniform; got {one.kind} of {one.name}")
-    names = [one.name for one in tolerances]
+    names = [one.name for one in found]
     if len(set(names)) < len(names):
         raise ValueError(f"tolerances must name a constant once; got {', '.join(names)}")
+    return found
 
 
 class Nodes(NamedTuple):
@@ -68,10 +72,13 @@ def nodes(tolerances: tuple[Tolerance, ...], samples: int | None = None, seed: i
         Clenshaw and Curtis's rule for uniform constants, whose ends are among its nodes; Gauss and Hermite's for
         log-normal ones; their products. The nominal device comes first, with weight 0 unless it is alone.
     """
+    tolerances = check_tolerances(tolerances)
+    seed = checks.whole("seed", seed, 0, checks.MOST_SEED)
     names = tuple(one.name for one in tolerances)
     if not tolerances:
         return Nodes(names, np.ones((1, 0)), np.ones(1))
     if samples is not None:
+        samples = checks.whole("samples", samples, 1, _MOST_SAMPLES)
         draw = np.random.default_rng(seed)
         columns = [_factors(one, _drawn(one, draw, samples)) for one in tolerances]
         factors, weights = np.stack(columns, axis=1), np.full(samples, 1 / samples)

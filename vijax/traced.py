@@ -17,7 +17,7 @@ import numpy as np
 from jax import export
 
 from vijax import xla
-from vijax.store import replacing
+from vijax.files import replacing
 
 _TRACED_BY = "jax", "jaxlib", "equinox", "diffrax"
 _DIGEST = hashlib.sha256
@@ -53,7 +53,7 @@ class Program:
         def flat(*leaves):
             return self._work(*jax.tree.unflatten(tree, leaves))
 
-        options, folder = xla.compiler_options(), _folder()
+        options, folder = xla.compiler_options(), cache_folder()
         if folder is None:
             return jax.jit(flat, compiler_options=options)
         path = folder / f"traced-{_DIGEST(f'{name} {_sources()}'.encode()).hexdigest()}"
@@ -64,7 +64,7 @@ class Program:
         return jax.jit(known.call, compiler_options=options)
 
 
-def _folder() -> Path | None:
+def cache_folder() -> Path | None:
     """Where compiled programs are kept, if they are, on a disk."""
     asked = jax.config.values
     folder = asked["jax_compilation_cache_dir"] if asked["jax_enable_compilation_cache"] else None

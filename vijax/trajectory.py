@@ -1,6 +1,7 @@
 """The motion of single starts, impact by impact: recorded, sampled at phase 0, differentiable both ways."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any
@@ -12,13 +13,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax import exact, flow
+from vijax import checks, exact, flow
 from vijax.membrane import HuntCrossley, Law
 from vijax.method import Method, Rk4, choose, repeated
-from vijax.model import Impact, ImpactPair, State, Status, WithStatus, check, is_concrete
+from vijax.model import Impact, ImpactPair, State, Status, WithStatus, check_pair, check_start
 
 _CHUNK = 64  # steps that a differentiated run computes twice, to remember only where a chunk began and what it decided
 _STEPS = 256  # steps of an adaptive solver per impact and period, before a run is stopped
+_IMPACT, _STATE = 56, 32  # bytes of a record
 _HELD = 8  # a contact that outlasts the last period by so many is for ever
 
 
@@ -227,6 +229,31 @@ def _precision(pair: ImpactPair) -> str:
     return str(jnp.result_type(float, pair.d))
 
 
+def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any]) -> Method | None:
+    """The method, as `choose` makes it unless it is a record already, if the pair suits its membrane."""
+    if not isinstance(method, Method):
+        method = choose(method, options, wall=_wall(pair), dtype=_precision(pair))
+    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    if (pair.r is None) == lossy:
+        raise ValueError(
+            f"r must be None with a Hunt-Crossley membrane, and a number with others; got {checks.shown(pair.r)}"
+        )
+    return method
+
+
+def _check_starts(pair: ImpactPair, periods: int, starts: Mapping[str, Any]) -> None:
+    """Raise ValueError unless the ball can start so; traced starts pass unseen."""
+    for name, start in starts.items():
+        if checks.is_concrete(start):
+            checks.finite(name, start)
+    check_start(pair, "u0", starts["u0"])
+    if checks.is_concrete(starts["t0"]):
+        t0 = np.asarray(starts["t0"])
+        good = (t0 >= 0) & (t0 < 2 * periods)
+        if not good.all():
+            raise ValueError(f"t0 must lie in [0, 2 periods), here [0, {2 * periods}); got {checks.first(t0, good)}")
+
+
 def trajectory(
     pair: ImpactPair,
     u0: Float[Array, "..."] | float,
@@ -259,25 +286,15 @@ def trajectory(
         usefully, as its derivatives miss the jump at the wall.
 
     Raises:
-        ValueError: periods or max_impacts below 1, an inadmissible pair, start or method.
+        ValueError: Which argument, what must hold, what came.
     """
     options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "steps": steps}
-    told = method if not isinstance(method, str) else choose(method, options, wall=_wall(pair), dtype=_precision(pair))
-    lossy = told is None or not isinstance(told.law, HuntCrossley)
-    if (pair.r is None) == lossy:
-        raise ValueError(f"r must be None with a Hunt-Crossley membrane, and a number with others; got {pair.r}")
-    room = 16 * periods + 16 if max_impacts is None else max_impacts
-    for name, value in (("periods", periods), ("max_impacts", room)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1; got {value}")
-    for name in ("d", "kappa", "r", "gamma"):
-        if getattr(pair, name) is not None:
-            check(name, getattr(pair, name))
-    for name, start in (("u0", u0), ("v0", v0), ("t0", t0)):
-        if is_concrete(start) and not np.isfinite(np.asarray(start)).all():
-            raise ValueError(f"{name} must be finite; got {start}")
-    if pair.kappa is None and is_concrete(pair.d, u0) and (np.abs(np.asarray(u0)) > 0.5 * np.asarray(pair.d)).any():
-        raise ValueError(f"u0 must lie within the gap of a rigid wall, |u0| <= d/2; got u0 = {u0} at d = {pair.d}")
+    told = _told(check_pair(pair), method, options)
+    periods = checks.whole("periods", periods, 1)
+    room = 16 * periods + 16 if max_impacts is None else checks.whole("max_impacts", max_impacts, 1)
+    _check_starts(pair, periods, {"u0": u0, "v0": v0, "t0": t0})
+    count = math.prod(checks.shapes(u0=u0, v0=v0, t0=t0, pair=pair.d))
+    checks.fits(("periods", "max_impacts"), count * (room * _IMPACT + periods * _STATE), "impacts and states")
     dtype = jnp.result_type(pair.d)
     numbers = [jnp.asarray(x, dtype) for x in (u0, v0, t0)]
     shape = jnp.broadcast_shapes(*(x.shape for x in numbers), *(jnp.shape(x) for x in jax.tree.leaves(pair)))

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import units
+from vijax import checks, units
 from vijax.model import CONSTANTS, Harvester, check
 
 # Other names of what a constant decides: each is applied after the constants, in this order.
@@ -78,8 +78,7 @@ def check_names(names: tuple[str, ...]) -> None:
     if not names:
         raise ValueError("tune must name at least one quantity; got none; omega0 is the membrane's")
     for name in names:
-        if name not in NAMES:
-            raise ValueError(f"tune must be among {', '.join(NAMES)}; got {name!r}")
+        checks.choice("tune", name, NAMES)
         rivals = [one for one in names if constant(one) == constant(name)]
         if len(rivals) > 1:
             raise ValueError(f"tune must name a quantity once; got {' and '.join(rivals)}")
@@ -96,6 +95,8 @@ def limits(names: tuple[str, ...], bounds: Mapping[str, tuple[float, float]], de
     Raises:
         ValueError: Bounds of what is not tuned, or that cannot be.
     """
+    if not isinstance(bounds, Mapping):
+        raise ValueError(f"bounds must be two numbers by name, as in {{'r': (0.1, 0.9)}}; got {checks.shown(bounds)}")
     for name in bounds:
         if name not in names:
             raise ValueError(f"bounds must be those of a tuned quantity; got {name!r}, not among {', '.join(names)}")
@@ -104,15 +105,13 @@ def limits(names: tuple[str, ...], bounds: Mapping[str, tuple[float, float]], de
 
 
 def _checked(name: str, bounds: tuple[float, float], device: Harvester) -> tuple[float, float]:
-    bounds = units.plain(name, bounds)
-    if len(bounds) != 2 or not bounds[0] < bounds[1]:
-        raise ValueError(f"bounds of {name} must be two, the lower first; got {bounds}")
-    for bound in bounds:
-        check(name, bound)
+    low, high = checks.bounds(f"bounds of {name}", units.plain(name, bounds))
+    for bound in (low, high):
+        check(name, bound, f"bounds of {name}")
     steepest = float(device.g) / float(device.A)
-    if name == "gamma" and max(abs(bound) for bound in bounds) > steepest:
-        raise ValueError(f"bounds of gamma must lie in [-g/A, g/A], here +-{steepest:g}; got {bounds}")
-    return float(bounds[0]), float(bounds[1])
+    if name == "gamma" and max(abs(low), abs(high)) > steepest:
+        raise ValueError(f"bounds of gamma must lie in [-g/A, g/A], here +-{steepest:g}; got {low, high}")
+    return low, high
 
 
 def _default(name: str, device: Harvester) -> tuple[float, float]:

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from vijax import checks
+
 UNITS = {
     "omega": "rad/s",
     "omega0": "rad/s",
@@ -69,7 +71,7 @@ def plain(name: str, value: Any) -> Any:
     """
     if isinstance(value, list | tuple) and any(map(_has_unit, value)):
         if not all(map(_has_unit, value)):
-            raise ValueError(f"{name} must have a unit at every value or at none; got {value!r}")
+            raise ValueError(f"{name} must have a unit at every value or at none; got {checks.shown(value)}")
         return np.array([plain(name, one) for one in value])
     return value.magnitude * _factor(name, value.units) if _has_unit(value) else value
 

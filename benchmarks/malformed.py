@@ -1,0 +1,588 @@
+"""Malformed calls, from tables: a door, one of its arguments, values that it must refuse.
+
+Building a case runs nothing; every case is alone with its mistake, all else in it being right and small.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+import vijax
+from vijax import blueprint, branch, chart, curve, design, model, orbit, plot, report, shooting, simulate
+from vijax.compare import cheapest_model
+from vijax.report import lines, table
+from vijax.surroundings import surroundings, weighted
+from vijax.tolerance import Tolerance, nodes
+
+NAN, INF, HUGE = math.nan, math.inf, 10**45
+
+
+class Case(NamedTuple):
+    """One mistake: how it reads, which arguments its message must name, and how it is made."""
+
+    text: str
+    names: tuple[str, ...]
+    make: Callable[[], Any]
+
+
+# --- what calls are made of ------------------------------------------------------------------------------------------
+
+
+def pair() -> vijax.ImpactPair:
+    """A soft cell."""
+    return vijax.impact_pair(0.2, 40.0, 0.5)
+
+
+def an_orbit() -> orbit.Orbit:
+    """A record such as a search returns, made by hand so that nothing is compiled."""
+    sequence = shooting.Sequence(jnp.array([[1, -1]], jnp.int32), jnp.array([2.0]), jnp.array([False]))
+    wide = vijax.impact_pair([0.2], [40.0], [0.5])
+    knots, two = jnp.array([[[0.1, 0.5, 0.05], [1.1, 0.5, 0.05]]]), jnp.full((1, 2), 0.01)
+    multipliers, zero = jnp.full((1, 2), 0.1 + 0j), jnp.zeros(1)
+    return orbit.Orbit(wide, sequence, knots, two, two, multipliers, zero, jnp.zeros(1, jnp.int32))
+
+
+def a_design() -> design.Design:
+    """A design without optima."""
+    return design.Design((), ("omega0",), {"omega0": (20.0, 400.0)}, "P", (), 0, 0)
+
+
+def an_optimum() -> design.Optimum:
+    """An optimum of which no more than the orbit is known."""
+    path = np.zeros((1, 1))
+    return design.Optimum({}, vijax.Harvester(), an_orbit(), "1:1", 0.0, None, {}, (), "maximum", 0, path, path[0])
+
+
+def a_map() -> xr.Dataset:
+    """A dataset that is no map."""
+    return xr.Dataset({"mass": ("d", [1.0, 2.0])})
+
+
+# --- kinds of bad values ---------------------------------------------------------------------------------------------
+
+# 0 and -1 stand apart, as some counts may be 0.
+WHOLE = (True, 1.5, NAN, "3", [3], 3j, -1, HUGE)
+COUNT = (*WHOLE, 0)
+REAL = (True, "0.5", NAN, [0.1, 0.2], 1j, {}, -INF)
+NUMBERS = ("0.1", [], NAN, INF, True, 1j, object(), [0.1, "x"], {"a": 1}, math.sin, np.array([]))
+AXIS = (*NUMBERS, [[0.1]])
+START = ("0.1", [], NAN, INF, True, 1j, object())
+DEVICE = ("paper", {}, 3.0, vijax.Harvester, pair)
+PAIR = ("soft", None, 3.0, {"d": 0.2}, (0.2, 40.0, 0.5, 0.0), vijax.Harvester)
+ORBIT = ("1:1", None, 3.0, [], pair)
+FUNCTION = (3, "bar", True, [])
+CHOICE = (3, None, "HARD", ["soft"], True)
+FLAG = ("yes", 1, None)
+PATH = (3, 1.5, b"map", ["map.zarr"], {})
+TARGET = (*PATH, "", "nowhere/map.zarr", "/proc/map.zarr", "/dev/null/map.zarr")
+DATASET = (None, 3, "map.zarr", [], xr.Variable("d", [1.0]))
+SEED = (True, 1.5, "3", [3], -1, HUGE)
+CELL = {"d": 0.2, "kappa": 40.0}
+
+Table = dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, tuple[Any, ...]]]]
+
+# Door: what is called, what is right in it, and which values of which argument are not.
+CALLS: Table = {
+    "sweep": (
+        vijax.sweep,
+        CELL,
+        {
+            "d": AXIS,
+            "kappa": (*AXIS, 0, -3.0),
+            "r": (1.5, -0.2, [0.5, 2.0], "half"),
+            "gamma": (NAN, "level", [INF]),
+            "u0": START,
+            "v0": START,
+            "omega": (0, "pi", []),
+            "A": (-1, "1 g"),
+            "periods": COUNT,
+            "transient": WHOLE,
+            "wall": CHOICE,
+            "until": CHOICE,
+            "method": CHOICE,
+            "dtype": (*CHOICE, float),
+            "outputs": (3, ["P", 3], "Q", ["Q"], [], [["P"]]),
+            "device": DEVICE,
+            "progress": FUNCTION,
+            "out": TARGET,
+            "overwrite": FLAG,
+            "workers": (2,),
+            "refine": (*WHOLE, 0, 9),
+            "steps": (100,),
+            "solver": ("Tsit5",),
+            "membrane": ("hertz", 0.5),
+        },
+    ),
+    "sweep into a store": (
+        vijax.sweep,
+        CELL | {"out": "map.zarr"},
+        {"workers": (True, 1.5, [2], 0, HUGE), "overwrite": FLAG},
+    ),
+    "sweep by ode": (
+        vijax.sweep,
+        CELL | {"method": "ode"},
+        {
+            "rtol": (*REAL, 0, -1e-8, INF),
+            "atol": (*REAL, 0, -1e-8, INF),
+            "solver": (3, "Euler", ["Tsit5"], True),
+            "membrane": ("hertz", 0.5, vijax.HuntCrossley),
+        },
+    ),
+    "sweep by rk4": (vijax.sweep, CELL | {"method": "rk4"}, {"steps": (*COUNT, 4)}),
+    "basins": (
+        vijax.basins,
+        CELL | {"u0": [0.0, 0.1], "v0": [0.0, 0.1]},
+        {
+            "u0": START,
+            "v0": START,
+            "d": ([], "0.1", NAN),
+            "r": (np.linspace(0.1, 2, 1000), 10**4000),
+            "merge_mirrors": FLAG,
+            "periods": COUNT,
+            "wall": CHOICE,
+            "device": DEVICE,
+            "progress": FUNCTION,
+        },
+    ),
+    "basin_fractions": (
+        vijax.basin_fractions,
+        CELL,
+        {
+            "starts": COUNT,
+            "speed": (*REAL, 0, -0.6, INF),
+            "seed": SEED,
+            "merge_mirrors": FLAG,
+            "periods": COUNT,
+            "device": DEVICE,
+            "progress": FUNCTION,
+            "u0": (0.1,),
+        },
+    ),
+    "compare": (
+        vijax.compare,
+        CELL,
+        {
+            "tolerance": (*REAL, 0, -0.05, INF),
+            "periods": COUNT,
+            "until": CHOICE,
+            "device": DEVICE,
+            "progress": FUNCTION,
+        },
+    ),
+    "lyapunov": (
+        vijax.lyapunov,
+        CELL,
+        {"starts": (*COUNT, 1), "periods": COUNT, "transient": WHOLE, "device": DEVICE, "progress": FUNCTION},
+    ),
+    "survival": (
+        vijax.survival,
+        CELL,
+        {
+            "starts": COUNT,
+            "speed": (*REAL, 0),
+            "seed": SEED,
+            "periods": (*COUNT, 7),
+            "device": DEVICE,
+            "progress": FUNCTION,
+        },
+    ),
+    "orbit_diagram": (
+        vijax.orbit_diagram,
+        {"along": "d", "values": [0.2, 0.3], "kappa": 40.0},
+        {
+            "along": (3, None, "u0", "", ["d"], "mass"),
+            "values": (0.2, [], "0.1", NAN, None, [[0.1]], ["a"], [0.0]),
+            "direction": CHOICE,
+            "periods": COUNT,
+            "keep": (*COUNT, 401),
+            "wall": CHOICE,
+            "dtype": CHOICE,
+            "device": DEVICE,
+            "progress": FUNCTION,
+        },
+    ),
+    "optimise": (
+        vijax.optimise,
+        {},
+        {
+            "device": DEVICE,
+            "tune": (3, (), ("mass",), ("omega0", "k"), [3], None),
+            "bounds": (3, {"r": (0.1, 0.2)}, {"omega0": 3}, {"omega0": (3,)}, {"omega0": ("a", "b")}, [("omega0",)]),
+            "objective": CHOICE,
+            "tolerances": (3, "omega0=5%", [3], [("omega0", 0.05)], [Tolerance("omega0", 0.05)]),
+            "looks": (*COUNT, 1),
+            "steps": (*COUNT, 1),
+            "balls": COUNT,
+            "impacts": COUNT,
+            "periods": COUNT,
+        },
+    ),
+    "optimise over tolerances": (
+        vijax.optimise,
+        {"objective": "mean", "tolerances": [Tolerance("omega0", 0.05)]},
+        {
+            "samples": COUNT,
+            "tolerances": (
+                [Tolerance("omega0", "5%")],
+                [Tolerance("omega0", NAN)],
+                [Tolerance("mass", 0.05)],
+                [Tolerance("omega0", 0.05, "normal")],
+                [Tolerance(3, 0.05)],
+            ),
+        },
+    ),
+    "optimise_all": (design.optimise_all, {}, {"devices": (3, [], [3], "paper", None, vijax.Harvester())}),
+    "under": (
+        design.under,
+        {"optimum": an_optimum(), "tolerances": [Tolerance("omega0", 0.05)]},
+        {
+            "optimum": (3, None, "best", a_design()),
+            "tolerances": (3, "omega0", [3], [Tolerance("omega0", 2.0)]),
+            "samples": COUNT,
+        },
+    ),
+    "trajectory": (
+        vijax.trajectory,
+        {"pair": pair(), "u0": 0.05, "v0": -0.4, "periods": 4},
+        {
+            "pair": PAIR,
+            "u0": (*START, None),
+            "v0": (*START, None),
+            "t0": (*START, -1.0, 8.0, 100.0, None),
+            "periods": (*COUNT, 10**12),
+            "max_impacts": (*COUNT, 10**9),
+            "method": (3, "euler", None, vijax.sweep),
+            "solver": ("Tsit5",),
+            "steps": (100,),
+        },
+    ),
+    "trajectory in a rigid gap": (
+        vijax.trajectory,
+        {"pair": vijax.impact_pair(0.2, None, 0.5), "v0": 0.0, "periods": 4},
+        {"u0": (0.2, -0.11, 5.0)},
+    ),
+    "steady": (
+        vijax.steady,
+        {"device": vijax.Harvester(), "orbit": an_orbit()[0]},
+        {"device": (*DEVICE, None), "orbit": (*ORBIT, an_orbit()), "pair": PAIR[:1] + PAIR[2:]},
+    ),
+    "impact_pair": (
+        vijax.impact_pair,
+        {"d": 0.2, "kappa": 40.0, "r": 0.5},
+        {
+            "d": (*NUMBERS, 0, -0.1, None),
+            "kappa": (0, INF, "stiff", [], True),
+            "r": (0, 1.5, NAN, [], "half", None),
+            "gamma": (NAN, INF, [], "level", None),
+        },
+    ),
+    "Harvester": (
+        vijax.Harvester,
+        {},
+        {
+            "m_b": (0, "3.5 g", NAN, True, [], None),
+            "s": (-1, "0.3 m", []),
+            "omega": (0, None, {}),
+            "r": (0, 1.5, "half"),
+            "r_b": (1.0,),
+            "V": (NAN, "2 kV", None),
+            "penetration_limit": (0, -1, "R0", []),
+        },
+    ),
+    "Harvester.pair": (vijax.Harvester().pair, {}, {"wall": CHOICE}),
+    "HuntCrossley": (vijax.HuntCrossley, {"chi": 0.5}, {"chi": (*REAL, -0.1), "exponent": (*REAL, 0.5)}),
+    "harvested_energy": (
+        vijax.harvested_energy,
+        {"device": vijax.Harvester(), "depth": 1e-3},
+        {"device": (*DEVICE, None), "depth": ("1 mm", None, {}, 1j, True, [[1.0], [2.0, 3.0]])},
+    ),
+    "load": (vijax.load, {}, {"path": (*PATH, "", "nowhere", "/dev/null", None)}),
+    "save": (
+        vijax.save,
+        {"dataset": a_map(), "path": "map.zarr"},
+        {"dataset": DATASET, "path": (*TARGET, None), "overwrite": FLAG},
+    ),
+    "orbit.search": (
+        orbit.search,
+        {"pair": pair(), "impacts": "1:1"},
+        {
+            "pair": (*PAIR, vijax.impact_pair([0.2, 0.3], 40.0, 0.5)),
+            "impacts": (3, None, "", "up", "0:0", "1:1/0T", "99999999999:1", "1000:1000", "R" * 5000, ["R", "L"]),
+            "period": (True, 1.5, "3", [3], -1, 0, HUGE, 7),
+            "guesses": (*COUNT, 10**9),
+            "seed": SEED,
+        },
+    ),
+    "orbit.from_state": (
+        orbit.from_state,
+        {"pair": pair(), "u": 0.05, "v": -0.4},
+        {
+            "pair": PAIR,
+            "u": (*START, None),
+            "v": (*START, None),
+            "t": (*START, -1.0, 2.0),
+            "period": (*COUNT, 10**9),
+            "settle": WHOLE,
+        },
+    ),
+    "orbit.from_state beyond a rigid wall": (
+        orbit.from_state,
+        {"pair": vijax.impact_pair(0.2, None, 0.5), "v": 0.0},
+        {"u": (0.2, -0.11, [0.0, 5.0])},
+    ),
+    "summarise": (
+        vijax.summarise,
+        {
+            "pair": vijax.impact_pair([0.2], [40.0], 0.5),
+            "u0": jnp.zeros(1),
+            "v0": jnp.zeros(1),
+            "scale": simulate.Scale(*jnp.ones((4, 1))),
+            "device": vijax.Harvester(),
+        },
+        {
+            "pair": (*PAIR, pair()),
+            "u0": ("0.1", None, NAN, jnp.zeros(2)),
+            "v0": ("0.1", None, NAN, jnp.zeros(2)),
+            "scale": (1.0, None, (1.0, 1.0)),
+            "device": (*DEVICE, None),
+            "periods": COUNT,
+            "until": CHOICE,
+            "transient": WHOLE,
+            "outputs": (3, ["Q"], None),
+            "method": ("ode", 3),
+            "count": (*WHOLE, 2),
+            "on": ("cpu", 0, []),
+        },
+    ),
+    "orbit.solve": (
+        orbit.solve,
+        {"pair": an_orbit().pair, "sequence": an_orbit().sequence, "knots": an_orbit().knots},
+        {"pair": PAIR, "sequence": ("RL", None, [1, -1]), "knots": ("x", None, [], 3.0)},
+    ),
+    **{
+        f"orbit.{door.__name__}": (door, {}, {"orbit": ORBIT})
+        for door in (orbit.symmetric, orbit.halved, orbit.doubled, orbit.unfolded, orbit.counts, orbit.labels)
+    },
+    "orbit.impacts": (orbit.impacts, {}, {"orbit": ORBIT}),
+    "orbit.power": (
+        orbit.power,
+        {"orbit": an_orbit(), "device": vijax.Harvester()},
+        {"orbit": ORBIT, "device": (*DEVICE, None)},
+    ),
+    "orbit.path": (orbit.path, {"orbit": an_orbit()}, {"orbit": ORBIT, "samples": COUNT}),
+    "branch.follow": (
+        branch.follow,
+        {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
+        {
+            "orbit": ORBIT,
+            "along": (3, None, "mass", ["d"]),
+            "within": (3, None, (0.3, 0.1), (0.1,), ("a", "b"), (0.1, NAN), (0.25, 0.3), "0.1:0.3"),
+            "direction": CHOICE,
+            "device": DEVICE,
+            "points": (*COUNT, 10**9),
+        },
+    ),
+    "branch.family": (
+        branch.family,
+        {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
+        {
+            "orbit": ORBIT,
+            "along": (3, "mass"),
+            "within": (3, (0.3, 0.1)),
+            "device": DEVICE,
+            "generations": (True, 1.5, "3", -1, HUGE),
+            "points": (0, 1.5, 10**9),
+        },
+    ),
+    "branch.switch": (
+        branch.switch,
+        {"point": branch.Point("flip", 0.2, an_orbit()), "along": "d", "within": (0.1, 0.3)},
+        {
+            "point": (3, None, "flip", branch.Point("fold", 0.2, an_orbit())),
+            "along": (3, "mass"),
+            "within": (3, (0.3, 0.1)),
+            "points": (0, 1.5, 10**9),
+        },
+    ),
+    "branch.dataset": (branch.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
+    "surroundings": (
+        surroundings,
+        {"optimum": an_optimum()},
+        {
+            "optimum": (3, None, "best", a_design()),
+            "starts": (*COUNT, 10**9),
+            "reach": (*REAL, 0, 1, -1),
+            "seed": SEED,
+        },
+    ),
+    "weighted": (
+        weighted,
+        {"design": a_design()},
+        {"design": (3, None, "best"), "starts": COUNT, "reach": (*REAL, 0, -1, 2.0), "seed": SEED},
+    ),
+    "report.describe": (
+        report.describe,
+        {"design": a_design()},
+        {"design": (3, None, "best"), "surroundings": (3, "all"), "diagram": (3, a_map()), "tolerances": (3, [3])},
+    ),
+    "report.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design(), {})}),
+    "report.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
+    "blueprint.design": (
+        blueprint.design,
+        {"diagram": a_map(), "report": {"best": None}},
+        {"diagram": (*DATASET, a_map())},
+    ),
+    "blueprint.design_map": (blueprint.design_map, {}, {"report": (3, None, "best")}),
+    "report.optimum": (report.optimum, {}, {"one": (3, None, "best")}),
+    **{
+        f"plot.{door.__name__}": (door, {"dataset": a_map()}, {"dataset": DATASET})
+        for door in (plot.power_map, plot.label_map, plot.basin_map, plot.multistability_map, plot.difference_map)
+    },
+    "chart.orbit_diagram": (chart.orbit_diagram, {}, {"dataset": DATASET}),
+    "chart.branches": (chart.branches, {}, {"dataset": DATASET}),
+    "tolerance.nodes": (
+        nodes,
+        {"tolerances": (Tolerance("omega0", 0.05),)},
+        {"tolerances": (3, "omega0", [3]), "samples": COUNT, "seed": SEED},
+    ),
+    "curve": (
+        curve.curve,
+        {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05]},
+        {"pair": PAIR, "t": ("x", None, 0.1), "side": ("x", None, 1, [1, -1]), "samples": COUNT},
+    ),
+    "curve.states": (
+        curve.states,
+        {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05], "when": [0.2]},
+        {"pair": PAIR, "v_in": ("x", [0.1, 0.2]), "when": ("x", None, [], True, 0.2)},
+    ),
+    "cheapest_model": (
+        cheapest_model,
+        {"found": a_map(), "tolerance": 0.05},
+        {"found": (*DATASET, a_map()), "tolerance": (*REAL, 0)},
+    ),
+    "with_constants": (
+        model.with_constants,
+        {"device": vijax.Harvester()},
+        {"device": (*DEVICE, None), "mass": (1.0,), "k": (0, "560 N/m", NAN), "m_b": (0, "3 g")},
+    ),
+    "with_pair": (
+        model.with_pair,
+        {"device": vijax.Harvester(), "pair": pair()},
+        {"device": (*DEVICE, None), "pair": PAIR},
+    ),
+}
+
+
+# Made here, as whatever is made while a call is traced is traced too.
+_PAIR, _ORBIT = pair(), an_orbit()
+
+# What is only differentiated by mistake: the door, and an argument of it that is traced.
+TRACED: dict[str, Callable[[Any], Any]] = {
+    "d of sweep": lambda x: vijax.sweep(d=x, kappa=40.0),
+    "r of sweep": lambda x: vijax.sweep(**CELL, r=x),
+    "device of sweep": lambda x: vijax.sweep(**CELL, device=vijax.Harvester(V=x)),
+    "v0 of basins": lambda x: vijax.basins(**CELL, v0=x),
+    "d of basin_fractions": lambda x: vijax.basin_fractions(d=x),
+    "kappa of compare": lambda x: vijax.compare(d=0.2, kappa=x),
+    "d of lyapunov": lambda x: vijax.lyapunov(d=x),
+    "speed of survival": lambda x: vijax.survival(**CELL, speed=x),
+    "values of orbit_diagram": lambda x: vijax.orbit_diagram(along="d", values=x),
+    "kappa of orbit_diagram": lambda x: vijax.orbit_diagram(along="d", values=[0.1, 0.2], kappa=x),
+    "device of optimise": lambda x: vijax.optimise(vijax.Harvester(s=x)),
+    "bounds of optimise": lambda x: vijax.optimise(bounds={"omega0": (20.0, x)}),
+    "pair of search": lambda x: orbit.search(vijax.impact_pair(x, 40.0, 0.5), "1:1"),
+    "u of from_state": lambda x: orbit.from_state(_PAIR, x, 0.1),
+    "within of follow": lambda x: branch.follow(_ORBIT, "d", (0.1, x)),
+    "reach of surroundings": lambda x: weighted(a_design(), reach=x),
+}
+
+# Calls that miss an argument, or have one too many.
+SHAPES: dict[str, Callable[[], Any]] = {
+    "kapa of sweep": lambda: vijax.sweep(kapa=3.0),
+    "progres of sweep": lambda: vijax.sweep(**CELL, progres=print),
+    "d and s of sweep": lambda: vijax.sweep(d=0.2, s=0.3),
+    "k and omega0 of sweep": lambda: vijax.sweep(k=500.0, omega0=300.0),
+    "gamma and beta of basins": lambda: vijax.basins(gamma=0.1, beta=0.1),
+    "workers without out": lambda: vijax.sweep(**CELL, workers=2),
+    "merge_mirrors on a slope": lambda: vijax.basins(**CELL, gamma=0.1, merge_mirrors=True),
+    "u0 outside a rigid gap": lambda: vijax.sweep(**CELL, u0=0.2, wall="rigid"),
+    "values missing": lambda: vijax.orbit_diagram(along="d"),
+    "d given twice": lambda: vijax.orbit_diagram(along="d", values=[0.1, 0.2], d=0.3),
+    "gamma of with_pair": lambda: model.with_pair(vijax.Harvester(), vijax.impact_pair(0.2, 40.0, 0.5, 20.0)),
+    "d and kappa of other shapes": lambda: vijax.impact_pair([0.1, 0.2], [1.0, 2.0, 3.0], 0.5),
+    "u0 and v0 of other shapes": lambda: vijax.trajectory(pair(), [0.0, 0.1], [0.1, 0.2, 0.3], 4),
+    "u and v of other shapes": lambda: orbit.from_state(pair(), [0.0, 0.1], [0.1, 0.2, 0.3]),
+    "r with Hunt-Crossley": lambda: vijax.trajectory(
+        pair(), 0.05, -0.4, 4, method="ode", membrane=vijax.HuntCrossley(0.5)
+    ),
+    "kapa of impact_pair": lambda: vijax.impact_pair(0.2, kapa=40.0, r=0.5),
+    "mass of Harvester": lambda: vijax.Harvester(mass=1.0),
+    "V of optimise": lambda: vijax.optimise(vijax.Harvester(V=0.0)),
+    "device of several": lambda: vijax.optimise(vijax.Harvester(s=np.array([0.1, 0.2]))),
+    "kappa of a rigid wall": lambda: branch.follow(rigid_orbit(), "kappa", (3.0, 40.0)),
+}
+
+# More than any machine holds, or would finish.
+LARGE: dict[str, Callable[[], Any]] = {
+    "d and kappa of 10^12 cells": lambda: vijax.sweep(d=np.linspace(0.1, 0.3, 10**6), kappa=np.linspace(3, 40, 10**6)),
+    "omega and omega0 of 10^12 cells": lambda: vijax.sweep(
+        omega=np.linspace(3, 9, 10**6), omega0=np.linspace(20, 400, 10**6)
+    ),
+    "periods in single precision": lambda: vijax.sweep(**CELL, periods=10**8, dtype="float32"),
+    "starts of 10^9": lambda: vijax.basin_fractions(**CELL, starts=10**9),
+    "starts and d of 10^12": lambda: vijax.basin_fractions(d=np.linspace(0.1, 0.3, 10**6), starts=10**6),
+    "u0 and v0 of 10^12": lambda: vijax.basins(**CELL, u0=np.linspace(0, 0.1, 10**6), v0=np.linspace(0, 1, 10**6)),
+    "starts of survival": lambda: vijax.survival(**CELL, starts=10**9),
+    "starts of lyapunov": lambda: vijax.lyapunov(**CELL, starts=10**9),
+    "values and kappa of 10^10": lambda: vijax.orbit_diagram(
+        along="d", values=np.linspace(0.1, 0.3, 10**5), kappa=np.linspace(3, 40, 10**5)
+    ),
+    "keep of 10^9": lambda: vijax.orbit_diagram(along="d", values=[0.1, 0.2], periods=10**9, keep=10**9),
+    "periods of 10^9 recorded": lambda: vijax.trajectory(pair(), 0.05, -0.4, 10**9),
+    "periods of 10^8 and u0 of many": lambda: vijax.trajectory(pair(), np.zeros(10**4), -0.4, 10**7),
+    "samples of 10^9": lambda: orbit.path(an_orbit(), 10**9),
+    "guesses of 5005 sequences": lambda: orbit.search(pair(), "6:9", guesses=10**7),
+    "points of 10^9": lambda: branch.follow(an_orbit(), "d", (0.1, 0.3), points=10**9),
+    "steps and balls of 10^12": lambda: vijax.optimise(steps=10**6, balls=10**6),
+    "samples of optimise": lambda: vijax.optimise(
+        objective="mean", tolerances=[Tolerance("omega0", 0.05)], samples=10**12
+    ),
+    "devices of many": lambda: design.optimise_all([vijax.Harvester()] * 10**4, steps=1000, balls=1000),
+}
+
+
+def rigid_orbit() -> orbit.Orbit:
+    """As `an_orbit`, between rigid walls."""
+    soft = an_orbit()
+    return orbit.Orbit(**(vars(soft) | {"pair": vijax.impact_pair([0.2], None, [0.5])}))
+
+
+def calls() -> Iterator[Case]:
+    """The malformed calls."""
+    for door, (function, right, wrong) in CALLS.items():
+        for argument, values in wrong.items():
+            for value in values:
+                make = partial(function, **(right | {argument: value}))
+                yield Case(f"{door}({argument}={_short(value)})", (argument,), make)
+    for text, traced in TRACED.items():
+        yield Case(f"traced: {text}", _names(text), partial(jax.eval_shape, traced, 0.2))
+    for text, make in (SHAPES | LARGE).items():
+        yield Case(text, _names(text), make)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """The arguments that a text begins with: "d and s of sweep"."""
+    words = text.split()
+    return (words[0], words[2]) if words[1] == "and" else (words[0],)
+
+
+def _short(value: Any) -> str:
+    # Without addresses, which no two processes share.
+    return re.sub(r" at 0x[0-9a-f]+", "", " ".join(repr(value).split()))[:60]

@@ -1,0 +1,247 @@
+"""Malformed command lines, from tables: a script, one of its options, texts that it must refuse."""
+
+from collections.abc import Iterator
+from functools import partial
+from importlib import import_module
+
+from malformed import HUGE, Case
+
+# Texts of an axis that are none, and of axes that run away.
+VALUES = (
+    *("", "x", "1,,2", "0.1;0.2", "nan", "1,inf", "1e999", "@", "@nowhere", "@.", "@/dev/zero", "@/dev/null"),
+    *("1:2", ":::", "1:2:0", "1:2:-3", "1:2:2.5", "1:2:1e3", "0.1:0.3:100000000", "0.1:0.3:1000000000000"),
+    *(f"0.1:0.3:{HUGE}", "1:2:3:lin", "1:2:3:log:4", "0:1:5:log", "2pip", "١٢:3"),
+)
+POSITIVE = (*VALUES, "0", "-1")
+WHOLES = ("", "x", "1.5", "nan", "1e3", "-1", "1e20", str(HUGE), "0x10", "True", "1_0x")
+COUNTS = (*WHOLES, "0")
+REALS = ("", "x", "nan", "inf", "1e999", "1,2", "0.1:0.2", "True")
+WORDS = ("", "x", "SOFT ", "1", "soft,rigid")
+SETS = ("", "=1", "V", "V=", "V=x", "V=nan", "m_b=0", "mass=1", "r=0.3", "V=1=2", "m_b=1e999", "=")
+OUT = ("", ".", "map.nc", "nowhere/map.zarr", "/proc/map.zarr", "/proc", "/dev/null/map.zarr", "/dev/null", "\0.zarr")
+PLOT = ("", ".", "map", "map.doc", "nowhere/map.png", "/proc/map.png", "/dev/null/map.png", "/dev/null")
+
+_SMALL = ("--d", "0.1:0.2:3", "--kappa", "10:20:3")
+Lines = dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]]
+
+# Script: what is right in a line, and which texts of which option are not; after it, what else the error may name.
+LINES: Lines = {
+    "grid": (
+        (*_SMALL, "--periods", "40"),
+        {
+            "d": POSITIVE,
+            "kappa": POSITIVE,
+            "r": ("2", "0", "", "half", "1:2:3"),
+            "gamma": ("nan", "x", "@/dev/zero"),
+            "omega": ("0", "x", "1:2", "-pi"),
+            "omega0": ("0", "x"),
+            "A": ("0", "1 g"),
+            "beta": ("nan", "steep"),
+            "u0": ("x", "nan", "-1:1:5:log"),
+            "v0": ("x", "inf", "1:2:0"),
+            "periods": COUNTS,
+            "transient": WHOLES,
+            "until": WORDS,
+            "wall": WORDS,
+            "method": WORDS,
+            "dtype": WORDS,
+            "show": WORDS,
+            "outputs": ("", "Q", "P,Q", "P;period", ",", "P"),
+            "set": SETS,
+            "refine": (*COUNTS, "9"),
+            "out": OUT,
+            "plot": PLOT,
+            "workers": COUNTS,
+            "scheduler": ("", "somewhere", "tls://127.0.0.1:1", "tcp://127.0.0.1:1", "://", "tcp://", "http://x:1"),
+            "compare": ("", "soft", "x"),
+            "tolerance": ("0.05", "x"),
+            "solver": ("Tsit5",),
+            "steps": ("100",),
+            "rtol": ("1e-8",),
+            "chi": ("0.5",),
+            "membrane": ("rubber", "hunt-crossley"),
+            "unknown": ("1",),
+        },
+    ),
+    "grid --compare rigid": (
+        (*_SMALL, "--compare", "rigid"),
+        {
+            "tolerance": (*REALS, "0", "-0.1", "0%", "-5%", "%", "5 percent", "nan%"),
+            "wall": ("rigid",),
+            "outputs": ("P",),
+            "u0": ("0.2",),
+            "refine": ("2",),
+            "method": ("ode",),
+            "show": ("label",),
+        },
+    ),
+    "grid --method ode": (
+        (*_SMALL, "--method", "ode"),
+        {
+            "rtol": (*REALS, "0", "-1"),
+            "atol": (*REALS, "0", "-1"),
+            "solver": ("", "Euler", "tsit5"),
+            "wall": ("rigid",),
+            "chi": ("0.5",),
+            "steps": ("100",),
+        },
+    ),
+    "grid --method rk4": ((*_SMALL, "--method", "rk4"), {"steps": (*COUNTS, "4")}),
+    "orbit_diagram": (
+        ("--along", "d=0.2:0.3:4", "--kappa", "40"),
+        {
+            "along": ("", "d", "d=", "=1:2:3", "u0=0:1:3", "mass=1:2:3", "d=0.2", "d=1:2", "d=@/dev/zero", "d=x,1"),
+            "direction": WORDS,
+            "kappa": ("0", "x", "1:2", "@nowhere", f"3:4:{HUGE}"),
+            "r": ("2",),
+            "periods": COUNTS,
+            "keep": (*COUNTS, "401"),
+            "wall": WORDS,
+            "dtype": WORDS,
+            "quantity": WORDS,
+            "set": SETS,
+            "out": OUT,
+            "plot": PLOT,
+            "d": ("0.1",),
+        },
+    ),
+    "basins": (
+        ("--d", "0.2", "--kappa", "3", "--u0", "0:0.1:3", "--v0", "0:0.5:3"),
+        {
+            "d": ("0", "x", "@/dev/zero", "0.1:0.3:100000000"),
+            "u0": ("x", "nan", "0:1:0"),
+            "v0": ("x", "inf", f"0:1:{HUGE}"),
+            "periods": COUNTS,
+            "wall": WORDS,
+            "speed": ("0.6", "x"),
+            "seed": ("1", "x"),
+            "set": ("=1", "V=x", "kappa=3"),
+            "out": OUT,
+            "plot": PLOT,
+        },
+    ),
+    "basins --starts": (
+        ("--d", "0.2,0.25", "--kappa", "3,4", "--starts", "4"),
+        {
+            "starts": (*COUNTS, "1e20", "10000000000"),
+            "speed": (*REALS, "0", "-0.6"),
+            "seed": ("", "x", "-1", "1.5", str(HUGE), "1e3"),
+            "u0": ("0.1",),
+        },
+    ),
+    "branch": (
+        ("--d", "0.2", "--kappa", "40", "--along", "d=0.1:0.3"),
+        {
+            "along": ("", "d", "d=", "=0.1:0.3", "d=0.1", "d=0.1:0.2:3", "d=0.3:0.1", "d=x:1", "mass=0:1"),
+            "impacts": ("", "x", "0:0", "1:1/0T", "99999999999:1", "1000:1000", "-1:1", "1:1:1", "R" * 5000, "1:1/T"),
+            "guesses": (*COUNTS, "10000000000"),
+            "generations": WHOLES,
+            "d": ("0", "0.1,0.2", "x"),
+            "kappa": ("0", "x", "inf"),
+            "wall": WORDS,
+            "quantity": WORDS,
+            "set": ("=1", "V=x"),
+            "out": OUT,
+            "plot": PLOT,
+        },
+    ),
+    "design": (
+        ("--d", "0.2", "--steps", "8"),
+        {
+            "tune": ("", ",", "mass", "omega0,k", "omega0;r"),
+            "bounds": (
+                "",
+                "omega0",
+                "omega0=",
+                "omega0=1",
+                "omega0=2:1",
+                "omega0=x:1",
+                "r=0.1:0.2",
+                "mass=1:2",
+                "=1:2",
+            ),
+            "tolerance": (
+                "",
+                "omega0",
+                "omega0=",
+                "omega0=x",
+                "omega0=0",
+                "omega0=-5%",
+                "omega0=200%",
+                "mass=5%",
+                "=5%",
+            ),
+            "objective": (*WORDS, "mean", "worst"),
+            "steps": (*COUNTS, "1", "10000000000"),
+            "balls": (*COUNTS, "10000000000"),
+            "impacts": (*COUNTS, "10000000000"),
+            "over": ("", "d", "r", "r=", "r=x", "r=0", "=1", "omega0=20:40:3", "mass=1", "u0=0.1", "d=0.1:0.2:3"),
+            "d": ("0", "0.1,0.2", "x"),
+            "set": ("=1", "V=x"),
+            "set V": ("V=0",),
+            "out": ("", "design.txt", "nowhere/design.json", "/proc", "/proc/design.json"),
+            "plot": PLOT,
+        },
+    ),
+    "paper": (
+        (),
+        {
+            "figure": ("", "x", "2", "99", "3,,4", "-1", "3-5", "three"),
+            "into": ("nowhere", "/proc", "/dev/null"),
+            "unknown": ("1",),
+        },
+    ),
+}
+# Lines of another shape: a script, its arguments, what the error must name.
+SHAPES = (
+    ("grid", ("--d",), "d"),
+    ("grid", ("map.zarr",), "map.zarr"),
+    ("grid", ("--d", "0.1:0.2:3", "--s", "0.3"), "s"),
+    ("grid", ("--gamma", "0.1", "--beta", "0.1"), "beta"),
+    ("grid", ("--d", "0.1", "--kappa", "30"), "plot"),
+    ("grid", ("--omega", "3:12:50"), "omega"),
+    ("grid", ("--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), "workers"),
+    ("grid", ("--workers", "2", "--plot", "map.png"), "workers"),
+    ("grid", ("--overwrite=yes",), "overwrite"),
+    ("grid", ("--d", "0.1:0.3:100000", "--kappa", "3:40:100000", "--plot", "map.png"), "kappa"),
+    ("grid", ("--d", "0.1:0.3:100000", "--kappa", "3:40:100000", "--out", "map.zarr"), "yes"),
+    ("grid", ("--compare", "rigid", "--d", "0.1:0.3:100000", "--kappa", "3:40:100000"), "kappa"),
+    ("grid", ("--omega", "3:9:10000000", "--omega0", "20:400:10000000"), "omega0"),
+    ("basins", ("--u0", "0:0.1:10000000", "--v0", "0:0.1:10000000"), "v0"),
+    ("basins", ("--starts", "10000000", "--d", "0.1:0.3:100", "--kappa", "3:40:100"), "starts"),
+    ("basins", ("--starts", "100000", "--d", "0.1:0.3:20", "--kappa", "3:40:20", "--periods", "100000"), "yes"),
+    ("basins", ("--starts", "9", "--u0", "0.1"), "u0"),
+    ("basins", ("--merge-mirrors", "--gamma", "0.1"), "merge_mirrors"),
+    ("orbit_diagram", ("--along", "d=0.1:0.3:100000", "--periods", "100000"), "yes"),
+    ("orbit_diagram", ("--along", "d=0.1:0.3:1000000", "--kappa", "3:40:10", "--keep", "400"), "keep"),
+    ("branch", ("--wall", "rigid", "--along", "kappa=3:40"), "along"),
+    ("branch", ("--impacts", "6:9", "--guesses", "10000000"), "guesses"),
+    ("design", ("--steps", "100000", "--balls", "1000"), "balls"),
+    ("design", ("--steps", "10000", "--balls", "400"), "yes"),
+    ("design", ("--over", "d=0.1:0.3:10000", "--s", "0.2"), "s"),
+    ("paper", (), "figure"),
+    ("paper", ("--figure",), "figure"),
+)
+# What a line needs besides, so that the option is looked at.
+_WITH = {"into": ("--figure", "3")}
+_COMMANDS = {"grid": "power_map"}
+
+
+def lines() -> Iterator[Case]:
+    """The malformed command lines, each run in the folder of the moment."""
+    for door, (right, wrong) in LINES.items():
+        for option, texts in wrong.items():
+            for text in texts:
+                words = option.split()
+                arguments = (*right, *_WITH.get(option, ()), f"--{words[0]}={text}")
+                yield Case(f"{door} {arguments[-1]}"[:100], (words[-1],), partial(_run, door.split()[0], arguments))
+
+    for script, given, name in SHAPES:
+        yield Case(f"{script} {' '.join(given)}", (name,), partial(_run, script, given))
+
+
+def _run(script: str, arguments: tuple[str, ...]) -> int:
+    """Exit code of a script, in this process."""
+    import command
+
+    return command.run(getattr(import_module(script), _COMMANDS.get(script, script)), list(arguments))
