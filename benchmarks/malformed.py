@@ -445,6 +445,11 @@ CALLS: Table = {
         f"plot.{door.__name__}": (door, {"dataset": a_map()}, {"dataset": DATASET})
         for door in (plot.power_map, plot.label_map, plot.basin_map, plot.multistability_map, plot.difference_map)
     },
+    "plot.variable_map": (
+        plot.variable_map,
+        {"dataset": a_map(), "name": "mass"},
+        {"dataset": DATASET, "name": (3, None, ["mass"], "P")},
+    ),
     "chart.orbit_diagram": (chart.orbit_diagram, {}, {"dataset": DATASET}),
     "chart.branches": (chart.branches, {}, {"dataset": DATASET}),
     "tolerance.nodes": (

@@ -50,7 +50,7 @@ def test_a_file_of_numbers_with_units(tmp_path):
     [
         ("omega", "5kg", "omega must be in rad/s, or in a unit of that kind; got one in kilogram"),
         ("beta", "5Hz", "beta must be in rad, .* got one in hertz"),
-        ("s", "5parsnips", "s must be in m, or in a unit known; got 'parsnips'"),
+        ("s", "5parsnips", "s must be in m, or in a unit that pint knows; got 'parsnips'"),
         ("omega", "2:10Hz:9", "omega must have a unit at every number or at none; got '2:10Hz:9'"),
         ("s", "0.2,30cm", "s must have a unit at every number or at none"),
         ("d", "5mm", "d must be a number without a unit; got one in millimeter; with a unit there is s"),

@@ -88,7 +88,9 @@ def _factor_of(name: str, text: str) -> float:
     try:
         return _factor(name, pint.application_registry.Unit(text))
     except pint.UndefinedUnitError:
-        raise ValueError(f"{name} must be in {UNITS.get(name, 'no unit')}, or in a unit known; got {text!r}") from None
+        raise ValueError(
+            f"{name} must be in {UNITS.get(name, 'no unit')}, or in a unit that pint knows; got {text!r}"
+        ) from None
 
 
 def _factor(name: str, unit: Any) -> float:
