@@ -294,3 +294,25 @@ def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     assert int(found.status) == Status.SLOW
     assert int(found.period) == -1
     assert found.periods_run < 1000
+
+
+def test_single_precision_finds_the_same_periods():
+    # It had called every seventh of these cells by twice its period: the decay of a flip, taken for the orbit.
+    axes = {"d": np.linspace(0.05, 0.3, 24), "kappa": np.geomspace(3, 400, 24), "r": 0.5, "gamma": 0.3}
+    double, single = (sweep(**axes, outputs=["period"], dtype=kind).period.values for kind in ("float64", "float32"))
+    periodic = double > 0
+    assert periodic.sum() > 350
+    assert (single != double)[periodic].mean() < 0.05
+
+
+def test_a_long_period_is_kept_by_a_flight_of_thousands():
+    # Orbits that attract from so near that chaos passes them: Newton alone would find them from there.
+    for d, kappa, r in (
+        (0.42213485860502636, 2.8083176198774358, 0.3414784028305109),
+        (0.13992353802728440, 118.61016650019532, 0.6504155346023393),
+    ):
+        found = sweep(d=d, kappa=kappa, r=r, outputs=["period", "max_impact_speed"])
+        if (period := int(found.period)) > 8:
+            axes = {"d": d, "kappa": kappa, "r": r, "outputs": ["max_impact_speed"]}
+            later = sweep(**axes, until="window", transient=5000, periods=period)
+            assert float(later.max_impact_speed) == pytest.approx(float(found.max_impact_speed), rel=1e-6)

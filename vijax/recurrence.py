@@ -16,6 +16,8 @@ from vijax.xla import share
 
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
 _ROUNDS = 8  # Newton rounds on one candidate
+_SHORT = 8  # longest period, in forcing periods, of an orbit whose surroundings are taken to be wide
+_WITHIN = 0.3  # of Newton's first step is left for the second where the first one was within the orbit's reach
 
 
 def grain(settings: Settings) -> Float[Array, ""] | float:
@@ -29,8 +31,12 @@ def recurrence(dtype, grain=0.0):
 
 
 def settled(dtype, grain=0.0):
-    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64, likewise."""
-    return 1e4 * float(jnp.finfo(dtype).eps) + grain
+    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64, 4e-6 in float32.
+
+    In float32 that is nearer to rounding: an orbit accepted at the first look would keep the decay of a flip, which
+    recurs sooner after two turns than after one, and have twice its period.
+    """
+    return (1e4 if dtype == jnp.float64 else 30.0) * float(jnp.finfo(dtype).eps) + grain
 
 
 def blank_candidate(settings: Settings, like: Lane, ball: Lanes) -> Candidate:
@@ -95,9 +101,12 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     least = grain(settings)
     close, far = settled(size.dtype, least), 1e3 * recurrence(size.dtype, least)
     arrived = (size < close) | ((size < 1e3 * close) & (size > 0.25 * c.last))
-    good = judged & arrived & (largest < 1 + 1e-6)
+    # A long orbit attracts from so near that chaos may pass it within the recurrence and go on. There Newton's second
+    # step is no shorter than the first: the orbit is a real one, but the ball is not on its way to it.
+    astray = judged & (c.period > _SHORT) & (c.rounds == 1) & (size > jnp.maximum(_WITHIN * c.last, close))
+    good = judged & arrived & (largest < 1 + 1e-6) & ~astray
     # Where a bounded, contracting Newton step leads nowhere near, the recurrence was a coincidence.
-    bad = judged & ~good & (arrived | ~(size + c.moved < far) | (c.rounds >= _ROUNDS))
+    bad = judged & ~good & (arrived | astray | ~(size + c.moved < far) | (c.rounds >= _ROUNDS))
     again = judged & ~good & ~bad
     cell = _begin_round(plan, cell, start | again, start, nudge_u, nudge_v, size)
     cell = _back_to_search(plan, cell, bad, 10 * least)
