@@ -61,7 +61,8 @@ class Arc(eqx.Module):
         if self.along != "omega":
             return eqx.tree_at(lambda pair: getattr(pair, self.along), self.pair, x)
         d = self.ratio * (x / flow.PI) ** 2
-        kappa = None if self.pair.kappa is None else self.pair.kappa * jnp.sqrt(self.pair.d / d)
+        root = lanes.library((self, x)).sqrt
+        kappa = None if self.pair.kappa is None else self.pair.kappa * root(self.pair.d / d)
         return ImpactPair(d, kappa, self.pair.r, self.pair.gamma)
 
 

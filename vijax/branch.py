@@ -7,11 +7,9 @@ import dataclasses
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from vijax import checks, flow, shooting
+from vijax import checks, flow, lanes, shooting
 from vijax import orbit as orbits
 from vijax.arc import ALONG, CLOSE, FIRST_END, FOLD, PLUS, Arc, Place, Tests, advance, unpack
 from vijax.axes import AXES
@@ -205,15 +203,14 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
     if along == "gamma" and bool(orbit.sequence.mirrored.any()):
         raise ValueError("orbit must be closed in full to be followed along gamma; got one closed half way; unfold it")
     size, (low, high) = len(orbit), within
-    ratio = jnp.full(size, device.s / device.A)
-    arcs = Arc(orbit.pair, orbit.sequence, ratio, jnp.full(size, low), jnp.full(size, high), along)
     # By NumPy from here on: branches differ in length, and JAX would compile a program for each.
-    arcs = jax.tree.map(np.asarray, arcs)
+    ratio, *bounds = (lanes.arrays(np.full(size, float(number))) for number in (device.s / device.A, low, high))
+    arcs = jax.tree.map(np.asarray, Arc(orbit.pair, orbit.sequence, ratio, bounds[0], bounds[1], along))
     knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 
-def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> Array:
+def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> np.ndarray:
     """The parameter's value at a pair, or ValueError unless it can be followed from there within the bounds."""
     rigid = pair.kappa is None
     allowed = [name for name in ALONG if name != "kappa" or not rigid]
@@ -222,9 +219,10 @@ def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], devi
     for bound in bounds:
         check(along, bound, "within")
     # The frequency at which the device's gap is d.
-    x = flow.PI * jnp.sqrt(pair.d * device.A / device.s) if along == "omega" else getattr(pair, along)
-    if not bool(((x >= low) & (x <= high)).all()):
-        raise ValueError(f"within must hold the start; got {bounds} and {along} = {float(jnp.ravel(x)[0]):.6g}")
+    pair = jax.tree.map(np.asarray, pair)
+    x = flow.PI * np.sqrt(pair.d * float(device.A / device.s)) if along == "omega" else getattr(pair, along)
+    if not ((x >= low) & (x <= high)).all():
+        raise ValueError(f"within must hold the start; got {bounds} and {along} = {np.ravel(x)[0]:.6g}")
     return x
 
 
@@ -241,7 +239,7 @@ def _branch(arc: Arc, rows: list[tuple], along: str, end: str) -> Branch:
             met.append(Point(kind, float(event.y[-1] * (arc.high - arc.low)), _orbits(arc, event.y[None])))
     orbit = _orbits(arc, ys)
     # At a bound the last orbit is there; at a grazing rounding decides whether it is one.
-    count = len(ys) if int(orbit.status[-1]) == Status.OK else last
+    count = len(ys) if np.asarray(orbit.status)[-1] == Status.OK else last
     return Branch(along, ys[:count, -1] * float(arc.high - arc.low), orbit[:count], met, ("start", end))
 
 
@@ -476,12 +474,12 @@ _ABOUT = {
 def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
     """What the dataset holds of a branch, a row a point."""
     if branch.along == "omega":
-        device = dataclasses.replace(device, omega=jnp.asarray(branch.values[:, None]))
+        device = dataclasses.replace(device, omega=lanes.arrays(branch.values[:, None]))
     hits, label = orbits.impacts(branch.orbit), orbits.counts(branch.orbit)
     length = orbits.depth_unit(branch.orbit, device)
     columns = {
         branch.along: branch.values,
-        "multiplier": np.abs(branch.orbit.multipliers).max(axis=1),
+        "multiplier": np.abs(np.asarray(branch.orbit.multipliers)).max(axis=1),
         "stable": branch.stable.astype(float),
         "P": orbits.power(branch.orbit, device),
         "period": label.period,
@@ -492,7 +490,7 @@ def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
         "side": hits.side,
         "phase": hits.t,
         "duration": hits.duration,
-        "depth": hits.depth * length,
+        "depth": np.asarray(hits.depth) * np.asarray(length),
     }
     return {name: np.asarray(values, float) for name, values in columns.items()}
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax import checks, flow
+from vijax import checks, flow, lanes
 from vijax.model import ImpactPair, check_pair
 
 MOST_SAMPLES = 10**6  # of a piece
@@ -58,7 +58,8 @@ def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[n
     (t, side, v_in, v_out, duration), count = _padded(t=t, side=side, v_in=v_in, v_out=v_out, duration=duration)
     index = np.searchsorted(t[:count], when, side="right") - 1
     last = np.maximum(index, 0)
-    u, v = _at(pair, *(row[last] for row in (t, side, v_in, v_out, duration)), np.asarray(when, float))
+    held = (row[last] for row in (t, side, v_in, v_out, duration))
+    u, v = lanes.elementwise(_at, pair, *held, np.asarray(when, float))
     return np.where(index < 0, np.nan, u), np.where(index < 0, np.nan, v)
 
 
@@ -68,7 +69,7 @@ def _padded(**given) -> tuple[list[np.ndarray], int]:
     rows = [_row(name, row, shape) for name, row in given.items()]
     there = np.isfinite(rows[0])
     count = int(there.sum())
-    width = 1 << max(count - 1, 0).bit_length()
+    width = lanes.padded(count)
     return [np.resize(row[there], width) for row in rows], count
 
 

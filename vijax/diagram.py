@@ -19,7 +19,7 @@ from vijax import checks, energy, estimate, simulate
 from vijax.axes import AXES, cells, check_axis
 from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance
 from vijax.grid import Axes, most_periods
-from vijax.lanes import workers
+from vijax.lanes import arrays, padded, workers
 from vijax.model import WALLS, Harvester, ImpactPair, State, Status, one_device
 from vijax.record import Record, record
 
@@ -245,7 +245,7 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
             if not group.size:
                 continue
             share = math.ceil(group.size / workers())
-            lanes = min(max(1 << (share - 1).bit_length(), _FEWEST_LANES), _MOST_LANES)
+            lanes = min(max(padded(share), _FEWEST_LANES), _MOST_LANES)
             number = math.ceil(group.size / lanes)
             tiles = [group[first::number] for first in range(number)]
             if number > 1:
@@ -300,18 +300,18 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
     for first in range(0, points, _LINKS):
         links = min(_LINKS, points - first)
 
-        def padded(x: np.ndarray, first: int = first, links: int = links) -> jax.Array:
+        def extended(x: np.ndarray, first: int = first, links: int = links) -> jax.Array:
             widths = ((0, lanes - chains), (0, _LINKS - links))
             return jnp.asarray(np.pad(x[:, first : first + links], widths, mode="edge"))
 
         soft = planned.settings["wall"] == "soft"
-        d, kappa, r, gamma = (padded(table[name]) for name in ("d", "kappa", "r", "gamma"))
+        d, kappa, r, gamma = (extended(table[name]) for name in ("d", "kappa", "r", "gamma"))
         summary = simulate.follow(
             ImpactPair(d, kappa if soft else None, r, gamma),
             simulate.Starts(*(jnp.asarray(np.pad(x, (0, lanes - chains), mode="edge")) for x in state)),
-            simulate.Growth(padded(growth["metres"]), padded(growth["speed"])),
-            padded(table["depth"]),
-            padded(table["speed"]),
+            simulate.Growth(extended(growth["metres"]), extended(growth["speed"])),
+            extended(table["depth"]),
+            extended(table["speed"]),
             planned.device,
             periods=periods,
             keep=keep,
@@ -328,7 +328,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
 def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -> Record:
     """The kept periods of every point, flown again from where they begin."""
     soft = planned.settings["wall"] == "soft"
-    d, kappa, r, gamma = (jnp.asarray(table[name].ravel()) for name in ("d", "kappa", "r", "gamma"))
+    d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
     whole_numbers = (x.astype(np.int32) for x in (n, held))
     lost = np.isin(summary.status, (Status.EVENT_BUDGET, Status.NONFINITE)).ravel()

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from vijax import checks
 from vijax.flow import half_turn
+from vijax.lanes import elementwise
 from vijax.model import Harvester, check_device
 from vijax.xla import once
 
@@ -67,11 +68,11 @@ def harvested_energy(device: Harvester, depth: Values) -> Values:
         found = checks.numbers("depth", given, some=False)
         # A number and an array of JAX stay what they are: their precision is the result's.
         depth = jnp.asarray(found, float) if isinstance(given, list | tuple) else depth
-    return _harvested(device, depth)
+    return elementwise(_harvested_energy, device, depth)
 
 
 @once
-def _harvested(device: Harvester, depth: Values) -> Values:
+def _harvested_energy(device: Harvester, depth: Values) -> Values:
     growth = stretch(device, depth)
     least = _rest_capacitance(device)
     gain = least * growth * (2 + growth)

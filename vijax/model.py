@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -402,7 +403,10 @@ def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
         check(name, value)
     arrays = [np.asarray(value) if isinstance(value, list | tuple) else value for value in given.values()]
     dtype = jnp.result_type(float, *arrays)  # float64, or float32 where all arrays are
-    arrays = [jnp.asarray(array, dtype) for array in arrays]
+    # By NumPy where it can: JAX would compile a program for every shape.
+    own = np if checks.is_concrete(*arrays) else jnp
+    arrays = [own.asarray(array, dtype) for array in arrays]
     shape = checks.shapes(**dict(zip(given, arrays, strict=True)))
-    fields = {name: jnp.broadcast_to(array, shape) for name, array in zip(given, arrays, strict=True)}
-    return ImpactPair(fields["d"], fields.get("kappa"), fields["r"], fields["gamma"])
+    fields = {name: own.broadcast_to(array, shape) for name, array in zip(given, arrays, strict=True)}
+    pair = ImpactPair(fields["d"], fields.get("kappa"), fields["r"], fields["gamma"])
+    return jax.device_put(pair) if own is np else pair

@@ -62,7 +62,7 @@ class Orbit(eqx.Module):
     def __getitem__(self, index: Any) -> "Orbit":
         """Some of the orbits, by an index array, a mask or a slice."""
         # Not by JAX, which compiles a program for every slice and every number of orbits.
-        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[index]), self)
+        return lanes.arrays(jax.tree.map(lambda leaf: np.asarray(leaf)[index], self))
 
     def __len__(self) -> int:
         return self.knots.shape[0]
@@ -103,6 +103,12 @@ def check_orbit(orbit: Any) -> Orbit:
     return orbit
 
 
+def _guess(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.ndarray) -> tuple[Sequence, Array]:
+    """Sequences and knots as `solve` takes them."""
+    *walls, near = lanes.arrays((side, span, mirrored, knots))
+    return Sequence(*walls), near
+
+
 def _level(pair: ImpactPair) -> bool:
     return bool((np.asarray(pair.gamma) == 0).all())
 
@@ -123,7 +129,7 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
 
 def concatenate(found: list[Orbit]) -> Orbit:
     """Orbits of one number of impacts as one batch."""
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *found)
+    return lanes.arrays(jax.tree.map(lambda *leaves: np.concatenate(leaves), *found))
 
 
 class _Claim(NamedTuple):
@@ -222,30 +228,29 @@ def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 
     period, settle = checks.whole("period", period, 1, _MOST_PERIOD), checks.whole("settle", settle, 0)
     checks.known("pair", check_pair(pair))
     given = {"u": u, "v": v, "t": t}
-    u, v, t = (jnp.atleast_1d(jnp.asarray(checks.finite(name, x), float)) for name, x in given.items())
+    # By NumPy, as JAX would compile a program for each number of states.
+    u, v, t = (np.atleast_1d(np.asarray(checks.finite(name, x), float)) for name, x in given.items())
     shape = checks.shapes(u=u, v=v, t=t, d=pair.d, kappa=0 if pair.kappa is None else pair.kappa, r=pair.r)
     check_start(pair, "u", u)
-    pair = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), pair)
-    u, v, t = (jnp.broadcast_to(x, shape) for x in (u, v, t))
-    inside = np.asarray((t >= 0) & (t < 2))
+    pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)
+    u, v, t = (np.broadcast_to(x, shape) for x in (u, v, t))
+    inside = (t >= 0) & (t < 2)
     if not inside.all():
         raise ValueError(f"t must lie in [0, 2); got {checks.first(t, inside)}")
-    lost = jnp.zeros(shape, bool)
+    lost = np.zeros(shape, bool)
     if settle:
-        last = jax.tree.map(lambda x: x[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
+        last = jax.tree.map(lambda x: np.asarray(x)[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
         # More impacts than a trajectory has room for: the state is not known.
-        lost = ~jnp.isfinite(last.u + last.v)
-        u, v, t = jnp.where(lost, 0.0, last.u), jnp.where(lost, 0.0, last.v), jnp.zeros_like(t)
+        lost = ~np.isfinite(last.u + last.v)
+        u, v, t = np.where(lost, 0.0, last.u), np.where(lost, 0.0, last.v), np.zeros(shape)
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
-    found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
-    onset = 2 * found.n.astype(found.t.dtype) + found.t
-    around = np.asarray((onset < onset[:, :1] + 2 * period - _SAME) & ~lost[:, None])
-    width = 1 << max(int(around.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
-    mask = jnp.asarray(around[:, :width])
-    side = jnp.where(mask, found.side[:, :width], 0)
-    knots = jnp.stack([onset[:, :width], jnp.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
-    span = jnp.full(shape, 2.0 * period)
-    return _solved(pair, Sequence(side, span, jnp.zeros(shape, bool)), knots)
+    found = jax.tree.map(np.asarray, trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts)
+    onset = 2 * found.n + found.t
+    around = (onset < onset[:, :1] + 2 * period - _SAME) & ~lost[:, None]
+    width = lanes.padded(int(around.sum(axis=1).max(initial=1)))
+    side = np.where(around[:, :width], found.side[:, :width], 0)
+    knots = np.stack([onset[:, :width], np.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
+    return _solved(pair, *_guess(side, np.full(shape, 2.0 * period), np.zeros(shape, bool), knots))
 
 
 def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
@@ -325,10 +330,9 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     speed = draw.uniform(0, _FASTEST, (guesses, count))
     free = np.zeros(()) if pair.kappa is None else np.pi / np.asarray(pair.omega1)
     knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
-    wide = jax.tree.map(lambda x: jnp.broadcast_to(x, guesses), pair)
-    side = jnp.broadcast_to(jnp.asarray(walls, jnp.int32), (guesses, count))
-    span = jnp.full(guesses, 2.0 * period)
-    return _solved(wide, Sequence(side, span, jnp.zeros(guesses, bool)), jnp.asarray(knots))
+    wide = jax.tree.map(lambda x: np.broadcast_to(x, guesses), pair)
+    side = np.broadcast_to(np.asarray(walls, np.int32), (guesses, count))
+    return _solved(wide, *_guess(side, np.full(guesses, 2.0 * period), np.zeros(guesses, bool), knots))
 
 
 def distinct(orbit: Orbit) -> Orbit:
@@ -382,8 +386,8 @@ def halved(orbit: Orbit) -> Orbit:
     kept = np.arange(host.knots.shape[1]) < (host.count // 2)[:, None]
     width = host.knots.shape[1] // 2
     side = np.where(kept, host.sequence.side, 0)[:, :width]
-    sequence = Sequence(jnp.asarray(side), 0.5 * host.sequence.span, jnp.ones(len(orbit), bool))
-    return _solved(host.pair, sequence, jnp.asarray(np.where(kept[..., None], host.knots, 0.0)[:, :width]))
+    knots = np.where(kept[..., None], host.knots, 0.0)[:, :width]
+    return _solved(host.pair, *_guess(side, 0.5 * host.sequence.span, np.ones(len(orbit), bool), knots))
 
 
 def doubled(orbit: Orbit) -> Orbit:
@@ -411,11 +415,8 @@ def _unfolded(orbit: Orbit, twice: Bool[np.ndarray, "orbit"]) -> Orbit:
     knots = np.take_along_axis(host.knots, from_first[..., None], axis=1)
     knots[..., 0] += np.where(again, host.sequence.span[:, None], 0.0)
     span = np.where(twice, 2 * host.sequence.span, host.sequence.span)
-    sequence = Sequence(jnp.asarray(np.where(there, side, 0)), jnp.asarray(span), host.sequence.mirrored & ~twice)
-    return proven(host.pair, sequence, jnp.asarray(np.where(there[..., None], knots, 0.0)))
-
-
-_compiled_passages = jax.jit(jax.vmap(shooting.passages))
+    mirrored, knots = host.sequence.mirrored & ~twice, np.where(there[..., None], knots, 0.0)
+    return proven(host.pair, *_guess(np.where(there, side, 0), span, mirrored, knots))
 
 
 class Counts(NamedTuple):
@@ -453,8 +454,13 @@ def labels(orbit: Orbit) -> np.ndarray:
 
 def impacts(orbit: Orbit) -> Impact:
     """The impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
-    full = unfolded(orbit)
-    passage = _compiled_passages(full.pair, full.sequence, full.knots)
+    return lanes.arrays(lanes.map_tiles(_hits, unfolded(orbit), _TILES))
+
+
+@jax.jit
+def _hits(full: Orbit) -> Impact:
+    """The impacts of orbits that are in full."""
+    passage = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots)
     side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
     phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
     blank, wall = jnp.where(side == 0, jnp.nan, 0.0), side.astype(t.dtype)
@@ -479,10 +485,10 @@ def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
     Source: Eq. (36), corrected.
     """
     check_device(device)
-    energy = jnp.where(
-        check_orbit(orbit).sequence.real, harvested_energy(device, orbit.depth * depth_unit(orbit, device)), 0.0
-    )
-    return energy.sum(axis=1) / orbit.sequence.span
+    own = lanes.library((check_orbit(orbit), device))
+    orbit, device = jax.tree.map(own.asarray, (orbit, device))
+    energy = own.asarray(harvested_energy(device, orbit.depth * depth_unit(orbit, device)))
+    return lanes.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
 
 
 def depth_unit(orbit: Orbit, device: Harvester) -> Any:
@@ -500,9 +506,17 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
         wall.
     """
     samples = checks.whole("samples", samples, 1, MOST_SAMPLES)
-    full, hits = unfolded(orbit), impacts(orbit)
-    until = _compiled_passages(full.pair, full.sequence, full.knots).next_t
-    t, stay, side = full.knots[..., 0], full.knots[..., 2], hits.side.astype(until.dtype)
-    rows = jax.vmap(partial(pieces, samples=samples))(full.pair, t, side, hits.v_in, hits.v_out, stay, until)
-    clock, u, v = (np.where(full.sequence.real[..., None], row, np.nan).reshape(len(full), -1) for row in rows)
+    full = jax.tree.map(np.asarray, unfolded(orbit))
+    rows = lanes.map_tiles(partial(_pieces, samples=samples), full, _TILES)
+    real = full.sequence.real[..., None]
+    clock, u, v = (np.where(real, row, np.nan).reshape(len(full), -1) for row in rows)
     return clock, u, v
+
+
+@partial(jax.jit, static_argnames="samples")
+def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
+    """(t, u, v) [orbit, impact, instant] of orbits that are in full."""
+    until = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots).next_t
+    hits, t = _hits(full), full.knots[..., 0]
+    side = hits.side.astype(t.dtype)
+    return jax.vmap(partial(pieces, samples=samples))(full.pair, t, side, hits.v_in, hits.v_out, hits.duration, until)

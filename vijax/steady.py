@@ -4,6 +4,7 @@ The orbit follows its parameters by the implicit function theorem on the shootin
 with every impact's own unknowns kept. Where that derivative means nothing, values and derivatives are NaN.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -94,11 +95,21 @@ def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> 
         ValueError: Which argument, what must hold, what came.
     """
     _check(device, orbit, pair)
-    rigid = orbit.pair.kappa is None
-    pair = device.pair("rigid" if rigid else "soft") if pair is None else pair
-    pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), pair)
-    sequence = orbit.sequence
-    guess = jnp.where(sequence.real[:, None], orbit.knots, 0.0)
+    wall = "rigid" if orbit.pair.kappa is None else "soft"
+    # Numbers of one kind, however they are given: each kind would be a program of its own.
+    device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
+    return _near(device, pair, orbit.sequence, orbit.knots, wall)
+
+
+@partial(jax.jit, static_argnames="wall")
+def _near(device: Harvester, pair: ImpactPair | None, sequence: Sequence, guess: Knots, wall: str) -> Steady:
+    """The steady state near a guess.
+
+    Compiled once, and so are its derivatives and batches: as one call they are known by its identity, while loops run
+    one by one would be compiled for every call, as each makes their bodies anew.
+    """
+    pair = device.pair(wall) if pair is None else pair
+    guess = jnp.where(sequence.real[:, None], guess, 0.0)
     return response(device, pair, sequence, *find(pair, sequence, guess))
 
 

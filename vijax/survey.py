@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax import simulate
-from vijax.lanes import workers
+from vijax.lanes import padded, workers
 from vijax.model import ImpactPair, State, Status
 from vijax.record import record
 from vijax.shooting import Sequence
@@ -104,7 +104,7 @@ def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int
     """How every cell ended, a `Summary`, in tiles on every core."""
     cells = pair.d.size
     share = math.ceil(cells / workers())
-    size = min(max(1 << (share - 1).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
+    size = min(max(padded(share), _SMALLEST_TILE), _LARGEST_TILE)
     number = math.ceil(cells / size)
     # Strided tiles cost the same.
     tiles = [np.arange(first, cells, number) for first in range(number)]
