@@ -13,6 +13,7 @@ from vijax import checks, flow, lanes, shooting
 from vijax import orbit as orbits
 from vijax.arc import ALONG, CLOSE, FIRST_END, FOLD, PLUS, Arc, Place, Tests, advance, unpack
 from vijax.axes import AXES
+from vijax.context import door
 from vijax.model import Harvester, ImpactPair, Status, check, one_device
 from vijax.orbit import Orbit, check_orbit
 
@@ -148,6 +149,7 @@ class Branch(NamedTuple):
 _GRAZING = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
 
+@door
 def follow(
     orbit: Orbit,
     along: str,
@@ -299,6 +301,7 @@ def _joined(down: Branch, up: Branch) -> Branch:
     return Branch(down.along, values, orbit, down.points[::-1] + up.points, (down.ends[1], up.ends[1]))
 
 
+@door
 def switch(
     point: Point, along: str, within: tuple[float, float], *, device: Harvester | None = None, points: int = 4000
 ) -> list[Branch]:
@@ -341,6 +344,7 @@ def _begins(point: Point) -> bool:
     return point.kind == "flip" or (point.kind == "pitchfork" and bool(point.orbit.sequence.mirrored[0]))
 
 
+@door
 def family(
     orbit: Orbit,
     along: str,
@@ -396,6 +400,7 @@ def _traits(point: Point) -> np.ndarray:
     return np.append(np.asarray(orbits.marks(orbits.unfolded(point.orbit)))[0], point.value)
 
 
+@door
 def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Dataset":
     """Branches as one dataset: what every orbit is, and what was met, padded with NaN.
 

@@ -6,14 +6,14 @@ import math
 import queue
 import time
 from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import simulate
+from vijax import context, simulate
 from vijax.dataset import Plan
 from vijax.lanes import padded, places
 from vijax.model import ImpactPair
@@ -82,7 +82,7 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
     for place in here:
         free.put(place)
     # Nothing runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
-    pool = ThreadPoolExecutor(len(here))
+    pool = context.pool(len(here))
     running: dict[Future[tuple[Fields, float]], Call] = {}
 
     def fill() -> None:

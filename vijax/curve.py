@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vijax import checks, flow, lanes
+from vijax.context import door
 from vijax.model import ImpactPair, check_pair
 
 MOST_SAMPLES = 10**6  # of a piece
@@ -22,6 +23,7 @@ class Curve(NamedTuple):
     v: np.ndarray
 
 
+@door
 def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48) -> Curve:
     """The motion from the first of successive impacts to the end of the last, in closed form.
 
@@ -49,6 +51,7 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
     return Curve(*(np.asarray(row)[:count].ravel() for row in rows))
 
 
+@door
 def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
     """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
     check_pair(pair)

@@ -6,7 +6,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax import checks, energy, estimate, simulate
+from vijax import checks, context, energy, estimate, simulate
 from vijax.axes import AXES, cells, check_axis
+from vijax.context import door
 from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance
 from vijax.grid import Axes, most_periods
 from vijax.lanes import arrays, padded, workers
@@ -58,6 +59,7 @@ _STROBES = {
 }
 
 
+@door
 def orbit_diagram(
     *,
     along: str,
@@ -150,6 +152,7 @@ class Diagram:
         return 8 * self.count * (self.planned.settings["keep"] * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
 
 
+@door
 def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | None = None, **settings: Any) -> Diagram:
     """Check what an orbit diagram is asked for; runs nothing.
 
@@ -186,6 +189,7 @@ def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | N
     return diagram
 
 
+@door
 def run(diagram: Diagram, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
     """The dataset of a plan, its chains run tile by tile on every core; see `orbit_diagram`."""
     tell = checks.function("progress", progress) or (lambda done, total: None)
@@ -239,7 +243,7 @@ def _table(diagram: Diagram) -> dict[str, np.ndarray]:
 def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Indices and fields of every tile of chains, as the tiles are done."""
     level = (table["gamma"] == 0).all(axis=1)
-    pool = ThreadPoolExecutor(workers())
+    pool = context.pool(workers())
     try:
         for group in (np.flatnonzero(level), np.flatnonzero(~level)):
             if not group.size:

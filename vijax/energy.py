@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vijax import checks
+from vijax.context import door
 from vijax.flow import half_turn
 from vijax.lanes import elementwise
 from vijax.model import Harvester, check_device
@@ -51,6 +52,7 @@ def capacitance(device: Harvester, depth: Values) -> Values:
     return _rest_capacitance(device) * (1 + stretch(device, depth)) ** 2
 
 
+@door
 def harvested_energy(device: Harvester, depth: Values) -> Values:
     """Energy E_j [J] harvested from an impact whose largest penetration is `depth` [m].
 

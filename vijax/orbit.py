@@ -4,7 +4,6 @@ import itertools
 import math
 import re
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -14,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vijax import checks, flow, lanes, shooting, xla
+from vijax import checks, context, flow, lanes, shooting, xla
+from vijax.context import door
 from vijax.curve import MOST_SAMPLES, pieces
 from vijax.energy import harvested_energy
 from vijax.impact_map import Next, next_impacts
@@ -59,6 +59,7 @@ class Orbit(eqx.Module):
         """Impacts until it closes (half of all where it closes onto its mirror image)."""
         return self.sequence.real.sum(axis=-1, dtype=jnp.int32)
 
+    @door
     def __getitem__(self, index: Any) -> "Orbit":
         """Some of the orbits, by an index array, a mask or a slice."""
         # Not by JAX, which compiles a program for every slice and every number of orbits.
@@ -68,6 +69,7 @@ class Orbit(eqx.Module):
         return self.knots.shape[0]
 
 
+@door
 def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
     """The periodic orbits near some guesses, thousands in one call, on every core.
 
@@ -122,11 +124,12 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
         found = work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: tile.real], found)
 
-    with ThreadPoolExecutor(lanes.workers()) as pool:
+    with context.pool(lanes.workers()) as pool:
         found = list(pool.map(part, lanes.tiles(jax.tree.leaves(rows)[0].shape[0], _TILES)))
     return concatenate(found)
 
 
+@door
 def concatenate(found: list[Orbit]) -> Orbit:
     """Orbits of one number of impacts as one batch."""
     return lanes.arrays(jax.tree.map(lambda *leaves: np.concatenate(leaves), *found))
@@ -160,6 +163,7 @@ def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[Array, "
     return _Claim(knots, residual, shooting.floquet(around, sequence.mirrored), passage, *flow.wrap_phase(passage.t))
 
 
+@door
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
     """Orbits from knots that solve the equations already, even where Newton is singular: points of a branch."""
     return _by_tiles(partial(_tile, _compiled(_measured), _level(pair)), (pair, sequence, knots))
@@ -210,6 +214,7 @@ def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) ->
     )
 
 
+@door
 def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1, settle: int = 0) -> Orbit:
     """Periodic orbits near some states: each is flown once around to learn its impacts, then corrected by Newton.
 
@@ -253,6 +258,7 @@ def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 
     return _solved(pair, *_guess(side, np.full(shape, 2.0 * period), np.zeros(shape, bool), knots))
 
 
+@door
 def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
     """Every orbit found with a given impact sequence, stable or unstable, from random guesses.
 
@@ -335,6 +341,7 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     return _solved(wide, *_guess(side, np.full(guesses, 2.0 * period), np.zeros(guesses, bool), knots))
 
 
+@door
 def distinct(orbit: Orbit) -> Orbit:
     """The orbits that are there, each once whichever impact it was begun with."""
     good = np.flatnonzero(np.asarray(check_orbit(orbit).status) == Status.OK)
@@ -346,6 +353,7 @@ def distinct(orbit: Orbit) -> Orbit:
 # What follows asks about orbits in any number: by NumPy, as JAX would compile a program for each number.
 
 
+@door
 def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
     """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
     t, speed, stay = np.moveaxis(np.asarray(orbit.knots), -1, 0)
@@ -356,6 +364,7 @@ def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
     return np.stack([np.nansum(part, axis=-1) for part in parts], axis=-1)
 
 
+@door
 def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"]:
     """Whether each orbit, run through once, is its own mirror image half a span later."""
     host, tolerance = jax.tree.map(np.asarray, check_orbit(orbit)), checks.positive("tolerance", tolerance)
@@ -370,6 +379,7 @@ def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"
     return host.sequence.mirrored | ((count % 2 == 0) & (host.pair.gamma == 0) & (same | ~first).all(axis=1))
 
 
+@door
 def halved(orbit: Orbit) -> Orbit:
     """Symmetric orbits closed half way, onto their mirror image: half the impacts, and a pitchfork becomes a flip.
 
@@ -390,11 +400,13 @@ def halved(orbit: Orbit) -> Orbit:
     return _solved(host.pair, *_guess(side, 0.5 * host.sequence.span, np.ones(len(orbit), bool), knots))
 
 
+@door
 def doubled(orbit: Orbit) -> Orbit:
     """Orbits run through twice, or in full where they were closed half way."""
     return _unfolded(check_orbit(orbit), np.ones(len(orbit), bool))
 
 
+@door
 def unfolded(orbit: Orbit) -> Orbit:
     """Orbits in full, those closed half way too."""
     mirrored = np.asarray(check_orbit(orbit).sequence.mirrored)
@@ -427,6 +439,7 @@ class Counts(NamedTuple):
     period: Int[np.ndarray, "orbit"]
 
 
+@door
 def counts(orbit: Orbit) -> Counts:
     """What is in the label of each orbit, over the smallest whole number of periods after which it recurs."""
     full = jax.tree.map(np.asarray, unfolded(orbit))
@@ -446,12 +459,14 @@ def counts(orbit: Orbit) -> Counts:
     return Counts(left // turns, right // turns, period // turns)
 
 
+@door
 def labels(orbit: Orbit) -> np.ndarray:
     """Names n:m/pT of orbits."""
     found = counts(orbit)
     return label(found.period, found.left, found.right)
 
 
+@door
 def impacts(orbit: Orbit) -> Impact:
     """The impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
     return lanes.arrays(lanes.map_tiles(_hits, unfolded(orbit), _TILES))
@@ -476,6 +491,7 @@ def _hits(full: Orbit) -> Impact:
     )
 
 
+@door
 def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
     """Energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
 
@@ -498,6 +514,7 @@ def depth_unit(orbit: Orbit, device: Harvester) -> Any:
     return device.length_unit
 
 
+@door
 def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The motion of full orbits to draw: `samples` instants of every contact and of every flight.
 

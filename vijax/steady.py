@@ -10,11 +10,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vijax import checks, elimination, energy, flow, shooting
 from vijax.clearance import Clearance, between
+from vijax.context import door
 from vijax.exact import implicit_root
 from vijax.model import Harvester, ImpactPair, Status, check_device, check_pair
 from vijax.shooting import Knots, Sequence
@@ -79,6 +81,7 @@ def _follows_jvp(primals, tangents):
     return knots, -elimination.solve(slope, moved).reshape(knots.shape)
 
 
+@door
 def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> Steady:
     """The steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
 
@@ -95,6 +98,8 @@ def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> 
         ValueError: Which argument, what must hold, what came.
     """
     _check(device, orbit, pair)
+    if orbit.knots.dtype != np.float64:
+        raise ValueError(f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbit` found it")
     wall = "rigid" if orbit.pair.kappa is None else "soft"
     # Numbers of one kind, however they are given: each kind would be a program of its own.
     device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))

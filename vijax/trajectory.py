@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax import checks, exact, flow, lanes
+from vijax.context import door
 from vijax.membrane import HuntCrossley, Law
 from vijax.method import Method, Rk4, choose, repeated
 from vijax.model import Impact, ImpactPair, State, Status, check_pair, check_start
@@ -285,6 +286,7 @@ def _check_starts(pair: ImpactPair, periods: int, starts: Mapping[str, Any]) -> 
             raise ValueError(f"t0 must lie in [0, 2 periods), here [0, {2 * periods}); got {checks.first(t0, good)}")
 
 
+@door
 def trajectory(
     pair: ImpactPair,
     u0: Float[Array, "..."] | float,
