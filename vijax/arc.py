@@ -55,7 +55,7 @@ def moved(pair: ImpactPair, along: str, x: Array, start: Array, steepest: Array)
     """A pair where a parameter, which was `start` there, is x; `steepest` is g/A, gamma of a vertical tube."""
     fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
     if along == "beta":
-        fields["gamma"] = steepest * jnp.sin(x)
+        fields["gamma"] = steepest * lanes.library((pair, x)).sin(x)
     elif along not in _POWERS:
         fields[along] = x
     for name, power in _POWERS.get(along, {}).items():

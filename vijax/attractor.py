@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike
 
 from vijax import checks, grid
 from vijax.axes import cells, check_axis
+from vijax.context import door
 from vijax.dataset import Plan
 from vijax.label import FAILED, label, ordered
 from vijax.model import Harvester, Status, one_device
@@ -46,6 +47,7 @@ _BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "O": ""}
 _NONE = {"starts": 0, "fraction": 0.0, "fraction_stderr": 0.0}
 
 
+@door
 def basins(
     *,
     u0: ArrayLike | None = None,
@@ -90,6 +92,7 @@ def basins(
     return matched(grid.run(planned, progress), merge_mirrors)
 
 
+@door
 def plan_basins(
     axes: Mapping[str, Any], device: Harvester | None = None, *, merge_mirrors: bool = False, **settings: Any
 ) -> Plan:
@@ -112,6 +115,7 @@ def plan_basins(
     return _plan({"u0": u0, "v0": v0} | others, device, merge_mirrors, settings)
 
 
+@door
 def basin_fractions(
     *,
     starts: int = 64,
@@ -154,6 +158,7 @@ def basin_fractions(
     return matched(grid.run(planned, progress), merge_mirrors)
 
 
+@door
 def plan_fractions(
     axes: Mapping[str, Any],
     device: Harvester | None = None,

@@ -8,14 +8,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from vijax import checks, shooting, units
+from vijax import checks, lanes, shooting, units
 from vijax import orbit as orbits
 from vijax.arc import CLOSE, FIRST_END, FOLD, MOVED, PLUS, Arc, Place, Tests, advance, moved, unpack
 from vijax.axes import AXES
+from vijax.context import door
 from vijax.model import Harvester, ImpactPair, Status, check, one_device, with_constants
 from vijax.orbit import Orbit, check_orbit
 
@@ -151,6 +150,7 @@ class Branch(NamedTuple):
 _GRAZING = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
 
+@door
 def follow(
     orbit: Orbit,
     along: str,
@@ -212,10 +212,10 @@ def _set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harv
             f"orbit must be closed in full to be followed along {along}; got one closed half way; unfold it"
         )
     size, (low, high) = len(orbit), within
-    steepest, low_end, high_end = (jnp.full(size, float(x)) for x in (device.g / device.A, low, high))
-    arcs = Arc(orbit.pair, orbit.sequence, x, steepest, low_end, high_end, along)
     # By NumPy from here on: branches differ in length, and JAX would compile a program for each.
-    arcs = jax.tree.map(np.asarray, arcs)
+    numbers: Any = (device.g / device.A, low, high)
+    start, steepest, low_end, high_end = lanes.arrays((x, *(np.full(size, float(number)) for number in numbers)))
+    arcs = jax.tree.map(np.asarray, Arc(orbit.pair, orbit.sequence, start, steepest, low_end, high_end, along))
     knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
@@ -225,12 +225,12 @@ def _tilts(along: str) -> bool:
     return along in ("gamma", "beta")
 
 
-def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> Array:
+def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> np.ndarray:
     """The parameter's value at a pair, or ValueError unless it can be followed from there within the bounds."""
     low, high = bounds = check_along(pair, along, within)
     x = value_at(pair, along, device)
-    if not bool(((x >= low) & (x <= high)).all()):
-        raise ValueError(f"within must hold the start; got {bounds} and {along} = {float(jnp.ravel(x)[0]):.6g}")
+    if not ((x >= low) & (x <= high)).all():
+        raise ValueError(f"within must hold the start; got {bounds} and {along} = {np.ravel(x)[0]:.6g}")
     return x
 
 
@@ -245,26 +245,29 @@ def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tu
     return bounds
 
 
-def value_at(pair: ImpactPair, along: str, device: Harvester) -> Array:
+def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
     """The parameter's value where a device, by that parameter, has a pair."""
+    of, by = jax.tree.map(np.asarray, (pair, device))
 
-    def omega0() -> Array:
-        return jnp.asarray(pair.kappa) * device.omega / math.pi
+    def omega0() -> np.ndarray:
+        return of.kappa * by.omega / math.pi
 
     known: dict[str, Callable[[], Any]] = {
-        "omega": lambda: math.pi * jnp.sqrt(pair.d * device.A / device.s),
+        "omega": lambda: math.pi * np.sqrt(of.d * by.A / by.s),
         "omega0": omega0,
-        "k": lambda: device.m_b * omega0() ** 2,
-        "s": lambda: pair.d * device.length_unit,
-        "A": lambda: device.s * (device.omega / math.pi) ** 2 / pair.d,
-        "beta": lambda: jnp.arcsin(pair.gamma * device.A / device.g),
+        "k": lambda: by.m_b * omega0() ** 2,
+        "s": lambda: of.d * by.length_unit,
+        "A": lambda: by.s * (by.omega / math.pi) ** 2 / of.d,
+        "beta": lambda: np.arcsin(of.gamma * by.A / by.g),
     }
-    return known[along]() if along in known else getattr(pair, along)
+    return known[along]() if along in known else getattr(of, along)
 
 
 def pair_at(pair: ImpactPair, along: str, value: float, device: Harvester) -> ImpactPair:
     """The pair where the parameter has another value, all else of the device as it is."""
-    return moved(pair, along, jnp.asarray(value), value_at(pair, along, device), jnp.asarray(device.g / device.A))
+    pair, x, steepest = lanes.arrays(jax.tree.map(np.asarray, (pair, value, device.g / device.A)))
+    begun: Any = value_at(pair, along, device)
+    return moved(pair, along, x, begun, steepest)
 
 
 def _branch(arc: Arc, rows: list[tuple], along: str, end: str) -> Branch:
@@ -280,7 +283,7 @@ def _branch(arc: Arc, rows: list[tuple], along: str, end: str) -> Branch:
             met.append(Point(kind, float(event.y[-1] * (arc.high - arc.low)), _orbits(arc, event.y[None])))
     orbit = _orbits(arc, ys)
     # At a bound the last orbit is there; at a grazing rounding decides whether it is one.
-    count = len(ys) if int(orbit.status[-1]) == Status.OK else last
+    count = len(ys) if np.asarray(orbit.status)[-1] == Status.OK else last
     return Branch(along, ys[:count, -1] * float(arc.high - arc.low), orbit[:count], met, ("start", end))
 
 
@@ -340,6 +343,7 @@ def _joined(down: Branch, up: Branch) -> Branch:
     return Branch(down.along, values, orbit, down.points[::-1] + up.points, (down.ends[1], up.ends[1]))
 
 
+@door
 def switch(
     point: Point, along: str, within: tuple[float, float], *, device: Harvester | None = None, points: int = 4000
 ) -> list[Branch]:
@@ -382,6 +386,7 @@ def _begins(point: Point) -> bool:
     return point.kind == "flip" or (point.kind == "pitchfork" and bool(point.orbit.sequence.mirrored[0]))
 
 
+@door
 def family(
     orbit: Orbit,
     along: str,
@@ -437,6 +442,7 @@ def _traits(point: Point) -> np.ndarray:
     return np.append(np.asarray(orbits.marks(orbits.unfolded(point.orbit)))[0], point.value)
 
 
+@door
 def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Dataset":
     """Branches as one dataset: what every orbit is, and what was met, padded with NaN.
 
@@ -515,12 +521,12 @@ _ABOUT = {
 def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
     """What the dataset holds of a branch, a row a point."""
     if branch.along not in ImpactPair.__dataclass_fields__:
-        device = with_constants(device, **{branch.along: jnp.asarray(branch.values[:, None])})
+        device = with_constants(device, **{branch.along: lanes.arrays(branch.values[:, None])})
     hits, label = orbits.impacts(branch.orbit), orbits.counts(branch.orbit)
     length = orbits.depth_unit(branch.orbit, device)
     columns = {
         branch.along: branch.values,
-        "multiplier": np.abs(branch.orbit.multipliers).max(axis=1),
+        "multiplier": np.abs(np.asarray(branch.orbit.multipliers)).max(axis=1),
         "stable": branch.stable.astype(float),
         "P": orbits.power(branch.orbit, device),
         "period": label.period,
@@ -531,7 +537,7 @@ def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
         "side": hits.side,
         "phase": hits.t,
         "duration": hits.duration,
-        "depth": hits.depth * length,
+        "depth": np.asarray(hits.depth) * np.asarray(length),
     }
     return {name: np.asarray(values, float) for name, values in columns.items()}
 

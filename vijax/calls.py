@@ -6,16 +6,16 @@ import math
 import queue
 import time
 from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import simulate
+from vijax import context, simulate
 from vijax.dataset import Plan
-from vijax.lanes import places
+from vijax.lanes import padded, places
 from vijax.model import ImpactPair
 from vijax.study import LARGEST_TILE, SMALLEST_TILE
 
@@ -40,7 +40,7 @@ class Call(NamedTuple):
 
 def rows_for(cells: int) -> int:
     """Rows of the call for so many cells: a power of two, so that few programs are compiled."""
-    return max(1 << max(cells - 1, 0).bit_length(), SMALLEST_TILE)
+    return max(padded(cells), SMALLEST_TILE)
 
 
 def rows_each(cells: int) -> int:
@@ -83,7 +83,7 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
     for place in here:
         free.put(place)
     # Nothing runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
-    pool = ThreadPoolExecutor(len(here))
+    pool = context.pool(len(here))
     running: dict[Future[tuple[Fields, float]], Call] = {}
 
     def fill() -> None:
@@ -145,14 +145,15 @@ def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> 
     """Fields for the first `count` of these cells, padded so that one program serves all."""
     planned = call.planned
     of, settings = planned.cells, planned.settings
-    padded = np.resize(index, call.rows)
+    rows = np.resize(index, call.rows)
     needs = planned.needs
 
     def column(quantity: "xr.Variable") -> jax.Array:
-        return jnp.asarray(of.flat(quantity, padded).astype(settings["dtype"]))
+        return jnp.asarray(of.flat(quantity, rows).astype(settings["dtype"]))
 
     def factors(scale: "xr.Variable") -> jax.Array:
-        return jnp.asarray(of.factors(scale).astype(settings["dtype"]))
+        own = of.factors(scale).astype(settings["dtype"])
+        return jnp.asarray(np.resize(own, padded(own.size)))
 
     d, kappa, r, gamma, u0, v0 = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0"))
     summary = simulate.summarise(
@@ -174,4 +175,6 @@ def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> 
         count=count,
         on=place,
     )
-    return {name: getattr(summary, name)[:count] for name in needs}
+    variants = of.factors(of.length).size
+    fields = {name: getattr(summary, name)[:count] for name in needs}
+    return {name: field if field.ndim == 1 else field[:, :variants] for name, field in fields.items()}

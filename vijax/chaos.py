@@ -8,6 +8,7 @@ import numpy as np
 
 from vijax import checks, grid
 from vijax.attractor import MOST_STARTS, SPEED, check_starts, described, plan_fractions, spread, started
+from vijax.context import door
 from vijax.grid import Axes
 from vijax.model import Harvester
 
@@ -25,6 +26,7 @@ _SPREADS = ("its standard error", "the lowest of the ensemble", "the highest of 
 _NEAR = 0.01  # spread of an ensemble around its start, in parts of the gap and of the unit of velocity
 
 
+@door
 def lyapunov(
     *,
     starts: int = 64,
@@ -91,6 +93,7 @@ def _share_of(progress: Callable[[int, int], None] | None, done: int, runs: int)
     return tell and (lambda now, total: tell(done * total + now, runs * total))
 
 
+@door
 def survival(
     *,
     starts: int = 1000,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from vijax import checks, grid
+from vijax.context import door
 from vijax.dataset import Plan
 from vijax.grid import Axes
 from vijax.label import ordered
@@ -58,6 +59,7 @@ class Comparison:
         return self.soft.cells.count + self.rigid.cells.count
 
 
+@door
 def compare(
     *,
     tolerance: float | None = None,
@@ -98,6 +100,7 @@ def compare(
     return run(planned, progress)
 
 
+@door
 def plan(
     axes: Mapping[str, Any], tolerance: float | None = None, device: Harvester | None = None, **settings: Any
 ) -> Comparison:
@@ -123,6 +126,7 @@ def _checked(tolerance: Any) -> float:
     return checks.real("tolerance", tolerance, must, lambda x: 0 < x < np.inf)
 
 
+@door
 def run(planned: Comparison, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
     """The comparison of a plan, soft cells first; see `compare`."""
     before = planned.soft.cells.count

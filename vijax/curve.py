@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax import checks, flow
+from vijax import checks, flow, lanes
+from vijax.context import door
 from vijax.model import ImpactPair, check_pair
 
 MOST_SAMPLES = 10**6  # of a piece
@@ -22,6 +23,7 @@ class Curve(NamedTuple):
     v: np.ndarray
 
 
+@door
 def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48) -> Curve:
     """The motion from the first of successive impacts to the end of the last, in closed form.
 
@@ -49,6 +51,7 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
     return Curve(*(np.asarray(row)[:count].ravel() for row in rows))
 
 
+@door
 def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
     """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
     check_pair(pair)
@@ -58,7 +61,8 @@ def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[n
     (t, side, v_in, v_out, duration), count = _padded(t=t, side=side, v_in=v_in, v_out=v_out, duration=duration)
     index = np.searchsorted(t[:count], when, side="right") - 1
     last = np.maximum(index, 0)
-    u, v = _at(pair, *(row[last] for row in (t, side, v_in, v_out, duration)), np.asarray(when, float))
+    held = (row[last] for row in (t, side, v_in, v_out, duration))
+    u, v = lanes.elementwise(_at, pair, *held, np.asarray(when, float))
     return np.where(index < 0, np.nan, u), np.where(index < 0, np.nan, v)
 
 
@@ -68,7 +72,7 @@ def _padded(**given) -> tuple[list[np.ndarray], int]:
     rows = [_row(name, row, shape) for name, row in given.items()]
     there = np.isfinite(rows[0])
     count = int(there.sum())
-    width = 1 << max(count - 1, 0).bit_length()
+    width = lanes.padded(count)
     return [np.resize(row[there], width) for row in rows], count
 
 

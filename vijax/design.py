@@ -7,7 +7,6 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 import itertools
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -16,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import checks, estimate, lanes, xla
+from vijax import checks, context, estimate, lanes, xla
 from vijax import objective as aims
 from vijax import orbit as orbits
 from vijax.ascent import Box, Climb, ascend, converged
+from vijax.context import door
 from vijax.estimate import Estimate
 from vijax.model import Harvester, Status, one_device
 from vijax.objective import OBJECTIVES, Batch, Scene
@@ -102,11 +102,13 @@ class Design:
         return self.optima[0] if self.optima else None
 
 
+@door
 def optimise(device: Harvester | None = None, **settings: Any) -> Design:
     """The admissible design that harvests most; see `optimise_all`, which takes many devices at once."""
     return optimise_all([one_device(device)], **settings)[0]
 
 
+@door
 def optimise_all(
     devices: Iterable[Harvester],
     *,
@@ -188,6 +190,7 @@ class Spread(NamedTuple):
     inadmissible: float
 
 
+@door
 def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None = None) -> Spread:
     """What becomes of a design when constants scatter.
 
@@ -226,6 +229,7 @@ def expected(devices: int, far: Effort) -> Estimate:
     return estimate.of_recorded(count, far.periods, count * _BALL)
 
 
+@door
 def check(
     devices: list[Harvester],
     tune: tuple[str, ...],
@@ -308,7 +312,7 @@ def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[_En
     for width, few in itertools.pairwise(reversed(widths)):
         some = np.flatnonzero((count > few) & (count <= width))
         jobs += [(some, width, tile) for tile in lanes.tiles(some.size, (_TILE,))]
-    with ThreadPoolExecutor(lanes.workers()) as pool:
+    with context.pool(lanes.workers()) as pool:
         list(pool.map(lambda job: part(*job), jobs))
     return [end for end in ends if end is not None]
 
@@ -375,6 +379,7 @@ def _compiled_states():
     return jax.jit(jax.vmap(steady), compiler_options=xla.compiler_options())
 
 
+@door
 def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
     """The steady state of every device on its known orbit, in padded tiles."""
     given, found = jax.tree.map(lambda *x: np.array(x), *devices), []

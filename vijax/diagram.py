@@ -6,7 +6,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax import checks, energy, estimate, simulate
+from vijax import checks, context, energy, estimate, simulate
 from vijax.axes import AXES, cells, check_axis
+from vijax.context import door
 from vijax.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
 from vijax.grid import Axes, most_periods
-from vijax.lanes import workers
+from vijax.lanes import arrays, padded, workers
 from vijax.model import WALLS, Harvester, ImpactPair, State, Status, one_device
 from vijax.record import Record, record
 
@@ -59,6 +60,7 @@ _STROBES = {
 }
 
 
+@door
 def orbit_diagram(
     *,
     along: str,
@@ -151,6 +153,7 @@ class Diagram:
         return 8 * self.count * (self.planned.settings["keep"] * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
 
 
+@door
 def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | None = None, **settings: Any) -> Diagram:
     """Check what an orbit diagram is asked for; runs nothing.
 
@@ -187,6 +190,7 @@ def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | N
     return diagram
 
 
+@door
 def run(diagram: Diagram, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
     """The dataset of a plan, its chains run tile by tile on every core; see `orbit_diagram`."""
     tell = checks.function("progress", progress) or (lambda done, total: None)
@@ -242,13 +246,13 @@ def _table(diagram: Diagram) -> dict[str, np.ndarray]:
 def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Indices and fields of every tile of chains, as the tiles are done."""
     level = (table["gamma"] == 0).all(axis=1)
-    pool = ThreadPoolExecutor(workers())
+    pool = context.pool(workers())
     try:
         for group in (np.flatnonzero(level), np.flatnonzero(~level)):
             if not group.size:
                 continue
             share = math.ceil(group.size / workers())
-            lanes = min(max(1 << (share - 1).bit_length(), _FEWEST_LANES), _MOST_LANES)
+            lanes = min(max(padded(share), _FEWEST_LANES), _MOST_LANES)
             number = math.ceil(group.size / lanes)
             tiles = [group[first::number] for first in range(number)]
             chains = f"{tiles[0].size:,} chains of {diagram.points:,} points side by side"
@@ -308,18 +312,18 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
     for first in range(0, points, _LINKS):
         links = min(_LINKS, points - first)
 
-        def padded(x: np.ndarray, first: int = first, links: int = links) -> jax.Array:
+        def extended(x: np.ndarray, first: int = first, links: int = links) -> jax.Array:
             widths = ((0, lanes - chains), (0, _LINKS - links))
             return jnp.asarray(np.pad(x[:, first : first + links], widths, mode="edge"))
 
         soft = planned.settings["wall"] == "soft"
-        d, kappa, r, gamma = (padded(table[name]) for name in ("d", "kappa", "r", "gamma"))
+        d, kappa, r, gamma = (extended(table[name]) for name in ("d", "kappa", "r", "gamma"))
         summary = simulate.follow(
             ImpactPair(d, kappa if soft else None, r, gamma),
             simulate.Starts(*(jnp.asarray(np.pad(x, (0, lanes - chains), mode="edge")) for x in state)),
-            simulate.Growth(padded(growth["metres"]), padded(growth["speed"])),
-            padded(table["depth"]),
-            padded(table["speed"]),
+            simulate.Growth(extended(growth["metres"]), extended(growth["speed"])),
+            extended(table["depth"]),
+            extended(table["speed"]),
             planned.device,
             periods=periods,
             keep=keep,
@@ -336,7 +340,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
 def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -> Record:
     """The kept periods of every point, flown again from where they begin."""
     soft = planned.settings["wall"] == "soft"
-    d, kappa, r, gamma = (jnp.asarray(table[name].ravel()) for name in ("d", "kappa", "r", "gamma"))
+    d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
     whole_numbers = (x.astype(np.int32) for x in (n, held))
     lost = np.isin(summary.status, (Status.EVENT_BUDGET, Status.NONFINITE)).ravel()

@@ -9,7 +9,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vijax import checks, units
+from vijax.context import door
 from vijax.flow import half_turn
+from vijax.lanes import elementwise
 from vijax.model import Harvester, check_device
 from vijax.xla import once
 
@@ -50,6 +52,7 @@ def capacitance(device: Harvester, depth: Values) -> Values:
     return _rest_capacitance(device) * (1 + stretch(device, depth)) ** 2
 
 
+@door
 def harvested_energy(device: Harvester, depth: Values) -> Values:
     """Energy E_j [J] harvested from an impact whose largest penetration is `depth`, in metres or a quantity of pint.
 
@@ -63,11 +66,11 @@ def harvested_energy(device: Harvester, depth: Values) -> Values:
     """
     check_device(device)
     given: Any = units.plain("depth", depth)
-    if not checks.is_concrete(given):
-        return _harvested(device, given)
-    found = checks.numbers("depth", given, some=False)
-    # A number and an array of JAX stay what they are: their precision is the result's.
-    return _harvested(device, jnp.asarray(found, float) if isinstance(given, list | tuple) else given)
+    if checks.is_concrete(given):
+        found = checks.numbers("depth", given, some=False)
+        # A number and an array of JAX stay what they are: their precision is the result's.
+        given = jnp.asarray(found, float) if isinstance(given, list | tuple) else given
+    return elementwise(_harvested, device, given)
 
 
 @once

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vijax import checks, traced
+from vijax.context import door
 from vijax.dataset import Plan
 from vijax.files import write_json
 from vijax.lanes import places
@@ -49,6 +50,7 @@ class Estimate(NamedTuple):
         return f"{self.cells:,} cells, up to {checks.gigabytes(self.size)}, about {self.seconds / length:,.2g} {unit}"
 
 
+@door
 def of(*plans: Plan) -> Estimate:
     """What runs of such plans take together."""
     kept = _paces()
@@ -59,6 +61,7 @@ def of(*plans: Plan) -> Estimate:
     )
 
 
+@door
 def of_recorded(cells: int, periods: int, size: float) -> Estimate:
     """What cells take whose impacts are recorded: the points of an orbit diagram, the balls of a survey."""
     return Estimate(cells, size, cells * periods * _RECORDED)

@@ -6,7 +6,6 @@
 import logging
 import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -16,11 +15,12 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax import calls, checks, cluster, estimate, study
+from vijax import calls, checks, cluster, context, estimate, study
 from vijax import method as methods
 from vijax import refine as refinement
 from vijax.axes import Cells, cells
 from vijax.calls import Call, Fields
+from vijax.context import door
 from vijax.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
 from vijax.lanes import places
 from vijax.membrane import HuntCrossley, Law
@@ -57,6 +57,7 @@ class Axes(TypedDict, total=False):
     v0: ArrayLike
 
 
+@door
 def sweep(
     *,
     periods: int = 400,
@@ -163,6 +164,7 @@ def sweep(
     return run(planned, progress, out, overwrite, workers)
 
 
+@door
 def plan(
     axes: Mapping[str, Any], outputs: Iterable[str] | None = None, device: Harvester | None = None, **settings: Any
 ) -> Plan:
@@ -222,6 +224,7 @@ def _levels(refine: Any, of: Cells, until: str) -> int:
     return levels
 
 
+@door
 def run(
     planned: Plan,
     progress: Callable[[int, int], None] | None = None,
@@ -345,7 +348,7 @@ def _compile_ahead(planned: Plan) -> None:
     """Begin to compile what the tiles of a new store need: XLA needs no Python, and importing zarr a core."""
     most = math.prod(study.blocks(planned.cells).values())
     whole = Call(planned, np.arange(min(most, planned.count)), calls.rows_for(most), 0)
-    ThreadPoolExecutor(1).submit(calls.prepare, whole, places()[0])
+    context.pool(1).submit(calls.prepare, whole, places()[0])
 
 
 def _fill(plane: study.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:
@@ -389,6 +392,7 @@ def _here(tiles: Iterable[study.Tile], rows: int) -> Iterator[study.Tile]:
             yield running.pop(call.number)
 
 
+@door
 def _make(rows: int, tile: study.Tile) -> None:
     """Simulate and write a tile, in a worker, on its first device."""
     call, place = _whole(tile, rows), places()[0]

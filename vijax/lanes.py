@@ -4,6 +4,7 @@ Knows no physics: a `Program` says what a cell is, what one quick trip does to e
 lane that declines needs instead. Memory is set by L and by the rows that go in and come out.
 """
 
+import math
 import os
 from collections.abc import Callable
 from functools import partial
@@ -101,6 +102,47 @@ def tiles(count: int, sizes: tuple[int, ...]) -> list[Tile]:
     size = max((size for size in sizes if -(-count // size) * size <= 2 * count), default=sizes[0])
     starts = range(0, count, size)
     return [Tile(np.minimum(np.arange(start, start + size), count - 1), min(size, count - start)) for start in starts]
+
+
+def padded(count: int) -> int:
+    """So many or some more: the next power of two, so that few programs are compiled for every number."""
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def library(tree: Any) -> Any:
+    """What cuts and joins arrays: NumPy, as JAX compiles a program for every size; JAX where something is traced."""
+    return jnp if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)) else np
+
+
+def arrays(tree: Any) -> Any:
+    """The same with JAX's arrays for NumPy's: not by `jnp.asarray`, which compiles a program for every shape."""
+    return tree if library(tree) is jnp else jax.device_put(tree)
+
+
+def map_tiles(work: Callable[[Any], Any], rows: Any, sizes: tuple[int, ...]) -> Any:
+    """What the work makes of any number of rows, in padded tiles of few sizes; in one call where they are traced."""
+    if library(rows) is jnp:
+        return work(rows)
+    parts = []
+    for tile in tiles(jax.tree.leaves(rows)[0].shape[0], sizes):
+        found = work(jax.tree.map(lambda leaf, some=tile.rows: np.asarray(leaf)[some], rows))
+        own = library(found)
+        parts.append(jax.tree.map(lambda leaf, real=tile.real, own=own: own.asarray(leaf)[:real], found))
+    return jax.tree.map(lambda *leaves: library(leaves).concatenate(leaves), *parts)
+
+
+def elementwise(work: Callable[..., Any], *args: Any) -> Any:
+    """What the work makes of arrays that broadcast, padded to a power of two; in their shape where they are traced."""
+    shape = np.broadcast_shapes(*(np.shape(leaf) for leaf in jax.tree.leaves(args)))
+    if not shape or library(args) is jnp:
+        return work(*args)
+    count = math.prod(shape)
+
+    def row(leaf):
+        return np.resize(np.broadcast_to(np.asarray(leaf), shape), padded(count)) if np.ndim(leaf) else leaf
+
+    found = work(*jax.tree.map(row, args))
+    return arrays(jax.tree.map(lambda leaf: np.asarray(leaf)[:count].reshape(shape), found))
 
 
 class _Queue(NamedTuple):

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from vijax import checks, units
 from vijax.checks import is_concrete
+from vijax.context import door
 
 Real = float | Float[Array, "..."]
 
@@ -132,6 +133,7 @@ class ImpactPair(eqx.Module):
         return self.kappa
 
 
+@door
 def damping_ratio(r: Real) -> Float[Array, "..."]:
     """Ratio c/(2 sqrt(k m_b)) = mu/(2 kappa) whose free contact has restitution r.
 
@@ -223,6 +225,7 @@ class Harvester(eqx.Module):
         """Largest admissible penetration [m]."""
         return self.R0 if self.penetration_limit is None else self.penetration_limit
 
+    @door
     def pair(self, wall: str = "soft") -> ImpactPair:
         """The device in nondimensional form, Eqs. (37)-(38).
 
@@ -241,6 +244,7 @@ CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field
 """Constants of the device; the penetration limit is none, but a choice of who builds it."""
 
 
+@door
 def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
     """The device that has the given nondimensional form, by its s, omega0, r and beta; the inverse of `Harvester.pair`.
 
@@ -262,6 +266,7 @@ def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
     return dataclasses.replace(device, s=pair.d * device.length_unit, omega0=omega0, r=pair.r, beta=jnp.arcsin(sine))
 
 
+@door
 def with_constants(device: Harvester, **constants: Real) -> Harvester:
     """The device with some constants changed, checked by name; `k` [N/m] sets omega0 = sqrt(k/m_b).
 
@@ -306,6 +311,7 @@ class MembranePair(eqx.Module):
         return self.omega_star / math.pi
 
 
+@door
 def membrane_pair(pair: ImpactPair) -> MembranePair:
     """A soft pair in the scaling of Eq. (39).
 
@@ -316,6 +322,7 @@ def membrane_pair(pair: ImpactPair) -> MembranePair:
     return MembranePair(pair.gamma * strength, strength, math.pi / kappa, 2 * damping_ratio(pair.r))
 
 
+@door
 def from_membrane_pair(pair: MembranePair) -> ImpactPair:
     """A soft pair in the scaling of Eqs. (37)-(38); the inverse of `membrane_pair` for 0 <= c* < 2."""
     ratio = 0.5 * pair.c_star
@@ -432,6 +439,7 @@ def check_start(pair: ImpactPair, name: str, u: Any) -> None:
         )
 
 
+@door
 def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
     """A checked `ImpactPair`, its fields broadcast to one shape.
 
@@ -452,7 +460,10 @@ def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
         check(name, value)
     arrays = [np.asarray(value) if isinstance(value, list | tuple) else value for value in given.values()]
     dtype = jnp.result_type(float, *arrays)  # float64, or float32 where all arrays are
-    arrays = [jnp.asarray(array, dtype) for array in arrays]
+    # By NumPy where it can: JAX would compile a program for every shape.
+    own = np if checks.is_concrete(*arrays) else jnp
+    arrays = [own.asarray(array, dtype) for array in arrays]
     shape = checks.shapes(**dict(zip(given, arrays, strict=True)))
-    fields = {name: jnp.broadcast_to(array, shape) for name, array in zip(given, arrays, strict=True)}
-    return ImpactPair(fields["d"], fields.get("kappa"), fields["r"], fields["gamma"])
+    fields = {name: own.broadcast_to(array, shape) for name, array in zip(given, arrays, strict=True)}
+    pair = ImpactPair(fields["d"], fields.get("kappa"), fields["r"], fields["gamma"])
+    return jax.device_put(pair) if own is np else pair

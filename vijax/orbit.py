@@ -4,7 +4,6 @@ import itertools
 import math
 import re
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -13,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vijax import checks, flow, lanes, shooting, xla
+from vijax import checks, context, flow, lanes, shooting, xla
+from vijax.context import door
 from vijax.curve import MOST_SAMPLES, pieces
 from vijax.energy import harvested_energy
 from vijax.impact_map import Next, next_impacts
@@ -58,15 +58,17 @@ class Orbit(WithStatus):
         """Impacts until it closes (half of all where it closes onto its mirror image)."""
         return self.sequence.real.sum(axis=-1, dtype=jnp.int32)
 
+    @door
     def __getitem__(self, index: Any) -> "Orbit":
         """Some of the orbits, by an index array, a mask or a slice."""
         # Not by JAX, which compiles a program for every slice and every number of orbits.
-        return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[index]), self)
+        return lanes.arrays(jax.tree.map(lambda leaf: np.asarray(leaf)[index], self))
 
     def __len__(self) -> int:
         return self.knots.shape[0]
 
 
+@door
 def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
     """The periodic orbits near some guesses, thousands in one call, on every core.
 
@@ -102,6 +104,12 @@ def check_orbit(orbit: Any) -> Orbit:
     return orbit
 
 
+def _guess(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.ndarray) -> tuple[Sequence, Array]:
+    """Sequences and knots as `solve` takes them."""
+    *walls, near = lanes.arrays((side, span, mirrored, knots))
+    return Sequence(*walls), near
+
+
 def _level(pair: ImpactPair) -> bool:
     return bool((np.asarray(pair.gamma) == 0).all())
 
@@ -115,14 +123,15 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
         found = work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: tile.real], found)
 
-    with ThreadPoolExecutor(lanes.workers()) as pool:
+    with context.pool(lanes.workers()) as pool:
         found = list(pool.map(part, lanes.tiles(jax.tree.leaves(rows)[0].shape[0], _TILES)))
     return concatenate(found)
 
 
+@door
 def concatenate(found: list[Orbit]) -> Orbit:
     """Orbits of one number of impacts as one batch."""
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *found)
+    return lanes.arrays(jax.tree.map(lambda *leaves: np.concatenate(leaves), *found))
 
 
 class _Claim(NamedTuple):
@@ -153,6 +162,7 @@ def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[Array, "
     return _Claim(knots, residual, shooting.floquet(around, sequence.mirrored), passage, *flow.wrap_phase(passage.t))
 
 
+@door
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
     """Orbits from knots that solve the equations already, even where Newton is singular: points of a branch."""
     return _by_tiles(partial(_tile, _compiled(_measured), _level(pair)), (pair, sequence, knots))
@@ -203,6 +213,7 @@ def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) ->
     )
 
 
+@door
 def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1, settle: int = 0) -> Orbit:
     """Periodic orbits near some states: each is flown once around to learn its impacts, then corrected by Newton.
 
@@ -221,32 +232,32 @@ def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 
     period, settle = checks.whole("period", period, 1, _MOST_PERIOD), checks.whole("settle", settle, 0)
     checks.known("pair", check_pair(pair))
     given = {"u": u, "v": v, "t": t}
-    u, v, t = (jnp.atleast_1d(jnp.asarray(checks.finite(name, x), float)) for name, x in given.items())
+    # By NumPy, as JAX would compile a program for each number of states.
+    u, v, t = (np.atleast_1d(np.asarray(checks.finite(name, x), float)) for name, x in given.items())
     shape = checks.shapes(u=u, v=v, t=t, d=pair.d, kappa=0 if pair.kappa is None else pair.kappa, r=pair.r)
     check_start(pair, "u", u)
-    pair = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), pair)
-    u, v, t = (jnp.broadcast_to(x, shape) for x in (u, v, t))
-    inside = np.asarray((t >= 0) & (t < 2))
+    pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)
+    u, v, t = (np.broadcast_to(x, shape) for x in (u, v, t))
+    inside = (t >= 0) & (t < 2)
     if not inside.all():
         raise ValueError(f"t must lie in [0, 2); got {checks.first(t, inside)}")
-    lost = jnp.zeros(shape, bool)
+    lost = np.zeros(shape, bool)
     if settle:
-        last = jax.tree.map(lambda x: x[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
+        last = jax.tree.map(lambda x: np.asarray(x)[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
         # More impacts than a trajectory has room for: the state is not known.
-        lost = ~jnp.isfinite(last.u + last.v)
-        u, v, t = jnp.where(lost, 0.0, last.u), jnp.where(lost, 0.0, last.v), jnp.zeros_like(t)
+        lost = ~np.isfinite(last.u + last.v)
+        u, v, t = np.where(lost, 0.0, last.u), np.where(lost, 0.0, last.v), np.zeros(shape)
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
-    found = trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts
-    onset = 2 * found.n.astype(found.t.dtype) + found.t
-    around = np.asarray((onset < onset[:, :1] + 2 * period - _SAME) & ~lost[:, None])
-    width = 1 << max(int(around.sum(axis=1).max(initial=1)) - 1, 0).bit_length()
-    mask = jnp.asarray(around[:, :width])
-    side = jnp.where(mask, found.side[:, :width], 0)
-    knots = jnp.stack([onset[:, :width], jnp.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
-    span = jnp.full(shape, 2.0 * period)
-    return _solved(pair, Sequence(side, span, jnp.zeros(shape, bool)), knots)
+    found = jax.tree.map(np.asarray, trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts)
+    onset = 2 * found.n + found.t
+    around = (onset < onset[:, :1] + 2 * period - _SAME) & ~lost[:, None]
+    width = lanes.padded(int(around.sum(axis=1).max(initial=1)))
+    side = np.where(around[:, :width], found.side[:, :width], 0)
+    knots = np.stack([onset[:, :width], np.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
+    return _solved(pair, *_guess(side, np.full(shape, 2.0 * period), np.zeros(shape, bool), knots))
 
 
+@door
 def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
     """Every orbit found with a given impact sequence, stable or unstable, from random guesses.
 
@@ -324,12 +335,12 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     speed = draw.uniform(0, _FASTEST, (guesses, count))
     free = np.zeros(()) if pair.kappa is None else np.pi / np.asarray(pair.omega1)
     knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
-    wide = jax.tree.map(lambda x: jnp.broadcast_to(x, guesses), pair)
-    side = jnp.broadcast_to(jnp.asarray(walls, jnp.int32), (guesses, count))
-    span = jnp.full(guesses, 2.0 * period)
-    return _solved(wide, Sequence(side, span, jnp.zeros(guesses, bool)), jnp.asarray(knots))
+    wide = jax.tree.map(lambda x: np.broadcast_to(x, guesses), pair)
+    side = np.broadcast_to(np.asarray(walls, np.int32), (guesses, count))
+    return _solved(wide, *_guess(side, np.full(guesses, 2.0 * period), np.zeros(guesses, bool), knots))
 
 
+@door
 def distinct(orbit: Orbit) -> Orbit:
     """The orbits that are there, each once whichever impact it was begun with."""
     good = np.flatnonzero(np.asarray(check_orbit(orbit).status) == Status.OK)
@@ -341,6 +352,7 @@ def distinct(orbit: Orbit) -> Orbit:
 # What follows asks about orbits in any number: by NumPy, as JAX would compile a program for each number.
 
 
+@door
 def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
     """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
     t, speed, stay = np.moveaxis(np.asarray(orbit.knots), -1, 0)
@@ -351,6 +363,7 @@ def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
     return np.stack([np.nansum(part, axis=-1) for part in parts], axis=-1)
 
 
+@door
 def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"]:
     """Whether each orbit, run through once, is its own mirror image half a span later."""
     host, tolerance = jax.tree.map(np.asarray, check_orbit(orbit)), checks.positive("tolerance", tolerance)
@@ -365,6 +378,7 @@ def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"
     return host.sequence.mirrored | ((count % 2 == 0) & (host.pair.gamma == 0) & (same | ~first).all(axis=1))
 
 
+@door
 def halved(orbit: Orbit) -> Orbit:
     """Symmetric orbits closed half way, onto their mirror image: half the impacts, and a pitchfork becomes a flip.
 
@@ -381,15 +395,17 @@ def halved(orbit: Orbit) -> Orbit:
     kept = np.arange(host.knots.shape[1]) < (host.count // 2)[:, None]
     width = host.knots.shape[1] // 2
     side = np.where(kept, host.sequence.side, 0)[:, :width]
-    sequence = Sequence(jnp.asarray(side), 0.5 * host.sequence.span, jnp.ones(len(orbit), bool))
-    return _solved(host.pair, sequence, jnp.asarray(np.where(kept[..., None], host.knots, 0.0)[:, :width]))
+    knots = np.where(kept[..., None], host.knots, 0.0)[:, :width]
+    return _solved(host.pair, *_guess(side, 0.5 * host.sequence.span, np.ones(len(orbit), bool), knots))
 
 
+@door
 def doubled(orbit: Orbit) -> Orbit:
     """Orbits run through twice, or in full where they were closed half way."""
     return _unfolded(check_orbit(orbit), np.ones(len(orbit), bool))
 
 
+@door
 def unfolded(orbit: Orbit) -> Orbit:
     """Orbits in full, those closed half way too."""
     mirrored = np.asarray(check_orbit(orbit).sequence.mirrored)
@@ -410,11 +426,8 @@ def _unfolded(orbit: Orbit, twice: Bool[np.ndarray, "orbit"]) -> Orbit:
     knots = np.take_along_axis(host.knots, from_first[..., None], axis=1)
     knots[..., 0] += np.where(again, host.sequence.span[:, None], 0.0)
     span = np.where(twice, 2 * host.sequence.span, host.sequence.span)
-    sequence = Sequence(jnp.asarray(np.where(there, side, 0)), jnp.asarray(span), host.sequence.mirrored & ~twice)
-    return proven(host.pair, sequence, jnp.asarray(np.where(there[..., None], knots, 0.0)))
-
-
-_compiled_passages = jax.jit(jax.vmap(shooting.passages))
+    mirrored, knots = host.sequence.mirrored & ~twice, np.where(there[..., None], knots, 0.0)
+    return proven(host.pair, *_guess(np.where(there, side, 0), span, mirrored, knots))
 
 
 class Counts(NamedTuple):
@@ -425,6 +438,7 @@ class Counts(NamedTuple):
     period: Int[np.ndarray, "orbit"]
 
 
+@door
 def counts(orbit: Orbit) -> Counts:
     """What is in the label of each orbit, over the smallest whole number of periods after which it recurs."""
     full = jax.tree.map(np.asarray, unfolded(orbit))
@@ -444,16 +458,23 @@ def counts(orbit: Orbit) -> Counts:
     return Counts(left // turns, right // turns, period // turns)
 
 
+@door
 def labels(orbit: Orbit) -> np.ndarray:
     """Names n:m/pT of orbits."""
     found = counts(orbit)
     return label(found.period, found.left, found.right)
 
 
+@door
 def impacts(orbit: Orbit) -> Impact:
     """The impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
-    full = unfolded(orbit)
-    passage = _compiled_passages(full.pair, full.sequence, full.knots)
+    return lanes.arrays(lanes.map_tiles(_hits, unfolded(orbit), _TILES))
+
+
+@jax.jit
+def _hits(full: Orbit) -> Impact:
+    """The impacts of orbits that are in full."""
+    passage = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots)
     side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
     phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
     blank, wall = jnp.where(side == 0, jnp.nan, 0.0), side.astype(t.dtype)
@@ -469,6 +490,7 @@ def impacts(orbit: Orbit) -> Impact:
     )
 
 
+@door
 def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
     """Energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
 
@@ -478,10 +500,10 @@ def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
     Source: Eq. (36), corrected.
     """
     check_device(device)
-    energy = jnp.where(
-        check_orbit(orbit).sequence.real, harvested_energy(device, orbit.depth * depth_unit(orbit, device)), 0.0
-    )
-    return energy.sum(axis=1) / orbit.sequence.span
+    own = lanes.library((check_orbit(orbit), device))
+    orbit, device = jax.tree.map(own.asarray, (orbit, device))
+    energy = own.asarray(harvested_energy(device, orbit.depth * depth_unit(orbit, device)))
+    return lanes.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
 
 
 def depth_unit(orbit: Orbit, device: Harvester) -> Any:
@@ -491,6 +513,7 @@ def depth_unit(orbit: Orbit, device: Harvester) -> Any:
     return device.length_unit
 
 
+@door
 def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The motion of full orbits to draw: `samples` instants of every contact and of every flight.
 
@@ -499,9 +522,17 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
         wall.
     """
     samples = checks.whole("samples", samples, 1, MOST_SAMPLES)
-    full, hits = unfolded(orbit), impacts(orbit)
-    until = _compiled_passages(full.pair, full.sequence, full.knots).next_t
-    t, stay, side = full.knots[..., 0], full.knots[..., 2], hits.side.astype(until.dtype)
-    rows = jax.vmap(partial(pieces, samples=samples))(full.pair, t, side, hits.v_in, hits.v_out, stay, until)
-    clock, u, v = (np.where(full.sequence.real[..., None], row, np.nan).reshape(len(full), -1) for row in rows)
+    full = jax.tree.map(np.asarray, unfolded(orbit))
+    rows = lanes.map_tiles(partial(_pieces, samples=samples), full, _TILES)
+    real = full.sequence.real[..., None]
+    clock, u, v = (np.where(real, row, np.nan).reshape(len(full), -1) for row in rows)
     return clock, u, v
+
+
+@partial(jax.jit, static_argnames="samples")
+def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
+    """(t, u, v) [orbit, impact, instant] of orbits that are in full."""
+    until = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots).next_t
+    hits, t = _hits(full), full.knots[..., 0]
+    side = hits.side.astype(t.dtype)
+    return jax.vmap(partial(pieces, samples=samples))(full.pair, t, side, hits.v_in, hits.v_out, hits.duration, until)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from vijax import checks, exact, lanes, quick, relay, traced, trips
 from vijax.cell import TRANSIENT_SHARE, Cell, Plan, Settings, blank_tally
+from vijax.context import door
 from vijax.membrane import HuntCrossley
 from vijax.method import Method, Ode
 from vijax.model import Harvester, ImpactPair, check_device, check_pair
@@ -143,6 +144,7 @@ def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, 
             raise ValueError(f"{name} must hold a number a cell, shape {cells}; got shape {np.shape(start)}")
 
 
+@door
 def summarise(
     pair: ImpactPair,
     u0: Float[Array, "cell"],
@@ -229,6 +231,7 @@ def blank(count: int, variants: int, dtype: str) -> Summary:
     return unpack(plan, np.zeros((count, columns(plan)), dtype))
 
 
+@door
 def attractors(
     pair: ImpactPair,
     u0: Float[Array, "cell"],
@@ -328,6 +331,7 @@ def _compiled_chains(plan: Plan) -> traced.Program:
     return traced.Program(follow, f"{follow.__qualname__} {plan}")
 
 
+@door
 def follow(
     pair: ImpactPair,
     starts: Starts,

@@ -6,17 +6,21 @@ found, for narrow windows of periodic motion lie there -> the best of every kind
 
 import itertools
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from vijax import lanes
 from vijax.energy import harvested_energy
-from vijax.model import Harvester, Status
+from vijax.model import Harvester, ImpactPair, Status
 from vijax.survey import Flown, Survey, survey
 from vijax.tuning import moving, tuned, values
 
+_TILES = (512, 4096, 32768)  # cells of one compiled call
 _LONGEST = 8  # forcing periods of an orbit
 _REACH = 0.49, 0.6  # of the gap that the ball's displacement may take, and its velocity
 _LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities, in parts of their bounds
@@ -190,12 +194,18 @@ def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
     low, high = box[places.owner].swapaxes(0, 1)
     z = low + parts * (high - low)
     given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
-    every = jax.jit(jax.vmap(lambda device, z: tuned(device, tune, z)))(given, z)
-    pair = jax.tree.map(np.asarray, jax.vmap(lambda device: device.pair())(every))
+    every, pair = lanes.map_tiles(lambda rows: _cells(*rows, tune), (given, z), _TILES)
     u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
     found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, periods=effort.periods)
     step = np.round(places.part * (effort.steps - 1)).astype(int)
-    return _Seen(found, jax.tree.map(np.asarray, every), z, places, step)
+    return _Seen(found, every, z, places, step)
+
+
+@partial(jax.jit, static_argnames="tune")
+def _cells(devices: Harvester, z: Float[Array, "cell variable"], tune: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
+    """Devices [cell] with tuned quantities, and their pairs."""
+    every = jax.vmap(lambda device, z: tuned(device, tune, z))(devices, z)
+    return every, jax.vmap(lambda device: device.pair())(every)
 
 
 def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, cells: int) -> _Places:

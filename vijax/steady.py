@@ -4,15 +4,18 @@ The orbit follows its parameters by the implicit function theorem on the shootin
 with every impact's own unknowns kept. Where that derivative means nothing, values and derivatives are NaN.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vijax import checks, elimination, energy, flow, shooting
 from vijax.clearance import Clearance, between
+from vijax.context import door
 from vijax.exact import implicit_root
 from vijax.model import Harvester, ImpactPair, Status, WithStatus, check_device, check_pair
 from vijax.shooting import Knots, Sequence
@@ -77,6 +80,7 @@ def _follows_jvp(primals, tangents):
     return knots, -elimination.solve(slope, moved).reshape(knots.shape)
 
 
+@door
 def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> Steady:
     """The steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
 
@@ -93,11 +97,23 @@ def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> 
         ValueError: Which argument, what must hold, what came.
     """
     _check(device, orbit, pair)
-    rigid = orbit.pair.kappa is None
-    pair = device.pair("rigid" if rigid else "soft") if pair is None else pair
-    pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), pair)
-    sequence = orbit.sequence
-    guess = jnp.where(sequence.real[:, None], orbit.knots, 0.0)
+    if orbit.knots.dtype != np.float64:
+        raise ValueError(f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbit` found it")
+    wall = "rigid" if orbit.pair.kappa is None else "soft"
+    # Numbers of one kind, however they are given: each kind would be a program of its own.
+    device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
+    return _near(device, pair, orbit.sequence, orbit.knots, wall)
+
+
+@partial(jax.jit, static_argnames="wall")
+def _near(device: Harvester, pair: ImpactPair | None, sequence: Sequence, guess: Knots, wall: str) -> Steady:
+    """The steady state near a guess.
+
+    Compiled once, and so are its derivatives and batches: as one call they are known by its identity, while loops run
+    one by one would be compiled for every call, as each makes their bodies anew.
+    """
+    pair = device.pair(wall) if pair is None else pair
+    guess = jnp.where(sequence.real[:, None], guess, 0.0)
     return response(device, pair, sequence, *find(pair, sequence, guess))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from vijax import branch, checks
 from vijax import orbit as orbits
 from vijax.attractor import MOST_STARTS, basin_fractions
+from vijax.context import door
 from vijax.design import Design, Optimum, states
 from vijax.model import Harvester, Status
 from vijax.orbit import Orbit
@@ -60,6 +61,7 @@ class Surroundings(NamedTuple):
     above: Edge
 
 
+@door
 def surroundings(optimum: Optimum, *, starts: int = 2000, reach: float = 0.5, seed: int | None = None) -> Surroundings:
     """Look around an optimum.
 
@@ -109,6 +111,7 @@ def _edge(optimum: Optimum, way: str, reach: float) -> Edge:
     return Edge(kind, float(device.omega0) * at / kappa, 100 * (at / kappa - 1))
 
 
+@door
 def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int | None = None) -> Optimum | None:
     """The design of most P times basin share, by line searches from the optima along one tuned quantity after another.
 

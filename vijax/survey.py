@@ -1,15 +1,14 @@
 """Which attractors many cells meet, impact by impact."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax import simulate
-from vijax.lanes import workers
+from vijax import context, simulate
+from vijax.lanes import padded, workers
 from vijax.model import ImpactPair, State, Status
 from vijax.record import record
 from vijax.shooting import Sequence
@@ -104,7 +103,7 @@ def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int
     """How every cell ended, a `Summary`, in tiles on every core."""
     cells = pair.d.size
     share = math.ceil(cells / workers())
-    size = min(max(1 << (share - 1).bit_length(), _SMALLEST_TILE), _LARGEST_TILE)
+    size = min(max(padded(share), _SMALLEST_TILE), _LARGEST_TILE)
     number = math.ceil(cells / size)
     # Strided tiles cost the same.
     tiles = [np.arange(first, cells, number) for first in range(number)]
@@ -114,7 +113,7 @@ def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int
         summary = simulate.attractors(own, u0, v0, periods=periods, keep=longest, count=rows.size)
         return jax.tree.map(lambda x: x[: rows.size], summary)
 
-    with ThreadPoolExecutor(workers()) as pool:
+    with context.pool(workers()) as pool:
         parts = list(pool.map(part, tiles))
     order = np.argsort(np.concatenate(tiles))
     return jax.tree.map(lambda *x: np.concatenate(x)[order], *parts)
@@ -144,7 +143,7 @@ def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int
 
     alike = [np.flatnonzero(periods == number) for number in np.unique(periods)]
     parts = [rows for some in alike for rows in np.array_split(some, min(workers(), some.size))]
-    with ThreadPoolExecutor(workers()) as pool:
+    with context.pool(workers()) as pool:
         found = list(pool.map(part, parts))
     width = max((one["n"].shape[1] for one in found), default=0) if impacts is None else impacts
     table = {name: np.full((u.size, width), np.nan) for name in _COLUMNS}

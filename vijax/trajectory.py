@@ -1,19 +1,20 @@
 """The motion of single starts, impact by impact: recorded, sampled at phase 0, differentiable both ways."""
 
 import math
-from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from collections.abc import Mapping
+from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from vijax import checks, exact, flow
+from vijax import checks, exact, flow, lanes
+from vijax.context import door
 from vijax.membrane import HuntCrossley, Law
 from vijax.method import Method, Rk4, choose, repeated
 from vijax.model import Impact, ImpactPair, State, Status, WithStatus, check_pair, check_start
@@ -21,6 +22,7 @@ from vijax.model import Impact, ImpactPair, State, Status, WithStatus, check_pai
 _CHUNK = 64  # steps that a differentiated run computes twice, to remember only where a chunk began and what it decided
 _STEPS = 256  # steps of an adaptive solver per impact and period, before a run is stopped
 _IMPACT, _STATE = 56, 32  # bytes of a record
+_TILES = (1, 8, 64, 512, 4096)  # starts of one compiled call
 _HELD = 8  # a contact that outlasts the last period by so many is for ever
 
 
@@ -69,47 +71,95 @@ def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Arra
     return u, jnp.where(aloft, v, side * z), jnp.where(aloft, 0, side.astype(jnp.int32))
 
 
-def _one(periods: int, max_impacts: int, pair: ImpactPair, u0, v0, t0) -> Trajectory:
-    start = _begin(pair, u0, v0, t0)
+class _Asked(NamedTuple):
+    """How far a run goes: traced, so that one program serves all numbers that its records have room for."""
 
-    def advance(carry, _):
+    periods: Int[Array, ""]
+    max_impacts: Int[Array, ""]
+    chunks: Int[Array, ""]  # of a stepping engine's steps
+
+
+class _Room(NamedTuple):
+    """How many of each a program has room for."""
+
+    periods: int
+    impacts: int
+    chunks: int
+
+
+class _Flown(NamedTuple):
+    """Steps of the exact engine, one after another along the leading axis: the start of each, what came of it.
+
+    Attributes:
+        idle: Whether the run had ended before.
+    """
+
+    begun: State
+    out: exact.Outcome
+    idle: Bool[Array, "step ..."]
+
+
+@partial(jax.jit, static_argnames="room")
+def _exact(asked: _Asked, pair: ImpactPair, u0, v0, t0, *, room: _Room) -> Trajectory:
+    """By the exact engine, of rows of starts."""
+    start = jax.vmap(_begin)(pair, u0, v0, t0)
+
+    def advance(carry, index):
         state, over = carry
-        horizon = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(u0.dtype) - state.t)
-        out = exact.step(pair, state, horizon, rolled=True)
-        ends = over | out.quiet | out.permanent | (horizon <= 0)
+        idle = over | (index > asked.max_impacts)
+        horizon = jnp.where(idle, 0.0, 2.0 * (asked.periods - state.n).astype(u0.dtype) - state.t)
+
+        def fly():
+            return jax.vmap(partial(exact.step, rolled=True))(pair, state, horizon)
+
+        def rest():
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fly))
+
+        # Room that is not asked for costs no time.
+        out = lax.cond(idle.all(), rest, fly)
+        over = over | (~idle & (out.quiet | out.permanent | (horizon <= 0)))
+        ends = idle | over
         after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
-        return (after, ends), (state, out, over)
+        return (after, over), _Flown(state, out, idle)
 
     # One step more than impacts: the flight or contact in which the last period ends.
-    steps = max_impacts + 1
-    (_, _), (begun, out, idle) = lax.scan(advance, (start, jnp.asarray(False)), None, length=steps)
+    steps = jnp.arange(room.impacts + 1, dtype=jnp.int32)
+    end, flown = lax.scan(advance, (start, jnp.zeros(u0.shape, bool)), steps)
+    return jax.vmap(partial(_recorded, asked, room), in_axes=(0, 1, 0, 0))(pair, flown, *end)
+
+
+def _recorded(
+    asked: _Asked, room: _Room, pair: ImpactPair, flown: _Flown, end: State, over: Bool[Array, ""]
+) -> Trajectory:
+    """Impacts and stroboscopic states of one start, from its steps and where they ended."""
+    begun, out, idle = flown
     real = ~idle & (out.impact.side != 0)
-    real = real & (jnp.cumsum(real) <= max_impacts) & (out.impact.n < periods)
-    order = jnp.argsort(~real, stable=True)[:max_impacts]
+    real = real & (jnp.cumsum(real, dtype=jnp.int32) <= asked.max_impacts) & (out.impact.n < asked.periods)
+    order = jnp.argsort(~real, stable=True)[: room.impacts]
     filled = real.sum(dtype=jnp.int32)
-    there = jnp.arange(max_impacts, dtype=jnp.int32) < filled
+    there = jnp.arange(room.impacts, dtype=jnp.int32) < filled
 
     def keep(leaf):
         blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
         return jnp.where(there, leaf[order], blank)
 
     clock = jnp.where(idle, jnp.inf, _time(begun))
-    ended = out.quiet | out.permanent
+    ended = (out.quiet | out.permanent) & ~idle
     until = jnp.where(idle | ended, jnp.inf, _time(out.state))
 
     def strobe(k):
-        now = 2.0 * k.astype(u0.dtype)
-        index = jnp.clip(jnp.searchsorted(clock, now, side="right") - 1, 0, steps - 1)
+        now = 2.0 * k.astype(clock.dtype)
+        index = jnp.clip(jnp.searchsorted(clock, now, side="right") - 1, 0, room.impacts)
         first, happened = jax.tree.map(lambda leaf: leaf[index], (begun, out))
         known = now <= until[index]
-        when = jnp.where(known, 2.0 * (k - first.n).astype(u0.dtype) - first.t, 0.0)
+        when = jnp.where(known, 2.0 * (k - first.n).astype(clock.dtype) - first.t, 0.0)
         u, v, mode = ball_at(pair, first, happened, when)
         blank = jnp.where(known, 0.0, jnp.nan)
         return State(u + blank, v + blank, jnp.zeros_like(u), k, mode)
 
-    states = jax.vmap(strobe)(jnp.arange(1, periods + 1, dtype=jnp.int32))
+    states = jax.vmap(strobe)(jnp.arange(1, room.periods + 1, dtype=jnp.int32))
     permanent = (out.permanent & ~idle).any()
-    short = ~(ended & ~idle).any() & (until[-1] < 2.0 * periods)
+    short = ~over & (_time(end) < 2.0 * asked.periods.astype(clock.dtype))
     status = jnp.where(permanent, Status.PERMANENT_CONTACT, jnp.where(filled == 0, Status.NO_IMPACT, Status.OK))
     status = jnp.where(short, Status.EVENT_BUDGET, status).astype(jnp.int32)
     return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
@@ -125,7 +175,7 @@ class _Recording(eqx.Module):
     broken: Array
 
 
-def _recording(periods: int, max_impacts: int, carry: Any, like: Float[Array, "lane"]) -> _Recording:
+def _recording(room: _Room, carry: Any, like: Float[Array, "lane"]) -> _Recording:
     """Empty records."""
     lanes = like.shape[0]
     whole = jnp.zeros(lanes, jnp.int32)
@@ -133,10 +183,10 @@ def _recording(periods: int, max_impacts: int, carry: Any, like: Float[Array, "l
     def blank(width):
         return jnp.full((lanes, width), jnp.nan, like.dtype), jnp.zeros((lanes, width), jnp.int32)
 
-    x, n = blank(max_impacts)
+    x, n = blank(room.impacts)
     impacts = Impact(n=n, t=x, side=n, v_in=x, v_out=x, depth=x, duration=x, work=x)
-    x, n = blank(periods)
-    k = jnp.broadcast_to(jnp.arange(1, periods + 1, dtype=jnp.int32), n.shape)
+    x, n = blank(room.periods)
+    k = jnp.broadcast_to(jnp.arange(1, room.periods + 1, dtype=jnp.int32), n.shape)
     return _Recording(carry, impacts, whole, State(x, x, x, k, n), jnp.zeros(lanes, bool))
 
 
@@ -150,13 +200,15 @@ def _write(table: Any, row: Any, index: Int[Array, "lane"], wanted: Array) -> An
     return jax.tree.map(write, table, row)
 
 
-def _stepped(room: str, steps: int, periods: int, max_impacts: int, method: Method, pair, u0, v0, t0) -> Trajectory:
+@partial(jax.jit, static_argnames=("name", "room"))
+def _stepped(asked: _Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, name: str, room: _Room) -> Trajectory:
     """Stepping engines: all lanes step together, each until its last period is over and its last contact has ended."""
-    engine = import_module(f"vijax.{room}")
+    engine = import_module(f"vijax.{name}")
+    periods, max_impacts, chunks = asked
     begun = jax.vmap(_begin)(pair, u0, v0, t0)
     wall = jax.vmap(method.law.wall)(pair)
     carry = jax.vmap(partial(engine.start, method, deep=True, tangent=False))(pair, begun)
-    start = _recording(periods, max_impacts, carry, u0)
+    start = _recording(room, carry, u0)
 
     def runs(r: _Recording):
         m = r.carry
@@ -179,13 +231,13 @@ def _stepped(room: str, steps: int, periods: int, max_impacts: int, method: Meth
             broken=r.broken | (real & ~jnp.isfinite(impact.v_out)),
         )
 
-    def chunk(r: _Recording, _):
+    def chunk(r: _Recording, index):
         def go(r):
             return lax.scan(lambda r, _: (advance(r), None), r, None, length=_CHUNK)[0]
 
-        return lax.cond(runs(r).any(), repeated(go), lambda r: r, r), None
+        return lax.cond(runs(r).any() & (index < chunks), repeated(go), lambda r: r, r), None
 
-    end, _ = lax.scan(chunk, start, None, length=-(-steps // _CHUNK))
+    end, _ = lax.scan(chunk, start, jnp.arange(room.chunks, dtype=jnp.int32))
     m = end.carry
     held = (m.mode != 0) & (m.n >= periods) & (m.onset_n < periods)
     short = runs(end) | ((end.filled >= max_impacts) & (m.n < periods))
@@ -194,31 +246,11 @@ def _stepped(room: str, steps: int, periods: int, max_impacts: int, method: Meth
     return Trajectory(end.impacts, end.filled, end.states, status.astype(jnp.int32))
 
 
-@lru_cache(maxsize=32)
-def _compiled_steps(room: str, steps: int, periods: int, max_impacts: int) -> Callable[..., Trajectory]:
-    return jax.jit(partial(_stepped, room, steps, periods, max_impacts))
-
-
-def _by_steps(method: Method, periods: int, max_impacts: int, pair: ImpactPair, *starts) -> Trajectory:
-    """A trajectory by a stepping engine, of starts of any shape."""
-    shape = starts[0].shape
-    pair, starts = jax.tree.map(lambda x: x.reshape(-1), (pair, starts))
-    if isinstance(method, Rk4):
-        room, steps = "rk4", int(method.steps) * (periods + _HELD)
-    else:
-        room, steps = "ode", _STEPS * (periods + max_impacts)
-    dtype = starts[0].dtype
-    method = jax.tree.map(lambda x: jnp.asarray(x, dtype), method)
-    flat = _compiled_steps(room, steps, periods, max_impacts)(method, pair, *starts)
-    return jax.tree.map(lambda x: x.reshape(shape + x.shape[1:]), flat)
-
-
-@lru_cache(maxsize=32)
-def _compiled(periods: int, max_impacts: int, axes: int) -> Callable[..., Trajectory]:
-    run = partial(_one, periods, max_impacts)
-    for _ in range(axes):
-        run = jax.vmap(run)
-    return jax.jit(run)
+def _steps(method: Method | None, periods: int, max_impacts: int) -> int:
+    """Most steps of a stepping engine."""
+    if method is None:
+        return 0
+    return int(method.steps) * (periods + _HELD) if isinstance(method, Rk4) else _STEPS * (periods + max_impacts)
 
 
 def _wall(pair: ImpactPair) -> str:
@@ -254,6 +286,7 @@ def _check_starts(pair: ImpactPair, periods: int, starts: Mapping[str, Any]) -> 
             raise ValueError(f"t0 must lie in [0, 2 periods), here [0, {2 * periods}); got {checks.first(t0, good)}")
 
 
+@door
 def trajectory(
     pair: ImpactPair,
     u0: Float[Array, "..."] | float,
@@ -291,15 +324,48 @@ def trajectory(
     options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "steps": steps}
     told = _told(check_pair(pair), method, options)
     periods = checks.whole("periods", periods, 1)
-    room = 16 * periods + 16 if max_impacts is None else checks.whole("max_impacts", max_impacts, 1)
+    room = _most(periods) if max_impacts is None else checks.whole("max_impacts", max_impacts, 1)
     _check_starts(pair, periods, {"u0": u0, "v0": v0, "t0": t0})
     count = math.prod(checks.shapes(u0=u0, v0=v0, t0=t0, pair=pair.d))
     checks.fits(("periods", "max_impacts"), count * (room * _IMPACT + periods * _STATE), "impacts and states")
-    dtype = jnp.result_type(pair.d)
-    numbers = [jnp.asarray(x, dtype) for x in (u0, v0, t0)]
-    shape = jnp.broadcast_shapes(*(x.shape for x in numbers), *(jnp.shape(x) for x in jax.tree.leaves(pair)))
-    pair = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, dtype), shape), pair)
-    u0, v0, t0 = (jnp.broadcast_to(x, shape) for x in numbers)
-    if told is not None:
-        return _by_steps(told, periods, room, pair, u0, v0, t0)
-    return _compiled(periods, room, len(shape))(pair, u0, v0, t0)
+    found, shape = _followed(told, pair, (u0, v0, t0), periods, max_impacts)
+    return _cut(found, shape, periods, room)
+
+
+def _followed(
+    method: Method | None, pair: ImpactPair, starts: tuple, periods: int, max_impacts: int | None
+) -> tuple[Trajectory, tuple[int, ...]]:
+    """The trajectories of all starts as rows, records padded; and the shape that the starts have."""
+    dtype, own = jnp.result_type(pair.d), lanes.library((pair, starts))
+    shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves((pair, starts))))
+    rows = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), shape).reshape(-1), (pair, starts))
+    most = _most(periods) if max_impacts is None else max_impacts
+    chunks = -(-_steps(method, periods, most) // _CHUNK)
+    asked = _Asked(*lanes.arrays([np.int32(number) for number in (periods, most, chunks)]))
+    wide = lanes.padded(periods)
+    room = _Room(wide, _most(wide) if max_impacts is None else lanes.padded(max_impacts), lanes.padded(chunks))
+    if method is None:
+        work = partial(_exact, asked, room=room)
+    else:
+        method = jax.tree.map(lambda x: jnp.asarray(x, dtype), method)
+        name = "rk4" if isinstance(method, Rk4) else "ode"
+        work = partial(_stepped, asked, method, name=name, room=room)
+    return lanes.map_tiles(lambda row: work(row[0], *row[1]), rows, _TILES), shape
+
+
+def _most(periods: int) -> int:
+    """Room for impacts in so many periods, unless something else is asked for."""
+    return 16 * periods + 16
+
+
+def _cut(found: Trajectory, shape: tuple[int, ...], periods: int, max_impacts: int) -> Trajectory:
+    """Without what lies beyond the numbers asked for, in the shape of the starts."""
+
+    def shaped(leaf, width=None):
+        return leaf.reshape(shape + leaf.shape[1:])[..., :width] if leaf.ndim > 1 else leaf.reshape(shape)
+
+    impacts, states = (
+        jax.tree.map(partial(shaped, width=width), part)
+        for part, width in ((found.impacts, max_impacts), (found.states, periods))
+    )
+    return lanes.arrays(Trajectory(impacts, shaped(found.filled), states, shaped(found.status)))

@@ -1,0 +1,159 @@
+"""vijax inside other programs: their settings of JAX, threads, forks, and platforms that are not there."""
+
+import dataclasses
+import inspect
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import vijax
+from vijax import orbit
+
+ROOT = Path(__file__).parent.parent
+SETTINGS = {
+    "jax_enable_x64": False,
+    "jax_debug_nans": True,
+    "jax_debug_infs": True,
+    "jax_numpy_rank_promotion": "raise",
+    "jax_numpy_dtype_promotion": "strict",
+    "jax_check_tracer_leaks": True,
+}
+SECONDS = 120  # a process that takes so long hangs
+
+
+@pytest.fixture(params=SETTINGS)
+def setting(request) -> Iterator[str]:
+    """One of the settings, while a test runs."""
+    name = request.param
+    before = getattr(jax.config, name)
+    jax.config.update(name, SETTINGS[name])
+    yield name
+    jax.config.update(name, before)
+
+
+def answers() -> Any:
+    """What public functions of each kind say: planes on many threads, Newton with guesses that fail, closed forms."""
+    device = vijax.Harvester()
+    found = orbit.search(device.pair(), "RL", guesses=64)
+    attracting = found[np.abs(np.asarray(found.multipliers)).max(axis=1) < 1]
+    path = vijax.trajectory(vijax.impact_pair(0.2, 40.0, 0.5), 0.02, 0.3, periods=5)
+    plane = vijax.sweep(d=[0.12, 0.2], kappa=40.0, r=0.5)
+    basins = vijax.basins(d=0.2, kappa=40.0, u0=0.02, v0=[0.1, 0.3])
+    lost = vijax.steady(dataclasses.replace(device, omega0=3.0), attracting[0])
+    told = plane.P, plane.period, basins.label, found, path, vijax.steady(device, attracting[0]), lost
+    return jax.tree.map(np.asarray, told)
+
+
+@pytest.fixture(scope="module")
+def plain() -> Any:
+    """The answers in a program that sets nothing."""
+    return answers()
+
+
+def assert_same(found: Any, plain: Any) -> None:
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(plain), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+
+def test_settings_of_a_program_change_nothing_and_stand_again(plain, setting):
+    assert_same(answers(), plain)
+    assert getattr(jax.config, setting) == SETTINGS[setting]
+    with pytest.raises(ValueError, match="r must"):
+        vijax.impact_pair(0.2, 40.0, -1.0)
+    assert getattr(jax.config, setting) == SETTINGS[setting]
+
+
+def test_settings_change_nothing_in_the_threads_of_a_program(plain, setting):
+    with ThreadPoolExecutor(1) as pool:
+        assert_same(pool.submit(answers).result(), plain)
+        assert pool.submit(lambda: getattr(jax.config, setting)).result() == SETTINGS[setting]
+
+
+def slopes() -> list[Any]:
+    """Derivatives of both kinds of motion by a program's own closures."""
+    device = vijax.Harvester()
+    known = orbit.search(device.pair(), "RL", guesses=64)
+    known = known[np.abs(np.asarray(known.multipliers)).max(axis=1) < 1][0]
+    pair = vijax.impact_pair(0.2, 40.0, 0.5)
+    return [
+        jax.grad(lambda x: vijax.steady(dataclasses.replace(device, omega0=x), known).P)(device.omega0),
+        jax.grad(lambda v: vijax.trajectory(pair, 0.02, v, periods=2).states.u[-1])(0.3),
+    ]
+
+
+@pytest.fixture(scope="module")
+def plain_slopes() -> list[Any]:
+    return slopes()
+
+
+def test_settings_of_a_program_change_no_derivative(plain_slopes, setting):
+    if setting == "jax_enable_x64":
+        with pytest.raises(ValueError, match="jax_enable_x64 must be True where a program traces vijax"):
+            slopes()
+    else:
+        np.testing.assert_array_equal(slopes(), plain_slopes)
+
+
+def test_a_door_looks_like_its_function():
+    assert vijax.steady.__doc__.startswith("The steady state of a device")
+    assert list(inspect.signature(vijax.steady).parameters) == ["device", "orbit", "pair"]
+
+
+def test_an_orbit_in_single_precision_is_refused():
+    found = orbit.search(vijax.Harvester().pair(), "RL", guesses=64)[0]
+    single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, found)
+    with pytest.raises(ValueError, match="orbit must hold 64 bits; got float32"):
+        vijax.steady(vijax.Harvester(), single)
+
+
+def run(command: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
+    told = os.environ | environment
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=told, timeout=SECONDS)
+
+
+FORKED = """
+import jax, multiprocessing, sys, vijax
+
+def work(number):
+    try:
+        return float(vijax.harvested_energy(vijax.Harvester(), 1e-3 * number))
+    except RuntimeError as error:
+        return str(error)
+
+if "warm" in sys.argv:
+    jax.numpy.zeros(1)
+with multiprocessing.get_context("fork").Pool(2) as pool:
+    print(*pool.map(work, [1, 2]), sep="\\n")
+"""
+
+
+def test_forked_after_jax_has_started_a_process_says_so_and_before_it_works():
+    done = run([sys.executable, "-W", "ignore", "-c", FORKED, "warm"])
+    assert done.stdout.count("vijax must not be called in a process that was forked after JAX had started") == 2
+    done = run([sys.executable, "-W", "ignore", "-c", FORKED])
+    device = vijax.Harvester()
+    np.testing.assert_allclose(
+        [float(line) for line in done.stdout.split()], [vijax.harvested_energy(device, 1e-3 * i) for i in (1, 2)]
+    )
+
+
+@pytest.mark.skipif(jax.default_backend() == "gpu", reason="asks for a GPU that is not there")
+def test_a_platform_that_is_not_there_is_one_line(tmp_path):
+    line = "JAX_PLATFORMS must name a platform that this machine has; got 'cuda'"
+    code = "import vijax; vijax.sweep(d=0.2, kappa=40.0, r=0.5)"
+    done = run([sys.executable, "-c", code], JAX_PLATFORMS="cuda")
+    assert done.stderr.strip().splitlines()[-1].startswith(f"OSError: {line}")
+    command = [sys.executable, "scripts/grid.py", "--d", "0.2", "--kappa", "40", "--out", str(tmp_path / "one.zarr")]
+    done = run(command, JAX_PLATFORMS="cuda")
+    assert done.returncode != 0
+    assert line in done.stderr
+    assert "Traceback" not in done.stderr

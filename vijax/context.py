@@ -1,0 +1,110 @@
+"""What vijax stands on, whatever the program around it has set: held while a public function runs, in its threads too.
+
+NaNs and broadcasts that are meant are ours, and impact times are worth little in 32 bits. A program's own settings
+stand again when the function returns, or raises.
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+from jax._src import xla_bridge
+from jax.extend import backend
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_HELD: dict[str, tuple[Callable[[Any], Any], Any]] = {
+    "jax_enable_x64": (jax.enable_x64, True),
+    "jax_debug_nans": (jax.debug_nans, False),
+    "jax_debug_infs": (jax.debug_infs, False),
+    "jax_numpy_rank_promotion": (jax.numpy_rank_promotion, "allow"),
+}
+
+
+class _Process:
+    """What the doors know of this process.
+
+    Attributes:
+        started: Whether JAX ran here when a fork was last made.
+        orphaned: Whether it was forked from one where JAX ran: its threads are not here, and every call would hang.
+    """
+
+    started = False
+    orphaned = False
+
+
+def _forks() -> None:
+    # JAX has no public way to ask without starting it.
+    _Process.started = xla_bridge.backends_are_initialized()
+
+
+def _forked() -> None:
+    _Process.orphaned = _Process.orphaned or _Process.started
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_forks, after_in_child=_forked)
+
+
+def door(function: Callable[P, T]) -> Callable[P, T]:
+    """A public function: it runs under the settings that vijax stands on, where JAX can run at all."""
+
+    @functools.wraps(function)
+    def through(*args: P.args, **kwargs: P.kwargs) -> T:
+        if _Process.orphaned:
+            raise RuntimeError(
+                "vijax must not be called in a process that was forked after JAX had started, where it would hang; "
+                'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep'
+            )
+        with _held(args, kwargs):
+            try:
+                return function(*args, **kwargs)
+            except (AssertionError, RuntimeError):
+                _check_platform()
+                raise
+
+    return through
+
+
+def pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that work under these settings: JAX's are those of one thread."""
+    return ThreadPoolExecutor(threads, initializer=lambda: _held().__enter__())
+
+
+def _held(*given: Any) -> ExitStack:
+    """The settings that differ from those of the program, which come back at the end."""
+    stack = ExitStack()
+    for name, (setting, value) in _HELD.items():
+        if getattr(jax.config, name) != value:
+            if name == "jax_enable_x64":
+                _check_untraced(given)
+            stack.enter_context(setting(value))
+    return stack
+
+
+def _check_untraced(given: Any) -> None:
+    """Raise where 32 bits are traced: what is made of them has 32 too, whatever is set in between."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given)):
+        raise ValueError(
+            "jax_enable_x64 must be True where a program traces vijax by jit, grad or vmap; got False; set it by "
+            'jax.config.update("jax_enable_x64", True), or trace within jax.enable_x64(True)'
+        )
+
+
+def _check_platform() -> None:
+    """Raise if JAX was told of a platform that is not here."""
+    asked = jax.config.values["jax_platforms"]
+    if not asked:
+        return
+    try:
+        backend.get_backend()
+    except (AssertionError, RuntimeError) as error:
+        cause = f" ({error})" if str(error) else ""
+        raise OSError(
+            f"JAX_PLATFORMS must name a platform that this machine has; got {asked!r}{cause}; unset it, or take cpu"
+        ) from None
