@@ -1,0 +1,45 @@
+"""`scripts/branch.py`: where its branches begin, and nothing at all after bad input."""
+
+import branch as script
+import pytest
+
+import vijax
+
+SHAKEN = ["--wall", "rigid", "--A", "100", "--guesses", "32", "--generations", "0"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_branch_begins_within_its_bounds_where_the_device_does_not_lie_there(folder, capsys):
+    # The device of Tables I and II turns at pi rad/s.
+    assert script.main([*SHAKEN, "--along", "omega=4.8Hz:5.2Hz", "--out", "branch.zarr"]) == 0
+    assert "1:1: omega 30.1593 to 32.6726" in capsys.readouterr().out
+    found = vijax.load(folder / "branch.zarr")
+    assert found.attrs["along"] == "omega"
+    assert {str(found[f"end_{end}"].values[0]) for end in ("first", "last")} == {"low", "high"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "say"),
+    [
+        (
+            ["--omega", "3", "--along", "omega=6pi:16pi"],
+            "omega must lie within the bounds of along",
+        ),
+        (["--along", "omega=20pi:21pi", "--A", "1"], "got none with 1:1 at omega = 64.4026, 63.6173"),
+        (["--along", "omega0=20:400"], "a rigid wall has no kappa or omega0 or k"),
+        (["--along", "u0=0:1"], "along must be among"),
+        (["--along", "omega"], "along must be NAME=LO:HI"),
+        (["--along", "s=1Hz:2Hz"], "s must be in m"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, say):
+    assert script.main([*SHAKEN, *arguments]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert said.startswith("error: ")
+    assert say in said
+    assert not list(folder.iterdir())
