@@ -446,6 +446,48 @@ def test_a_cell_is_the_same_alone(plane):
         np.testing.assert_array_equal(alone[name], among[name], err_msg=str(name))
 
 
+# Some of these kappa, two of them near the resonance where the careful step does much, once depended on the lane.
+MIXED = {"d": np.linspace(0.02, 0.6, 12), "kappa": np.geomspace(2, 3000, 41)[[2, 3, 13, 16, 18, 29, 39]]}
+
+
+@pytest.fixture
+def optimised(monkeypatch):
+    """Programs compiled as users have them: without optimisation no multiplication is fused with an addition."""
+    monkeypatch.setenv("XLA_FLAGS", "")
+    simulate._compiled.cache_clear()
+    yield
+    simulate._compiled.cache_clear()
+
+
+def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
+    d, kappa = MIXED["d"], MIXED["kappa"]
+    mixed = sweep(d=d, kappa=kappa, r=0.6)
+    assert (mixed["period"] > 0).any()
+    assert (mixed["period"] == 0).any()
+    others = {
+        "axes in another order": sweep(kappa=kappa, d=d, r=0.6),
+        "an axis more": sweep(r=np.linspace(0.6, 0.9, 12), d=d, kappa=kappa).isel(r=0),
+        "in a store": sweep(kappa=kappa, d=d[::-1], r=0.6, out=tmp_path / "plane.zarr"),
+        "fewer cells": sweep(d=d, kappa=kappa[:2], r=0.6),
+    }
+    for where, other in others.items():
+        for name in mixed.data_vars:
+            got = other[name].sel(d=d).transpose("d", "kappa")
+            wanted = mixed[name].sel(kappa=got["kappa"])
+            np.testing.assert_array_equal(got, wanted, err_msg=f"{name}, {where}")
+
+
+def test_periodic_cells_hardly_depend_on_what_else_is_wanted():
+    mixed = sweep(**MIXED, r=0.6)
+    other = sweep(**MIXED, r=0.6, outputs=["restitution", "contact_time", "period"])
+    periodic = mixed["period"] > 0
+    assert periodic.any()
+    for name in ("status", "period"):
+        np.testing.assert_array_equal(other[name], mixed[name], err_msg=name)
+    for name in ("restitution", "contact_time"):
+        np.testing.assert_allclose(other[name].where(periodic), mixed[name].where(periodic), rtol=1e-12)
+
+
 def test_physical_and_dimensionless_axes_give_the_same_map(plane):
     # d = s omega^2 / (A pi^2) and kappa = omega0 pi / omega, at A = 1 and omega = pi.
     physical = sweep(s=[0.2, 0.25, 0.3], omega0=[100.0, 400.0], periods=LONG)

@@ -132,6 +132,9 @@ def sweep(
         each without the dimensions that it cannot depend on. P is in joules per HALF forcing period. Believe it only
         where `admissible` is true, and read `status` (CF flags) where `period` is -1. Attributes record versions,
         commit, machine, tolerances and every setting. With `out` nothing of it is read before it is looked at.
+        What a cell's numbers are does not depend on the other cells, to the last bit on one kind of device. Where other
+        `outputs`, or another number of variants, make another program, it rounds otherwise: periodic cells agree to
+        1e-12, aperiodic ones, where chaos makes much of a rounding, within the errors of their averages.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.

@@ -279,7 +279,9 @@ def run(
         lanes: How many cells are worked on at once, at least.
 
     A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same
-    elementwise arithmetic wherever it sits.
+    elementwise arithmetic wherever it sits. To the last bit only if what several results need is stored (`xla.share`):
+    LLVM makes several loops of one, of whole vectors and of what is left, and fuses multiplications and additions in
+    each as it sees fit.
     """
     lanes, made = whole_blocks(lanes), _maker(program)
     width = min(max(lanes // _SHARE, _FEWEST), lanes)
