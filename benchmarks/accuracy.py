@@ -37,7 +37,7 @@ import numpy as np
 
 import vijax
 from vijax import lanes, orbit, simulate, survey
-from vijax.model import Harvester, ImpactPair
+from vijax.model import Harvester, ImpactPair, impact_pair
 from vijax.shooting import Sequence
 from vijax.steady import Steady, find, response
 
@@ -154,12 +154,10 @@ WIDTH = 16  # impacts of an orbit at most
 def steady_states(count: int) -> None:
     """Steady states beside the impact map's flight of the same orbits, from attractors of drawn cells, d moved."""
     draw = np.random.default_rng(105)
-    d, kappa = (
-        np.exp(draw.uniform(np.log(0.005), np.log(0.6), count)),
-        np.exp(draw.uniform(np.log(5), np.log(5e3), count)),
-    )
+    d = np.exp(draw.uniform(np.log(0.005), np.log(0.6), count))
+    kappa = np.exp(draw.uniform(np.log(5), np.log(5e3), count))
     gamma = np.where(draw.random(count) < 0.5, 0.0, draw.uniform(-1, 1, count))
-    pair = ImpactPair(d, kappa, draw.uniform(0.05, 0.93, count), gamma)
+    pair = impact_pair(d, kappa, draw.uniform(0.05, 0.93, count), gamma)
     met = survey.survey(pair, 0.3 * d, np.full(count, -0.47), longest=1, periods=400).orbits(WIDTH)
     sequence, device = met.sequence(WIDTH), Harvester()
     said, wrong, lost, pressed, worst = 0, 0, 0, 0, 0.0
@@ -173,7 +171,7 @@ def steady_states(count: int) -> None:
         wrong += int((ok & ~fine).sum())
         lost += int(((state.status == vijax.Status.VIRTUAL) & fine).sum())
         worst = max(worst, np.abs(state.P / P - 1)[ok & fine].max())
-        pressed += int((ok & (state.knots[..., 2].max(axis=1) * there.kappa > 20)).sum())
+        pressed += int((ok & (state.knots[..., 2].max(axis=1) * np.asarray(there.kappa) > 20)).sum())
     note = f"{said:,} steady states, {pressed:,} of them OK and pressed on a wall for more than 20/kappa"
     say("steady states called OK that the impact map does not fly", wrong, 0, note)
     say("steady states called VIRTUAL that it flies", lost, 0)
@@ -182,7 +180,11 @@ def steady_states(count: int) -> None:
 
 def _steadily(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> Steady:
     """Steady states of many orbits, in tiles."""
-    one = jax.jit(jax.vmap(lambda *orbit: response(device, *orbit[:2], *find(*orbit))))
+
+    def one_of(pair: ImpactPair, sequence: Sequence, knots: Any) -> Steady:
+        return response(device, pair, sequence, *find(pair, sequence, knots))
+
+    one = jax.jit(jax.vmap(one_of))
     rows = jax.tree.map(np.asarray, (pair, sequence, knots))
     parts = []
     for tile in lanes.tiles(knots.shape[0], (512,)):
@@ -197,13 +199,14 @@ FLOWN = 20_000  # forcing periods that a label must outlast
 
 def long_periods(count: int) -> None:
     """Labels of long periods beside the motion that the same starts have come to after many periods more."""
-    draw, met, cells = np.random.default_rng(106), [], 0
+    draw, cells = np.random.default_rng(106), 0
+    met: list[list[Any]] = []
     while sum(d.size for d, *_ in met) < count:
         d, r = draw.uniform(0.02, 0.6, 65536), draw.uniform(0.2, 0.9, 65536)
         kappa = np.exp(draw.uniform(np.log(2), np.log(1000), d.size))
         found = _labelled(d, kappa, r, periods=400)
         some = np.flatnonzero(found.period >= LONG)
-        hits = found.impacts_left + found.impacts_right
+        struck = found.impacts_left + found.impacts_right
         met.append([x[some] for x in (d, kappa, r, found.period, hits, found.fastest)])
         cells += d.size
     d, kappa, r, period, hits, fastest = (np.concatenate(x)[:count] for x in zip(*met, strict=True))

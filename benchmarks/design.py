@@ -352,7 +352,7 @@ def ratio(case: Case) -> float:
 def excess(optimum: Optimum) -> float:
     """How far the worst impact is beyond its constraint, relative, by the exact impact map."""
     device, orbit = optimum.device, optimum.orbit
-    deep = np.asarray(orbit.depth) * float(device.length_unit)
+    deep: Any = np.asarray(orbit.depth) * float(device.length_unit)
     given = np.asarray(orbit.work) * float(device.m_b * device.speed_unit**2)
     gained = np.asarray(harvested_energy(device, deep))
     return float(max(np.nanmax(deep) / float(device.depth_limit), np.nanmax(gained / given)) - 1)

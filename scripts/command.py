@@ -263,8 +263,10 @@ def _told_of_waiting(bar: Any) -> Iterator[None]:
         while not ended.wait(1.0):
             bar.refresh()
 
+    level, passed_on = _WAITING.level, _WAITING.propagate
     _WAITING.addHandler(handler)
     _WAITING.setLevel(logging.INFO)
+    _WAITING.propagate = False  # the bar shows it, and nothing else twice
     clock = threading.Thread(target=tick, daemon=True)
     if sys.stderr.isatty():  # a log would fill with it
         clock.start()
@@ -273,6 +275,8 @@ def _told_of_waiting(bar: Any) -> Iterator[None]:
     finally:
         ended.set()
         _WAITING.removeHandler(handler)
+        _WAITING.setLevel(level)
+        _WAITING.propagate = passed_on
 
 
 def finish(
