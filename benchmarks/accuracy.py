@@ -207,7 +207,7 @@ def long_periods(count: int) -> None:
         found = _labelled(d, kappa, r, periods=400)
         some = np.flatnonzero(found.period >= LONG)
         struck = found.impacts_left + found.impacts_right
-        met.append([x[some] for x in (d, kappa, r, found.period, hits, found.fastest)])
+        met.append([x[some] for x in (d, kappa, r, found.period, struck, found.fastest)])
         cells += d.size
     d, kappa, r, period, hits, fastest = (np.concatenate(x)[:count] for x in zip(*met, strict=True))
     kept = np.zeros(count, bool)
