@@ -16,6 +16,7 @@ import pytest
 
 import vijax
 from vijax import orbit
+from vijax.energy import capacitance
 
 ROOT = Path(__file__).parent.parent
 SETTINGS = {
@@ -157,3 +158,10 @@ def test_a_platform_that_is_not_there_is_one_line(tmp_path):
     assert done.returncode != 0
     assert line in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_what_a_pair_and_a_membrane_say_of_themselves_has_64_bits_too():
+    pair = vijax.impact_pair([0.2, 0.3], 40.0, 0.5)
+    with jax.enable_x64(False):
+        said = pair.mu, pair.zeta, pair.omega1, capacitance(vijax.Harvester(), np.array([1e-3, 2e-3]))
+    assert {x.dtype for x in said} == {np.dtype("float64")}

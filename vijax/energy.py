@@ -42,6 +42,7 @@ def _rest_capacitance(device: Harvester) -> Values:
     return jnp.asarray(device.eps_M * PI * device.R0**2 / device.w0)
 
 
+@door
 def capacitance(device: Harvester, depth: Values) -> Values:
     """Capacitance [F] of a membrane that a ball has entered by `depth` [m].
 

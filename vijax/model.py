@@ -113,16 +113,19 @@ class ImpactPair(eqx.Module):
     gamma: Float[Array, "..."]
 
     @property
+    @door
     def mu(self) -> Float[Array, "..."]:
         """Damping of w'' + mu w' + kappa^2 w = f, by the calibration of Eq. (19)."""
         return 2 * self.zeta
 
     @property
+    @door
     def zeta(self) -> Float[Array, "..."]:
         """Decay rate mu/2 of a free contact."""
         return self._soft_kappa() * damping_ratio(self.r)
 
     @property
+    @door
     def omega1(self) -> Float[Array, "..."]:
         """Damped frequency sqrt(kappa^2 - zeta^2) = kappa pi/sqrt(pi^2 + ln^2 r): from r, as the difference cancels."""
         return self._soft_kappa() * math.pi / jnp.sqrt(math.pi**2 + jnp.log(self.r) ** 2)
