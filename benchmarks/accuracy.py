@@ -185,12 +185,7 @@ def _steadily(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: np
         return response(device, pair, sequence, *find(pair, sequence, knots))
 
     one = jax.jit(jax.vmap(one_of))
-    rows = jax.tree.map(np.asarray, (pair, sequence, knots))
-    parts = []
-    for tile in lanes.tiles(knots.shape[0], (512,)):
-        part = one(*jax.tree.map(lambda leaf, tile=tile: leaf[tile.rows], rows))
-        parts.append(jax.tree.map(lambda leaf, tile=tile: np.asarray(leaf)[: tile.real], part))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return lanes.map_tiles(lambda rows: one(*rows), (pair, sequence, knots), (512,))
 
 
 LONG = 9  # forcing periods of an orbit that counts as long
@@ -217,7 +212,7 @@ def long_periods(count: int) -> None:
         later = _labelled(d[of], kappa[of], r[of], periods=int(each), until="window", transient=FLOWN)
         same = np.abs(later.fastest / fastest[of] - 1) < 1e-8
         kept[of] = same & (np.round(later.impacts_per_period * each) == hits[of])
-    say("labels of long periods that a flight does not keep", 1 - kept.mean(), 1e-2, f"{count:,} of {cells:,} cells")
+    say("labels of long periods that a flight does not keep", 1 - kept.mean(), 5e-3, f"{count:,} of {cells:,} cells")
 
 
 def _labelled(d: np.ndarray, kappa: np.ndarray, r: np.ndarray, **settings: Any) -> simulate.Summary:

@@ -239,13 +239,21 @@ class Turns(eqx.Module):
 
 
 class _Visit(eqx.Module):
-    """A contact on its way: its exit first unless that is known, then every turning point up to it, in order."""
+    """A contact on its way: its exit first unless that is known, then every turning point up to it, in order.
+
+    Attributes:
+        number: How many searches were made; the exit is number 0.
+        s, sign: When the last turning point was, and the sign of w' just after it.
+        going: Whether there may be more.
+        settled: Whether nothing but rounding is left of the oscillation, so that the steady response tells the rest.
+        seen: The highest and lowest yet.
+    """
 
     number: Array
-    s: Scalar  # of the last turning point
-    sign: Scalar  # of w' just after s
+    s: Scalar
+    sign: Scalar
     going: Flag
-    settled: Flag  # of the oscillation nothing is left but rounding
+    settled: Flag
     seen: Turns
 
 
@@ -281,7 +289,7 @@ def turning_points(
         settled = _amplitude(m, steady, w, z, s) <= eps * (jnp.abs(steady.c) + jnp.abs(steady.q) + jnp.abs(w))
         seeking = v.going & (first | ~settled)
         rate = force.later(s).at(zero) - m.mu * z - m.kappa * m.kappa * w
-        z = jnp.where(s == 0, z, 0.0)  # at a turning point w' is zero, not its rounding error
+        z = jnp.where(s == 0, z, 0.0)  # A turning point's own w' is zero, not its rounding error.
         later = slope.later(s)
         sought = jax.tree.map(lambda x, slope: jnp.where(first, x, v.sign * slope), (force, w0, z0), (later, z, rate))
         limit = jnp.where(first, jnp.inf, seen.exit - s)
