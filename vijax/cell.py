@@ -86,6 +86,7 @@ class Candidate(eqx.Module):
     period: Lane
     prime: Lane  # smallest recurrence seen on this round: a flip's slow decay recurs sooner after two turns than one
     base: Lanes
+    origin: Lanes  # where the search stood when the first round began
     moved: Lane
     last: Lane
     rounds: Lane
@@ -101,12 +102,11 @@ class Course(eqx.Module):
 
 
 class Relay(eqx.Module):
-    """What a chained cell needs to be handed on, and to go on as if no round had been tried."""
+    """What a chained cell needs to be handed on."""
 
     start: Lanes
     mark: Lanes  # the last exit before the kept periods
     held: Lane  # mode at the mark
-    origin: Lanes  # where the search stood when the first round began
     last: Lanes  # exit of the latest impact before the end, if the round were repeated until then
     latest: Lane  # the onset of that impact, in periods
 

@@ -11,12 +11,13 @@ from vijax.lanes import choose
 from vijax.method import Ode
 from vijax.model import Status
 from vijax.quick import Hit, Lanes
-from vijax.relay import come_back, depart
+from vijax.relay import depart
 from vijax.xla import share
 
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
 _ROUNDS = 8  # Newton rounds on one candidate
 _SHORT = 8  # longest period, in forcing periods, of an orbit whose surroundings are taken to be wide
+_GAIN = 1e3  # at most is what rounding gains in solving for Newton's step
 _WITHIN = 0.3  # of Newton's first step is left for the second where the first one was within the orbit's reach
 
 
@@ -43,8 +44,8 @@ def blank_candidate(settings: Settings, like: Lane, ball: Lanes) -> Candidate:
     """A search that has seen no impact yet."""
     zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
     inf = jnp.full_like(like, jnp.inf)
-    tolerance = jnp.full_like(like, recurrence(like.dtype, grain(settings)))
-    return Candidate(zero, zero, inf, zero, zero, tolerance, no, no, zero, zero, zero, zero, ball, zero, inf, zero)
+    near = jnp.full_like(like, recurrence(like.dtype, grain(settings)))
+    return Candidate(zero, zero, inf, zero, zero, near, no, no, zero, zero, zero, zero, ball, ball, zero, inf, zero)
 
 
 def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
@@ -80,6 +81,7 @@ def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
             period=jnp.where(found, period, c.period),
             prime=jnp.where(again, period, c.prime),
             base=c.base,
+            origin=c.origin,
             moved=c.moved,
             last=c.last,
             rounds=c.rounds,
@@ -97,10 +99,12 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     c = cell.candidate
     start = stopped & c.found & ~failed
     judged = stopped & c.tracing & (c.left <= 0) & ~failed
-    size, nudge_u, nudge_v, largest = _newton(plan, cell)
+    size, nudge_u, nudge_v, largest, gain = _newton(plan, cell)
     least = grain(settings)
     close, far = settled(size.dtype, least), 1e3 * recurrence(size.dtype, least)
-    arrived = (size < close) | ((size < 1e3 * close) & (size > 0.25 * c.last))
+    # Rounding leaves of a step what it gains in solving. A step that shrinks slowly for any other reason is not there
+    # yet: near a flip, where the motion after two turns is nearly what it was, Newton gains but a third a round.
+    arrived = (size < close) | ((size < close * jnp.clip(gain, 1.0, _GAIN)) & (size > 0.25 * c.last))
     # A long orbit attracts from so near that chaos may pass it within the recurrence and go on. There Newton's second
     # step is no shorter than the first: the orbit is a real one, but the ball is not on its way to it.
     astray = judged & (c.period > _SHORT) & (c.rounds == 1) & (size > jnp.maximum(_WITHIN * c.last, close))
@@ -115,7 +119,7 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
 
 
 def _newton(plan: Plan, cell: Cell):
-    """Size and components of Newton's correction of the round's start, and the largest Floquet multiplier."""
+    """Size and components of Newton's correction of the round's start, the largest multiplier, what rounding gains."""
     c = cell.candidate
     grown = jnp.exp(cell.exponent * jnp.log(TANGENT_SCALE))
     m = jnp.stack([jnp.stack(cell.tangent[:2], -1), jnp.stack(cell.tangent[2:], -1)], -2) * grown[:, None, None]
@@ -128,6 +132,7 @@ def _newton(plan: Plan, cell: Cell):
     determinant = a * d - b * e
     safe = jnp.where(determinant == 0, jnp.nan, determinant)
     nudge_u, nudge_v = (d * miss_u - b * miss_v) / safe, (a * miss_v - e * miss_u) / safe
+    gain = (jnp.abs(a) + jnp.abs(b) + jnp.abs(e) + jnp.abs(d)) / jnp.abs(safe)
     half_trace = 0.5 * (m[:, 0, 0] + m[:, 1, 1])
     product = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
     spread = half_trace * half_trace - product
@@ -135,7 +140,7 @@ def _newton(plan: Plan, cell: Cell):
         spread > 0, jnp.abs(half_trace) + jnp.sqrt(jnp.maximum(spread, 0.0)), jnp.sqrt(jnp.maximum(product, 0.0))
     )
     size = jnp.abs(nudge_u) + jnp.abs(nudge_v) + jnp.where(jnp.abs(rest) < 0.05, 0.0, jnp.inf)
-    return jnp.where(jnp.isfinite(size), size, jnp.inf), nudge_u, nudge_v, largest
+    return jnp.where(jnp.isfinite(size), size, jnp.inf), nudge_u, nudge_v, largest, gain
 
 
 def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane, nudge_v: Lane, size: Lane) -> Cell:
@@ -157,6 +162,7 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
         period=c.period,
         prime=jnp.where(begin, c.period, c.prime),
         base=base,
+        origin=choose(first, cell.ball, c.origin),
         moved=jnp.where(begin, jnp.where(first, 0.0, c.moved + size), c.moved),
         last=jnp.where(begin, jnp.where(first, jnp.inf, size), c.last),
         rounds=jnp.where(begin, jnp.where(first, 0.0, c.rounds + 1), c.rounds),
@@ -172,21 +178,22 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
             choose(begin, (one, zero, zero, one), cell.tangent),
             choose(begin, zero, cell.exponent),
             cell.running | begin,
-            depart(cell, begin, first),
+            depart(cell, begin),
         ),
         is_leaf=lambda x: x is None,
     )
 
 
 def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] | float) -> Cell:
-    """A candidate that is no attractor: go on from where the round ended, with a tolerance a hundred times tighter.
+    """A candidate that is no attractor: go on from where the search stood, with a tolerance a hundred times tighter.
 
+    Newton may have taken the ball onto an orbit that repels, which it would leave only after hundreds of periods.
     What recurs to rounding and is none will not become one: the search is over, or it would hold the cell for
     thousands of periods, each failed round beginning its window anew.
     """
     c = cell.candidate
     zero = jnp.zeros_like(cell.since)
-    ball = come_back(cell, bad)
+    ball = choose(bad, c.origin, cell.ball)
     rounding = jnp.finfo(zero.dtype).eps
     tighter = jnp.where(c.tolerance > rounding, jnp.maximum(1e-2 * c.tolerance, jnp.maximum(least, rounding)), 0.0)
     new = eqx.tree_at(

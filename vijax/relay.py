@@ -1,7 +1,6 @@
 """A cell in a chain: where it starts, what it hands on, where the impacts that are wanted of it begin.
 
-The run of a chained cell is that of the ball alone: a round of Newton that comes to nothing leaves no trace. A cell on
-a certified orbit ends there, in the state in which the orbit would be after all of its periods.
+A cell on a certified orbit ends there, in the state in which the orbit would be after all of its periods.
 """
 
 import equinox as eqx
@@ -36,7 +35,7 @@ class Handover(eqx.Module):
 
 def begin(ball: Lanes, held: Lane) -> Relay:
     """The record of a cell that has just started."""
-    return Relay(ball, ball, held, ball, ball, jnp.full_like(held, -jnp.inf))
+    return Relay(ball, ball, held, ball, jnp.full_like(held, -jnp.inf))
 
 
 def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Relay | None:
@@ -53,7 +52,6 @@ def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Rel
         start=old.start,
         mark=choose(early, hit.after, old.mark),
         held=jnp.where(early, 0.0, old.held),
-        origin=old.origin,
         last=choose(later, _moved(hit.after, ahead), old.last),
         latest=jnp.where(later, onset, old.latest),
     )
@@ -68,18 +66,13 @@ def _moved(ball: Lanes, periods: Lane) -> Lanes:
     return Lanes(ball.u, ball.v, ball.t, ball.n + periods)
 
 
-def depart(cell: Cell, begins: Mask, first: Mask) -> Relay | None:
+def depart(cell: Cell, begins: Mask) -> Relay | None:
     """The record as a round begins."""
     old = cell.relay
     if old is None:
         return None
     latest = jnp.where(begins, -jnp.inf, old.latest)
-    return Relay(old.start, old.mark, old.held, choose(first, cell.ball, old.origin), old.last, latest)
-
-
-def come_back(cell: Cell, bad: Mask) -> Lanes:
-    """The ball as a round is given up: where the search had stopped, if the cell is chained."""
-    return cell.ball if cell.relay is None else choose(bad, cell.relay.origin, cell.ball)
+    return Relay(old.start, old.mark, old.held, old.last, latest)
 
 
 def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end: Lane) -> Handover:
