@@ -263,6 +263,7 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
     return known[along]() if along in known else getattr(of, along)
 
 
+@door
 def pair_at(pair: ImpactPair, along: str, value: float, device: Harvester) -> ImpactPair:
     """The pair where the parameter has another value, all else of the device as it is."""
     pair, x, steepest = lanes.arrays(jax.tree.map(np.asarray, (pair, value, device.g / device.A)))

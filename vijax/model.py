@@ -209,16 +209,19 @@ class Harvester(eqx.Module):
             )
 
     @property
+    @door
     def k(self) -> Real:
         """Stiffness of the membrane, m_b omega0^2 [N/m]."""
         return self.m_b * self.omega0**2
 
     @property
+    @door
     def length_unit(self) -> Real:
         """Metres per unit of u: A pi^2/omega^2."""
         return self.A * (math.pi / self.omega) ** 2
 
     @property
+    @door
     def speed_unit(self) -> Real:
         """Metres per second per unit of u': A pi/omega."""
         return self.A * (math.pi / self.omega)
@@ -304,11 +307,13 @@ class MembranePair(eqx.Module):
     c_star: Float[Array, "..."]
 
     @property
+    @door
     def length_unit(self) -> Float[Array, "..."]:
         """Units of u per unit of x: d."""
         return (self.omega_star / math.pi) ** 2 / self.A_star
 
     @property
+    @door
     def time_unit(self) -> Float[Array, "..."]:
         """Units of t per unit of t*: 1/kappa."""
         return self.omega_star / math.pi

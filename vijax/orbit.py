@@ -506,6 +506,7 @@ def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
     return lanes.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
 
 
+@door
 def depth_unit(orbit: Orbit, device: Harvester) -> Any:
     """Metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
     if orbit.pair.kappa is None:
