@@ -34,7 +34,7 @@ class Status(enum.IntEnum):
     NO_ORBIT = 7  # no periodic orbit was found from the guess
     VIRTUAL = 8  # the equations of an orbit hold, but the ball would meet a wall in between
     UNSTABLE = 9  # the orbit repels, or is at a bifurcation
-    NOT_RUN = 10  # of a store that is not finished: nothing is known yet
+    NOT_RUN = 10  # the store is not finished, and nothing is known of the cell yet
 
     @property
     def advice(self) -> str:

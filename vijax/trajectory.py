@@ -19,13 +19,18 @@ from vijax.membrane import HuntCrossley, Law
 from vijax.method import Method, Rk4, choose, repeated
 from vijax.model import Impact, ImpactPair, State, Status, WithStatus, check_pair, check_start
 
-_CHUNK = 64  # steps that a differentiated run computes twice, to remember only where a chunk began and what it decided
-_STEPS = 256  # steps of an adaptive solver per impact and period, before a run is stopped
+# A differentiated run computes so many steps twice: it remembers only where a chunk began and what it decided.
+_CHUNK = 64
+# An adaptive solver that takes more steps than this per impact and period is stopped.
+_STEPS = 256
 _IMPACT, _STATE = 56, 32  # bytes of a record
-_STRETCH = 64  # steps of the exact engine in one compiled call
-_TILES = (1, 8, 64, 512, 4096)  # starts of one compiled call
-_STROBES = (64, 4096)  # balls at phase 0 that one compiled call finds
-_HELD = 8  # a contact that outlasts the last period by so many is for ever
+# The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
+# call, and few enough that the host waits for no long one after every ball has arrived.
+_STRETCH = 64
+# Few sizes of compiled calls are few programs: starts that fly together, and balls at phase 0 that are found together.
+_TILES, _STROBES = (1, 8, 64, 512, 4096), (64, 4096)
+# A contact that outlasts the last period by so many is taken to last for ever.
+_HELD = 8
 
 
 class Trajectory(WithStatus):
@@ -74,11 +79,16 @@ def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Arra
 
 
 class _Asked(NamedTuple):
-    """How far a run goes: traced, so that one program serves all numbers that its records have room for."""
+    """How far a run goes: traced, so that one program serves all numbers that its records have room for.
+
+    Attributes:
+        periods, max_impacts: As asked for.
+        chunks: How often a stepping engine may take `_CHUNK` steps.
+    """
 
     periods: Int[Array, ""]
     max_impacts: Int[Array, ""]
-    chunks: Int[Array, ""]  # of a stepping engine's steps
+    chunks: Int[Array, ""]
 
 
 class _Room(NamedTuple):
@@ -148,7 +158,7 @@ def _fly(asked: _Asked, room: _Room, pair: ImpactPair, starts: tuple) -> tuple[_
     steps = room.impacts + 1
     if lanes.library((pair, starts)) is jnp:
         return _onward(asked, pair, reached, jnp.int32(0), steps)
-    # One program flies stretches of any number of periods, where each number would have a program of its own.
+    # Stretches of one length need one program, where every number of periods would need its own: 4 s and 800 mappings.
     parts = []
     for first in range(0, steps, _STRETCH):
         reached, flown = _stretch(asked, pair, reached, np.int32(first))
