@@ -48,7 +48,7 @@ def _options() -> list[click.Parameter]:
         *command.device_options(),
         click.Option(["--periods"], default=400, show_default=True, help="forcing periods to run, at most"),
         click.Option(["--until"], default="attractor", show_default=True, help="attractor or window"),
-        click.Option(["--transient"], default=0, show_default=True, help="forcing periods to drop first"),
+        click.Option(["--transient"], default=0, show_default=True, help="forcing periods to drop before a window"),
         click.Option(["--wall"], default="soft", show_default=True, help="soft or rigid"),
         click.Option(["--compare"], metavar="rigid", help="map what rigid walls change instead: P and the label"),
         click.Option(["--tolerance"], metavar="5%", help="with --compare: part of P that they may change"),

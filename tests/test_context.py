@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax import orbit
-from vijax.energy import capacitance
+from vijax import branch, curve, energy, model, orbit, report, tolerance, tuning
+from vijax.model import membrane_pair
 
 ROOT = Path(__file__).parent.parent
 SETTINGS = {
@@ -160,8 +161,61 @@ def test_a_platform_that_is_not_there_is_one_line(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_what_a_pair_and_a_membrane_say_of_themselves_has_64_bits_too():
-    pair = vijax.impact_pair([0.2, 0.3], 40.0, 0.5)
-    with jax.enable_x64(False):
-        said = pair.mu, pair.zeta, pair.omega1, capacitance(vijax.Harvester(), np.array([1e-3, 2e-3]))
-    assert {x.dtype for x in said} == {np.dtype("float64")}
+PAIR = vijax.impact_pair([0.2, 0.3], 40.0, [0.5, 0.7])
+MEMBRANE = membrane_pair(PAIR)
+DEVICES = jax.tree.map(lambda x: jax.device_put(np.array([x, 1.1 * x])), vijax.Harvester())
+NUMBERS = np.array([1e-3, 2e-3])
+CLOSED_FORMS = {
+    "ImpactPair": lambda: (PAIR.mu, PAIR.zeta, PAIR.omega1),
+    "Harvester": lambda: (DEVICES.k, DEVICES.length_unit, DEVICES.speed_unit, DEVICES.pair()),
+    "MembranePair": lambda: (MEMBRANE.length_unit, MEMBRANE.time_unit),
+    "model.impact_pair": lambda: vijax.impact_pair([0.1, 0.2], 40.0, 0.3),
+    "model.damping_ratio": lambda: model.damping_ratio(NUMBERS),
+    "model.with_pair": lambda: model.with_pair(vijax.Harvester(), PAIR),
+    "model.with_constants": lambda: model.with_constants(vijax.Harvester(), k=NUMBERS),
+    "model.membrane_pair": lambda: membrane_pair(PAIR),
+    "model.from_membrane_pair": lambda: model.from_membrane_pair(MEMBRANE),
+    "energy.stretch": lambda: energy.stretch(vijax.Harvester(), NUMBERS),
+    "energy.capacitance": lambda: energy.capacitance(vijax.Harvester(), NUMBERS),
+    "energy.harvested_energy": lambda: energy.harvested_energy(vijax.Harvester(), NUMBERS),
+    "energy.rigid_penetration": lambda: energy.rigid_penetration(NUMBERS),
+    "energy.membrane_work_rigid": lambda: energy.membrane_work_rigid(PAIR.d, PAIR.r),
+    "energy.membrane_work": lambda: energy.membrane_work(40.0, 9.0, 0.1, 1.0, NUMBERS, 50 * NUMBERS, PAIR.d, -PAIR.d),
+    "energy.energy_ratio": lambda: energy.energy_ratio(NUMBERS, 3 * NUMBERS),
+    # Equal in single precision, and admissible there.
+    "energy.admissible": lambda: energy.admissible(vijax.Harvester(), PAIR.d, np.array([0.2, 0.3 * (1 - 1e-9)]), 0.0),
+    "tuning.values": lambda: tuning.values(("omega0", "beta"), np.array([[1.0, 2.0], [3.0, 4.0]])),
+    "tuning.tuned": lambda: tuning.tuned(vijax.Harvester(), ("k", "d"), NUMBERS),
+    "tuning.value_of": lambda: [tuning.value_of(DEVICES, name) for name in tuning.NAMES],
+    "tuning.limits": lambda: tuning.limits(("k", "d"), {}, vijax.Harvester()),
+    "branch.value_at": lambda: branch.value_at(PAIR, "omega", vijax.Harvester()),
+    "branch.pair_at": lambda: branch.pair_at(PAIR, "omega", 7.0, vijax.Harvester()),
+    "orbit.depth_unit": lambda: orbit.depth_unit(two_orbits(), DEVICES),
+    "orbit.power": lambda: orbit.power(two_orbits(), vijax.Harvester()),
+    "Orbit": lambda: (two_orbits()[:1], two_orbits().count),
+    "curve.curve": lambda: curve.curve(vijax.impact_pair(0.2, 40.0, 0.5), NUMBERS, [1, 1], NUMBERS, NUMBERS, NUMBERS),
+    "report.describe": lambda: plain_numbers(report.describe(designed())),
+    "tolerance.nodes": lambda: tolerance.nodes((tolerance.Tolerance("s", 0.1),))[1:],
+}
+
+
+@cache
+def two_orbits() -> orbit.Orbit:
+    return orbit.search(vijax.Harvester().pair(), "RL", guesses=64)[:2]
+
+
+@cache
+def designed() -> vijax.design.Design:
+    return vijax.optimise(vijax.Harvester(s=0.2), steps=8, balls=2, impacts=2, looks=6)
+
+
+def plain_numbers(told: Any) -> list[Any]:
+    return [leaf for leaf in jax.tree.leaves(told) if not isinstance(leaf, str)]
+
+
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+def test_what_has_a_closed_form_has_all_its_digits_in_a_program_of_32_bits(name):
+    two_orbits(), designed()
+    told = jax.tree.map(np.asarray, CLOSED_FORMS[name]())
+    with jax.enable_x64(False), jax.numpy_rank_promotion("raise"):
+        assert_same(jax.tree.map(np.asarray, CLOSED_FORMS[name]()), told)

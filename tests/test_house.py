@@ -68,7 +68,7 @@ ROOMS: dict[str, set[str]] = {
     "steady": {"context", "checks", "elimination", "model", "flow", "energy", "exact", "shooting", "clearance"},
     "ascent": set(),
     "tolerance": {"checks", "model"},
-    "tuning": {"checks", "units", "model"},
+    "tuning": {"context", "checks", "units", "model"},
     "objective": {"model", "shooting", "steady", "ascent", "tuning"},
     "impact_map": {"xla", "model", "quick", "lanes", "cell", "trips"},
     "label": {"model"},

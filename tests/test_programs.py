@@ -73,13 +73,15 @@ CALLS = {
     "steady": lambda i, known: vijax.steady(tuned(omega0(i)), known[0]),
     "steady, grad": lambda i, known: jax.grad(power(known))(omega0(i)),
     "steady, vmap": lambda i, known: jax.vmap(power(known))(jnp.full(3, omega0(i))),
-    "trajectory, periods": lambda i, known: vijax.trajectory(pair(i), 0.02, 0.3, periods=5 + i),
-    "trajectory, max_impacts": lambda i, known: vijax.trajectory(pair(i), 0.02, 0.3, periods=5 + i, max_impacts=9 + i),
+    "trajectory, periods": lambda i, known: vijax.trajectory(pair(i), 0.02, 0.3, periods=5 + 20 * i),
+    "trajectory, max_impacts": lambda i, known: vijax.trajectory(
+        pair(i), 0.02, 0.3, periods=5 + 20 * i, max_impacts=9 + 40 * i
+    ),
     "trajectory, starts": lambda i, known: vijax.trajectory(pair(i), np.full((2, 4 + i), 0.02), 0.3, periods=5),
     "trajectory, grad": lambda i, known: jax.grad(lambda v: vijax.trajectory(pair(i), 0.02, v, 5).states.u[-1])(0.3),
     "trajectory, rk4": lambda i, known: vijax.trajectory(pair(i), 0.02, 0.3, periods=5 + i, method="rk4", steps=100),
     "orbit.search": lambda i, known: orbit.search(pair(i), "RL", guesses=60 + i),
-    "orbit.from_state": lambda i, known: orbit.from_state(pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + i),
+    "orbit.from_state": lambda i, known: orbit.from_state(pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + 40 * i),
     "orbit.doubled": lambda i, known: orbit.doubled(many(known, i)),
     "orbit.impacts": lambda i, known: orbit.impacts(many(known, i)),
     "orbit.labels": lambda i, known: orbit.labels(many(known, i)),
@@ -110,6 +112,31 @@ def test_other_numbers_compile_nothing(name, known):
         CALLS[name](1, known)
         CALLS[name](2, known)
     assert not programs
+
+
+def test_derivatives_and_batches_of_other_periods_compile_slices_alone():
+    def moved(periods):
+        slope = jax.jvp(lambda v: vijax.trajectory(pair(0), 0.02, v, periods), (0.3,), (1.0,))
+        return slope, jax.vmap(lambda v: vijax.trajectory(pair(0), 0.02, v, periods))(np.full(3, 0.3))
+
+    moved(5)
+    with compilations() as programs:
+        moved(6)
+        moved(7)
+    # What is traced can only be cut to size by JAX, which has a program for each shape.
+    assert not set(programs) - {"jit(dynamic_slice)", "jit(broadcast_in_dim)"}
+
+
+def test_what_is_traced_flies_the_same():
+    starts = np.linspace(-0.3, 0.3, 3)
+    for wall in (40.0, None):
+        flat = vijax.impact_pair(0.2, wall, 0.5, 0.05)
+        plain = vijax.trajectory(flat, 0.02, starts, 40)
+        traced = jax.vmap(lambda v, flat=flat: vijax.trajectory(flat, 0.02, v, 40))(starts)
+        assert jax.tree.structure(plain) == jax.tree.structure(traced)
+        for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(traced), strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
 
 
 def test_a_compilation_is_seen():

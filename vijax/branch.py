@@ -31,7 +31,8 @@ _LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror imag
 _AWAY = 20  # steps before a branch can have closed
 _WAYS = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
 _MOST_POINTS, MOST_GENERATIONS = 10**6, 64
-_NARROWINGS = 40  # of an interval that holds an event: false position with every third step a bisection
+# An interval that holds an event is narrowed so often: by false position, with every third step a bisection.
+_NARROWINGS = 40
 
 
 def _changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -263,6 +264,7 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
     return known[along]() if along in known else getattr(of, along)
 
 
+@door
 def pair_at(pair: ImpactPair, along: str, value: float, device: Harvester) -> ImpactPair:
     """The pair where the parameter has another value, all else of the device as it is."""
     pair, x, steepest = lanes.arrays(jax.tree.map(np.asarray, (pair, value, device.g / device.A)))

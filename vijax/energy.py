@@ -19,6 +19,7 @@ PI = math.pi
 Values = Float[Array, "..."]
 
 
+@door
 def stretch(device: Harvester, depth: Values) -> Values:
     """Relative growth A_s/(pi R0^2) - 1 of a membrane of area A_s that a ball has entered by `depth` [m].
 
@@ -83,6 +84,7 @@ def _harvested(device: Harvester, depth: Values) -> Values:
     return (0.5 * device.V**2) * gain * (1 + gain * (1 / (least + device.C_T)))
 
 
+@door
 def rigid_penetration(r: Values) -> Values:
     """Largest penetration chi of a free contact in units of v_in/omega0; a rigid wall is lent it for its energy.
 
@@ -94,6 +96,7 @@ def rigid_penetration(r: Values) -> Values:
     return jnp.exp(-decrement / PI * jnp.arctan2(jnp.full_like(decrement, PI), decrement))
 
 
+@door
 def membrane_work_rigid(v_in: Values, r: Values) -> Values:
     """Energy per unit mass that an impact on a rigid wall takes from the ball: v_in^2 (1 - r^2)/2."""
     return 0.5 * v_in * v_in * (1 - r) * (1 + r)
@@ -147,6 +150,7 @@ def _squared_speed_short(
     return half * total
 
 
+@door
 @once
 def membrane_work(
     kappa: Values,
@@ -212,6 +216,7 @@ def membrane_work(
     return jnp.where(mu > 0, work, work - lax.stop_gradient(work))
 
 
+@door
 def energy_ratio(energy: Values, work: Values) -> Values:
     """Energy taken out over energy put in, E_j/W_j: 0 where nothing is taken out, inf where nothing was put in."""
     some = work > 0
@@ -219,6 +224,7 @@ def energy_ratio(energy: Values, work: Values) -> Values:
     return jnp.where(energy == 0, 0.0, ratio)
 
 
+@door
 def admissible(device: Harvester, energy: Values, work: Values, depth: Values) -> Bool[Array, "..."]:
     """Whether an impact may be: it gives out no more than it got, and stays within the device's penetration limit.
 

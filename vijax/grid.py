@@ -99,7 +99,8 @@ def sweep(
         periods: Forcing periods to run: at most (until="attractor"), or after the transient (until="window").
         until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
             `transient` periods and measures over the next `periods`.
-        transient: Forcing periods to drop first.
+        transient: Forcing periods to drop before a window. The search for an attractor begins at once whatever is said
+            here; where it finds none, averages leave out the first quarter of `periods`.
         wall: "soft" or "rigid".
         method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
             paper's fixed steps without event location (`vijax.rk4` says what it cannot know).

@@ -34,7 +34,7 @@ class Status(enum.IntEnum):
     NO_ORBIT = 7  # no periodic orbit was found from the guess
     VIRTUAL = 8  # the equations of an orbit hold, but the ball would meet a wall in between
     UNSTABLE = 9  # the orbit repels, or is at a bifurcation
-    NOT_RUN = 10  # of a store that is not finished: nothing is known yet
+    NOT_RUN = 10  # the store is not finished, and nothing is known of the cell yet
 
     @property
     def advice(self) -> str:
@@ -209,16 +209,19 @@ class Harvester(eqx.Module):
             )
 
     @property
+    @door
     def k(self) -> Real:
         """Stiffness of the membrane, m_b omega0^2 [N/m]."""
         return self.m_b * self.omega0**2
 
     @property
+    @door
     def length_unit(self) -> Real:
         """Metres per unit of u: A pi^2/omega^2."""
         return self.A * (math.pi / self.omega) ** 2
 
     @property
+    @door
     def speed_unit(self) -> Real:
         """Metres per second per unit of u': A pi/omega."""
         return self.A * (math.pi / self.omega)
@@ -304,11 +307,13 @@ class MembranePair(eqx.Module):
     c_star: Float[Array, "..."]
 
     @property
+    @door
     def length_unit(self) -> Float[Array, "..."]:
         """Units of u per unit of x: d."""
         return (self.omega_star / math.pi) ** 2 / self.A_star
 
     @property
+    @door
     def time_unit(self) -> Float[Array, "..."]:
         """Units of t per unit of t*: 1/kappa."""
         return self.omega_star / math.pi

@@ -24,11 +24,11 @@ from vijax.trajectory import trajectory
 
 _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
 _SAME = 1e-6  # how closely the impact map must meet the next impact of a real orbit
-_FASTEST = 1.5  # of a guess's speeds, in units of A pi/omega
+_FASTEST = 1.5  # largest speed of a guess, in units of A pi/omega
 _TILES = (32, 256, 4096)  # orbits of one compiled call
 _MOST_PERIOD = 1000  # forcing periods of an orbit
-_MOST_IMPACTS, _MOST_SEQUENCES = 64, 10_000  # that a text may ask for
-_MOST_GUESSES = 10**7  # of all sequences together
+# A text may ask for so many impacts and sequences, and all sequences together for so many guesses.
+_MOST_IMPACTS, _MOST_SEQUENCES, _MOST_GUESSES = 64, 10_000, 10**7
 
 
 class Orbit(WithStatus):
@@ -506,6 +506,7 @@ def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
     return lanes.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
 
 
+@door
 def depth_unit(orbit: Orbit, device: Harvester) -> Any:
     """Metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
     if orbit.pair.kappa is None:

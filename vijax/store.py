@@ -15,7 +15,8 @@ from vijax.files import check_ending, check_folder, recover, replacing_folder
 if TYPE_CHECKING:
     import xarray as xr
 
-_LEVEL = 1  # of compression; 3 takes twice as long to save a thousandth
+# Level 3 of compression takes twice as long and saves a thousandth more.
+_LEVEL = 1
 
 
 def check_store(name: str, path: str | Path, overwrite: bool = False) -> Path:
@@ -117,12 +118,22 @@ def load(path: str | Path) -> "xr.Dataset":
     Raises:
         FileNotFoundError: If there is no store.
         ValueError: If a file of it is not what was written; FileExistsError if a folder stands in its place.
+
+    Warns:
+        UserWarning: If the store has no list of its files, as those of earlier versions: chunks alone are checked then.
     """
     path = checks.path("path", path)
     with view(path) as dataset:
         _check(path, inventory.records(path))
         with _in_one_line(path):
-            return dataset.load()
+            found = dataset.load()
+    if inventory.read(path) is None:
+        warnings.warn(
+            f"{path} has no {inventory.LIST}, the list of its files, as stores of earlier versions: edits of its "
+            "metadata go unseen; make it anew for a store that is checked",
+            stacklevel=2,
+        )
+    return found
 
 
 def view(path: str | Path) -> "xr.Dataset":

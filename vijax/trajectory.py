@@ -19,11 +19,18 @@ from vijax.membrane import HuntCrossley, Law
 from vijax.method import Method, Rk4, choose, repeated
 from vijax.model import Impact, ImpactPair, State, Status, WithStatus, check_pair, check_start
 
-_CHUNK = 64  # steps that a differentiated run computes twice, to remember only where a chunk began and what it decided
-_STEPS = 256  # steps of an adaptive solver per impact and period, before a run is stopped
+# A differentiated run computes so many steps twice: it remembers only where a chunk began and what it decided.
+_CHUNK = 64
+# An adaptive solver that takes more steps than this per impact and period is stopped.
+_STEPS = 256
 _IMPACT, _STATE = 56, 32  # bytes of a record
-_TILES = (1, 8, 64, 512, 4096)  # starts of one compiled call
-_HELD = 8  # a contact that outlasts the last period by so many is for ever
+# The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
+# call, and few enough that the host waits for no long one after every ball has arrived.
+_STRETCH = 64
+# Few sizes of compiled calls are few programs: starts that fly together, and balls at phase 0 that are found together.
+_TILES, _STROBES = (1, 8, 64, 512, 4096), (64, 4096)
+# A contact that outlasts the last period by so many is taken to last for ever.
+_HELD = 8
 
 
 class Trajectory(WithStatus):
@@ -72,11 +79,16 @@ def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Arra
 
 
 class _Asked(NamedTuple):
-    """How far a run goes: traced, so that one program serves all numbers that its records have room for."""
+    """How far a run goes: traced, so that one program serves all numbers that its records have room for.
+
+    Attributes:
+        periods, max_impacts: As asked for.
+        chunks: How often a stepping engine may take `_CHUNK` steps.
+    """
 
     periods: Int[Array, ""]
     max_impacts: Int[Array, ""]
-    chunks: Int[Array, ""]  # of a stepping engine's steps
+    chunks: Int[Array, ""]
 
 
 class _Room(NamedTuple):
@@ -88,7 +100,7 @@ class _Room(NamedTuple):
 
 
 class _Flown(NamedTuple):
-    """Steps of the exact engine, one after another along the leading axis: the start of each, what came of it.
+    """Steps of the exact engine [row, step]: the start of each, what came of it.
 
     Attributes:
         idle: Whether the run had ended before.
@@ -96,18 +108,28 @@ class _Flown(NamedTuple):
 
     begun: State
     out: exact.Outcome
-    idle: Bool[Array, "step ..."]
+    idle: Bool[Array, "row step"]
 
 
-@partial(jax.jit, static_argnames="room")
-def _exact(asked: _Asked, pair: ImpactPair, u0, v0, t0, *, room: _Room) -> Trajectory:
-    """By the exact engine, of rows of starts."""
-    start = jax.vmap(_begin)(pair, u0, v0, t0)
+class _Reached(NamedTuple):
+    """Where runs of the exact engine are, and which of them are over."""
 
-    def advance(carry, index):
-        state, over = carry
+    state: State
+    over: Bool[Array, "row"]
+
+
+@jax.jit
+def _set_out(pair: ImpactPair, u0, v0, t0) -> _Reached:
+    return _Reached(jax.vmap(_begin)(pair, u0, v0, t0), jnp.zeros(u0.shape, bool))
+
+
+def _onward(asked: _Asked, pair: ImpactPair, reached: _Reached, first: Int[Array, ""], count: int):
+    """So many steps on, the first of which has a number in the run: where the balls are then, and the `_Flown`."""
+
+    def advance(reached: _Reached, index):
+        state, over = reached
         idle = over | (index > asked.max_impacts)
-        horizon = jnp.where(idle, 0.0, 2.0 * (asked.periods - state.n).astype(u0.dtype) - state.t)
+        horizon = jnp.where(idle, 0.0, 2.0 * (asked.periods - state.n).astype(state.t.dtype) - state.t)
 
         def fly():
             return jax.vmap(partial(exact.step, rolled=True))(pair, state, horizon)
@@ -120,49 +142,94 @@ def _exact(asked: _Asked, pair: ImpactPair, u0, v0, t0, *, room: _Room) -> Traje
         over = over | (~idle & (out.quiet | out.permanent | (horizon <= 0)))
         ends = idle | over
         after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
-        return (after, over), _Flown(state, out, idle)
+        return _Reached(after, over), _Flown(state, out, idle)
 
+    reached, flown = lax.scan(advance, reached, first + jnp.arange(count, dtype=jnp.int32))
+    return reached, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), flown)
+
+
+_stretch = jax.jit(partial(_onward, count=_STRETCH))
+
+
+def _fly(asked: _Asked, room: _Room, pair: ImpactPair, starts: tuple) -> tuple[_Reached, _Flown]:
+    """All steps of rows of starts: as many as there is room for where they are traced, else until all runs are over."""
+    reached = _set_out(pair, *starts)
     # One step more than impacts: the flight or contact in which the last period ends.
-    steps = jnp.arange(room.impacts + 1, dtype=jnp.int32)
-    end, flown = lax.scan(advance, (start, jnp.zeros(u0.shape, bool)), steps)
-    return jax.vmap(partial(_recorded, asked, room), in_axes=(0, 1, 0, 0))(pair, flown, *end)
+    steps = room.impacts + 1
+    if lanes.library((pair, starts)) is jnp:
+        return _onward(asked, pair, reached, jnp.int32(0), steps)
+    # Stretches of one length need one program, where every number of periods would need its own: 4 s and 800 mappings.
+    parts = []
+    for first in range(0, steps, _STRETCH):
+        reached, flown = _stretch(asked, pair, reached, np.int32(first))
+        parts.append(jax.tree.map(np.asarray, flown))
+        if np.asarray(reached.over).all():
+            break
+    flown = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
+    return jax.tree.map(np.asarray, reached), flown
 
 
-def _recorded(
-    asked: _Asked, room: _Room, pair: ImpactPair, flown: _Flown, end: State, over: Bool[Array, ""]
-) -> Trajectory:
-    """Impacts and stroboscopic states of one start, from its steps and where they ended."""
-    begun, out, idle = flown
+def _exact(asked: _Asked, pair: ImpactPair, u0, v0, t0, *, room: _Room) -> Trajectory:
+    """By the exact engine, of rows of starts."""
+    reached, flown = _fly(asked, room, pair, (u0, v0, t0))
+    own = lanes.library((pair, flown))
+    out, idle = flown.out, flown.idle
     real = ~idle & (out.impact.side != 0)
-    real = real & (jnp.cumsum(real, dtype=jnp.int32) <= asked.max_impacts) & (out.impact.n < asked.periods)
-    order = jnp.argsort(~real, stable=True)[: room.impacts]
-    filled = real.sum(dtype=jnp.int32)
-    there = jnp.arange(room.impacts, dtype=jnp.int32) < filled
+    counted = own.cumsum(real, axis=1, dtype=own.int32)
+    real = real & (counted <= asked.max_impacts) & (out.impact.n < asked.periods)
+    filled = real.sum(axis=1, dtype=own.int32)
+    there = own.arange(room.impacts, dtype=own.int32) < filled[:, None]
+    order = own.argsort(~real, axis=1, stable=True)[:, : room.impacts]
+    order = own.pad(order, ((0, 0), (0, room.impacts - order.shape[1])))
 
     def keep(leaf):
-        blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
-        return jnp.where(there, leaf[order], blank)
+        blank = 0 if own.issubdtype(leaf.dtype, own.integer) else own.nan
+        return own.where(there, own.take_along_axis(leaf, order, axis=1), blank)
 
-    clock = jnp.where(idle, jnp.inf, _time(begun))
-    ended = (out.quiet | out.permanent) & ~idle
-    until = jnp.where(idle | ended, jnp.inf, _time(out.state))
-
-    def strobe(k):
-        now = 2.0 * k.astype(clock.dtype)
-        index = jnp.clip(jnp.searchsorted(clock, now, side="right") - 1, 0, room.impacts)
-        first, happened = jax.tree.map(lambda leaf: leaf[index], (begun, out))
-        known = now <= until[index]
-        when = jnp.where(known, 2.0 * (k - first.n).astype(clock.dtype) - first.t, 0.0)
-        u, v, mode = ball_at(pair, first, happened, when)
-        blank = jnp.where(known, 0.0, jnp.nan)
-        return State(u + blank, v + blank, jnp.zeros_like(u), k, mode)
-
-    states = jax.vmap(strobe)(jnp.arange(1, room.periods + 1, dtype=jnp.int32))
-    permanent = (out.permanent & ~idle).any()
-    short = ~over & (_time(end) < 2.0 * asked.periods.astype(clock.dtype))
-    status = jnp.where(permanent, Status.PERMANENT_CONTACT, jnp.where(filled == 0, Status.NO_IMPACT, Status.OK))
-    status = jnp.where(short, Status.EVENT_BUDGET, status).astype(jnp.int32)
+    states = _strobes(pair, flown, room.periods)
+    permanent = (out.permanent & ~idle).any(axis=1)
+    short = ~reached.over & (_time(reached.state) < 2.0 * asked.periods.astype(reached.state.t.dtype))
+    status = own.where(permanent, Status.PERMANENT_CONTACT, own.where(filled == 0, Status.NO_IMPACT, Status.OK))
+    status = own.where(short, Status.EVENT_BUDGET, status).astype(own.int32)
     return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
+
+
+_exact_traced = jax.jit(_exact, static_argnames="room")
+
+
+def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:
+    """The balls at phase 0 of periods 1 ... periods, [row, period]: each in the last step that began before."""
+    own = lanes.library((pair, flown))
+    begun, out, idle = flown
+    clock = own.where(idle, own.inf, _time(begun))
+    # A step that nothing ends is the last word on all that comes.
+    ended = idle | out.quiet | out.permanent
+    until = own.where(ended, own.inf, _time(out.state))
+    k = own.broadcast_to(own.arange(1, periods + 1, dtype=own.int32), (clock.shape[0], periods))
+    now = 2.0 * k.astype(clock.dtype)
+    index = own.clip(_before(clock, now), 0, clock.shape[1] - 1)
+    first, happened, last = jax.tree.map(lambda leaf: own.take_along_axis(leaf, index, axis=1), (begun, out, until))
+    known = now <= last
+    when = own.where(known, 2.0 * (k - first.n).astype(clock.dtype) - first.t, 0.0)
+    wide = jax.tree.map(lambda leaf: own.broadcast_to(leaf[:, None], k.shape), pair)
+    rows = jax.tree.map(lambda leaf: leaf.reshape(-1), (wide, first, happened, when))
+    u, v, mode = jax.tree.map(lambda leaf: leaf.reshape(k.shape), lanes.map_tiles(_balls_at, rows, _STROBES))
+    blank = own.where(known, 0.0, own.nan).astype(u.dtype)
+    return State(u + blank, v + blank, own.zeros_like(u), k, mode)
+
+
+@jax.jit
+def _balls_at(rows: tuple) -> tuple:
+    return jax.vmap(ball_at)(*rows)
+
+
+def _before(clock: Float[Array, "row step"], now: Float[Array, "row period"]) -> Int[Array, "row period"]:
+    """The last step of each row that began by then; -1 before all."""
+    if lanes.library((clock, now)) is jnp:
+        return jax.vmap(partial(jnp.searchsorted, side="right"))(clock, now) - 1
+    rows: Any = zip(clock, now, strict=True)
+    index: Any = np.stack([np.searchsorted(row, when, side="right") for row, when in rows])
+    return index - 1
 
 
 class _Recording(eqx.Module):
@@ -341,11 +408,14 @@ def _followed(
     rows = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), shape).reshape(-1), (pair, starts))
     most = _most(periods) if max_impacts is None else max_impacts
     chunks = -(-_steps(method, periods, most) // _CHUNK)
-    asked = _Asked(*lanes.arrays([np.int32(number) for number in (periods, most, chunks)]))
+    numbers: Any = (np.int32(number) for number in (periods, most, chunks))
+    asked = _Asked(*numbers)
     wide = lanes.padded(periods)
     room = _Room(wide, _most(wide) if max_impacts is None else lanes.padded(max_impacts), lanes.padded(chunks))
-    if method is None:
-        work = partial(_exact, asked, room=room)
+    if method is None and own is np:
+        work = partial(_exact, asked, room=_Room(periods, most, chunks))
+    elif method is None:
+        work = partial(_exact_traced, asked, room=room)
     else:
         method = jax.tree.map(lambda x: jnp.asarray(x, dtype), method)
         name = "rk4" if isinstance(method, Rk4) else "ode"

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax import checks, units
+from vijax.context import door
 from vijax.model import CONSTANTS, Harvester, check
 
 # Other names of what a constant decides: each is applied after the constants, in this order.
@@ -31,6 +32,7 @@ def moving(name: str) -> bool:
     return constant(name) in _MOVING
 
 
+@door
 def values(names: tuple[str, ...], z: Any) -> Any:
     """Values of the quantities for their variables, [..., quantity]."""
     plain = np.array([name in LINEAR for name in names])
@@ -43,6 +45,7 @@ def variables(names: tuple[str, ...], x: Any) -> np.ndarray:
     return np.where(plain, x, np.log(np.where(plain, 1.0, x)))
 
 
+@door
 def tuned(device: Harvester, names: tuple[str, ...], z: Any) -> Harvester:
     """The device with the quantities that the variables say."""
     given = dict(zip(names, values(names, z), strict=True))
