@@ -99,8 +99,8 @@ def sweep(
         periods: Forcing periods to run: at most (until="attractor"), or after the transient (until="window").
         until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
             `transient` periods and measures over the next `periods`.
-        transient: Forcing periods to drop before a window. The search for an attractor begins at once whatever is said
-            here; where it finds none, averages leave out the first quarter of `periods`.
+        transient: Forcing periods to drop before a window. The search for an attractor begins at once and takes none;
+            where it finds nothing, averages leave out the first quarter of `periods`.
         wall: "soft" or "rigid".
         method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
             paper's fixed steps without event location (`vijax.rk4` says what it cannot know).
@@ -188,6 +188,11 @@ def plan(
         checks.choice(name, settings[name], allowed)
     for name, least in (("periods", 1), ("transient", 0)):
         settings[name] = checks.whole(name, settings[name], least, most_periods(settings["dtype"]))
+    if settings["transient"] and settings["until"] == "attractor":
+        raise ValueError(
+            f"transient must be 0 with until='attractor', whose search begins at once; got {settings['transient']}; "
+            "until='window' drops a transient"
+        )
     refine = settings.pop("refine", None)
     options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
     method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
