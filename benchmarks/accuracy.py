@@ -36,10 +36,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import vijax
-from vijax import lanes, orbit, simulate, survey
-from vijax.model import Harvester, ImpactPair, impact_pair
-from vijax.shooting import Sequence
-from vijax.steady import Steady, find, response
+from vijax.batch import simulate
+from vijax.design import survey
+from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.orbits import periodic
+from vijax.orbits.shooting import Sequence
+from vijax.orbits.steady import Steady, find, response
+from vijax.runtime import tiles
 
 TESTS = Path(__file__).parent.parent / "tests"
 sys.path.insert(0, str(TESTS))
@@ -164,8 +168,8 @@ def steady_states(count: int) -> None:
     for moved in MOVED:
         there = dataclasses.replace(met.pair, d=moved * met.pair.d)
         state = _steadily(device, there, sequence, met.knots)
-        flown = orbit.proven(there, sequence, jnp.asarray(state.knots))
-        P, fine = np.asarray(orbit.power(flown, device)), np.asarray(flown.status) == vijax.Status.OK
+        flown = periodic.proven(there, sequence, jnp.asarray(state.knots))
+        P, fine = np.asarray(periodic.power(flown, device)), np.asarray(flown.status) == vijax.Status.OK
         ok = state.status == vijax.Status.OK
         said += state.status.size
         wrong += int((ok & ~fine).sum())
@@ -185,7 +189,7 @@ def _steadily(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: np
         return response(device, pair, sequence, *find(pair, sequence, knots))
 
     one = jax.jit(jax.vmap(one_of))
-    return lanes.map_tiles(lambda rows: one(*rows), (pair, sequence, knots), (512,))
+    return tiles.map_tiles(lambda rows: one(*rows), (pair, sequence, knots), (512,))
 
 
 LONG = 9  # forcing periods of an orbit that counts as long

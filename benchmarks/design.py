@@ -57,15 +57,17 @@ import mpmath as mp
 import numpy as np
 
 import vijax
-from vijax import design
-from vijax import orbit as orbits
-from vijax.design import Design, Optimum
-from vijax.energy import harvested_energy
-from vijax.model import Harvester, ImpactPair, Status, impact_pair
-from vijax.orbit import Orbit
-from vijax.shooting import Sequence
-from vijax.steady import steady
-from vijax.survey import survey
+from vijax.design import optimise
+from vijax.design.optimise import Design, Optimum
+from vijax.design.survey import survey
+from vijax.model.device import Harvester
+from vijax.model.energy import harvested_energy
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.records import Status
+from vijax.orbits import periodic as orbits
+from vijax.orbits.periodic import Orbit
+from vijax.orbits.shooting import Sequence
+from vijax.orbits.steady import steady
 
 DATA = Path(__file__).parent.parent / "tests" / "data"
 SEED = 5
@@ -234,14 +236,14 @@ def rise_mp(d: float, near: tuple[float, float, float], kappa: Any) -> Any:
 def reference() -> None:
     """The small fast device, for P and for speed."""
     settings = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
-    best = design.optimise(small_and_fast(), **settings).optima[0]
+    best = optimise.optimise(small_and_fast(), **settings).optima[0]
     say("reference: small fast device, kappa (4.00713)", f"{best.values['kappa']:.5f}")
     say("reference: P, microjoule (57.75761)", f"{1e6 * best.height:.5f}")
     say("reference: penetration, mm (6.026)", f"{1e3 * best.state.depth.max():.4f}")
     say("reference: largest multiplier (0.533)", f"{best.state.multiplier:.4f}")
     for d, kappa, speed in ((0.2, "4.0182", "-"), (0.16, "3.7820", "0.92524")):
         device = small_and_fast(d)
-        best = design.optimise(device, objective="speed", **settings).optima[0]
+        best = optimise.optimise(device, objective="speed", **settings).optima[0]
         say(f"reference: speed, d {d}: kappa ({kappa})", f"{best.values['kappa']:.6f}")
         say(
             f"reference: speed, d {d}: in units of A pi/omega ({speed})",
@@ -334,7 +336,7 @@ def cases(draw: np.random.Generator, within: dict, count: int, points: int, free
             continue
         devices.append(device)
         bests.append(best)
-    designs = design.optimise_all(devices, tune=("kappa",), bounds={"kappa": KAPPA}) if devices else []
+    designs = optimise.optimise_all(devices, tune=("kappa",), bounds={"kappa": KAPPA}) if devices else []
     return [Case(*case) for case in zip(devices, bests, designs, strict=True)], left_out
 
 
@@ -418,7 +420,7 @@ def speed(designs: int) -> None:
     seconds = []
     for _ in range(2):
         begun = time.perf_counter()
-        found = design.optimise_all(devices)
+        found = optimise.optimise_all(devices)
         seconds.append(time.perf_counter() - begun)
     starts = sum(one.starts for one in found)
     looks = [optimum.looks for one in found for optimum in one.optima]
@@ -466,7 +468,7 @@ BESIDE = 0.02  # relative, of kappa's bounds about it
 def cliffs() -> None:
     """Designs in small ranges about the fold at kappa 3.69 and about grazing."""
     for low, high in FOLDS:
-        found = design.optimise(small_and_fast(), tune=("kappa",), bounds={"kappa": (low, high)})
+        found = optimise.optimise(small_and_fast(), tune=("kappa",), bounds={"kappa": (low, high)})
         told(f"cliffs: small fast device, kappa {low} to {high}", [found])
         for one in found.optima:
             print(
@@ -479,7 +481,7 @@ def cliffs() -> None:
     designs = []
     for i in np.flatnonzero((clear < GRAZES) & (gamma == 0)):
         bounds = {"kappa": (kappa[i] * (1 - BESIDE), kappa[i] * (1 + BESIDE))}
-        designs.append(design.optimise(Harvester(s=d[i], r=r[i]), tune=("kappa",), bounds=bounds))
+        designs.append(optimise.optimise(Harvester(s=d[i], r=r[i]), tune=("kappa",), bounds=bounds))
     told(f"cliffs: beside {len(designs)} orbits that nearly graze", designs)
 
 

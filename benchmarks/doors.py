@@ -45,7 +45,7 @@ def called(case: Case) -> str:
         case.make()
     except _REFUSALS as error:
         where = Path(traceback.extract_tb(error.__traceback__)[-1].filename).parent
-        ours = where in _HERE or "unexpected keyword argument" in str(error)
+        ours = any(where.is_relative_to(home) for home in _HERE) or "unexpected keyword argument" in str(error)
         return _unclear(case, str(error)) or ("" if ours else f"{type(error).__name__} from {where.name}: {error}")
     except Exception as error:
         return f"{type(error).__name__}: {error}"

@@ -31,6 +31,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import charts
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -39,11 +40,13 @@ import numpy as np
 from peers import rk4
 
 import vijax
-from vijax import chart, exact, flow
-from vijax.membrane import Linear
-from vijax.method import Ode
-from vijax.model import ImpactPair, State, damping_ratio
-from vijax.trajectory import Trajectory
+from vijax.batch.trajectory import Trajectory
+from vijax.engine import exact
+from vijax.engine.method import Ode
+from vijax.model import flow
+from vijax.model.membrane import Linear
+from vijax.model.pair import ImpactPair, damping_ratio
+from vijax.model.records import State
 
 HERE = Path(__file__).parent
 REFERENCE = HERE.parent / "tests" / "data" / "plane_cells.json"
@@ -574,7 +577,7 @@ def main() -> None:
     given = parser.parse_args()
 
     if given.plot:
-        chart.stability_map(stability_map(STABILITY_SIDES[given.quick]), given.plot)
+        charts.stability_map(stability_map(STABILITY_SIDES[given.quick]), given.plot)
         return
     given.rows.mkdir(parents=True, exist_ok=True)
     part = "_quick" if given.quick or given.only else ""

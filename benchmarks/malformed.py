@@ -15,11 +15,15 @@ import numpy as np
 import xarray as xr
 
 import vijax
-from vijax import blueprint, branch, chart, curve, design, model, orbit, plot, report, shooting, simulate
-from vijax.compare import cheapest_model
-from vijax.report import lines, table
-from vijax.surroundings import surroundings, weighted
-from vijax.tolerance import Tolerance, nodes
+from vijax.batch import simulate
+from vijax.design import optimise, report
+from vijax.design.report import lines, table
+from vijax.design.robustness import surroundings, weighted
+from vijax.design.tolerance import Tolerance, nodes
+from vijax.model import device
+from vijax.orbits import continuation, motion, periodic, shooting
+from vijax.planes.compare import cheapest_model
+from vijax.plots import branches, designs, maps, orbit_diagrams
 
 NAN, INF, HUGE = math.nan, math.inf, 10**45
 
@@ -40,24 +44,24 @@ def pair() -> vijax.ImpactPair:
     return vijax.impact_pair(0.2, 40.0, 0.5)
 
 
-def an_orbit() -> orbit.Orbit:
+def an_orbit() -> periodic.Orbit:
     """A record such as a search returns, made by hand so that nothing is compiled."""
     sequence = shooting.Sequence(jnp.array([[1, -1]], jnp.int32), jnp.array([2.0]), jnp.array([False]))
     wide = vijax.impact_pair([0.2], [40.0], [0.5])
     knots, two = jnp.array([[[0.1, 0.5, 0.05], [1.1, 0.5, 0.05]]]), jnp.full((1, 2), 0.01)
     multipliers, zero = jnp.full((1, 2), 0.1 + 0j), jnp.zeros(1)
-    return orbit.Orbit(wide, sequence, knots, two, two, multipliers, zero, jnp.zeros(1, jnp.int32))
+    return periodic.Orbit(wide, sequence, knots, two, two, multipliers, zero, jnp.zeros(1, jnp.int32))
 
 
-def a_design() -> design.Design:
+def a_design() -> optimise.Design:
     """A design without optima."""
-    return design.Design((), ("omega0",), {"omega0": (20.0, 400.0)}, "P", (), 0, 0)
+    return optimise.Design((), ("omega0",), {"omega0": (20.0, 400.0)}, "P", (), 0, 0)
 
 
-def an_optimum() -> design.Optimum:
+def an_optimum() -> optimise.Optimum:
     """An optimum of which no more than the orbit is known."""
     path = np.zeros((1, 1))
-    return design.Optimum({}, vijax.Harvester(), an_orbit(), "1:1", 0.0, None, {}, (), "maximum", 0, path, path[0])
+    return optimise.Optimum({}, vijax.Harvester(), an_orbit(), "1:1", 0.0, None, {}, (), "maximum", 0, path, path[0])
 
 
 def a_map() -> xr.Dataset:
@@ -238,9 +242,9 @@ CALLS: Table = {
             ),
         },
     ),
-    "optimise_all": (design.optimise_all, {}, {"devices": (3, [], [3], "paper", None, vijax.Harvester())}),
+    "optimise_all": (optimise.optimise_all, {}, {"devices": (3, [], [3], "paper", None, vijax.Harvester())}),
     "under": (
-        design.under,
+        optimise.under,
         {"optimum": an_optimum(), "tolerances": [Tolerance("omega0", 0.05)]},
         {
             "optimum": (3, None, "best", a_design()),
@@ -309,8 +313,8 @@ CALLS: Table = {
         {"dataset": a_map(), "path": "map.zarr"},
         {"dataset": DATASET, "path": (*TARGET, None), "overwrite": FLAG},
     ),
-    "orbit.search": (
-        orbit.search,
+    "periodic.search": (
+        periodic.search,
         {"pair": pair(), "impacts": "1:1"},
         {
             "pair": (*PAIR, vijax.impact_pair([0.2, 0.3], 40.0, 0.5)),
@@ -320,8 +324,8 @@ CALLS: Table = {
             "seed": SEED,
         },
     ),
-    "orbit.from_state": (
-        orbit.from_state,
+    "periodic.from_state": (
+        periodic.from_state,
         {"pair": pair(), "u": 0.05, "v": -0.4},
         {
             "pair": PAIR,
@@ -332,8 +336,8 @@ CALLS: Table = {
             "settle": WHOLE,
         },
     ),
-    "orbit.from_state beyond a rigid wall": (
-        orbit.from_state,
+    "periodic.from_state beyond a rigid wall": (
+        periodic.from_state,
         {"pair": vijax.impact_pair(0.2, None, 0.5), "v": 0.0},
         {"u": (0.2, -0.11, [0.0, 5.0])},
     ),
@@ -361,24 +365,31 @@ CALLS: Table = {
             "on": ("cpu", 0, []),
         },
     ),
-    "orbit.solve": (
-        orbit.solve,
+    "periodic.solve": (
+        periodic.solve,
         {"pair": an_orbit().pair, "sequence": an_orbit().sequence, "knots": an_orbit().knots},
         {"pair": PAIR, "sequence": ("RL", None, [1, -1]), "knots": ("x", None, [], 3.0)},
     ),
     **{
         f"orbit.{door.__name__}": (door, {}, {"orbit": ORBIT})
-        for door in (orbit.symmetric, orbit.halved, orbit.doubled, orbit.unfolded, orbit.counts, orbit.labels)
+        for door in (
+            periodic.symmetric,
+            periodic.halved,
+            periodic.doubled,
+            periodic.unfolded,
+            periodic.counts,
+            periodic.labels,
+        )
     },
-    "orbit.impacts": (orbit.impacts, {}, {"orbit": ORBIT}),
-    "orbit.power": (
-        orbit.power,
+    "periodic.impacts": (periodic.impacts, {}, {"orbit": ORBIT}),
+    "periodic.power": (
+        periodic.power,
         {"orbit": an_orbit(), "device": vijax.Harvester()},
         {"orbit": ORBIT, "device": (*DEVICE, None)},
     ),
-    "orbit.path": (orbit.path, {"orbit": an_orbit()}, {"orbit": ORBIT, "samples": COUNT}),
-    "branch.follow": (
-        branch.follow,
+    "periodic.path": (periodic.path, {"orbit": an_orbit()}, {"orbit": ORBIT, "samples": COUNT}),
+    "continuation.follow": (
+        continuation.follow,
         {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
         {
             "orbit": ORBIT,
@@ -389,8 +400,8 @@ CALLS: Table = {
             "points": (*COUNT, 10**9),
         },
     ),
-    "branch.family": (
-        branch.family,
+    "continuation.family": (
+        continuation.family,
         {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
         {
             "orbit": ORBIT,
@@ -401,17 +412,17 @@ CALLS: Table = {
             "points": (0, 1.5, 10**9),
         },
     ),
-    "branch.switch": (
-        branch.switch,
-        {"point": branch.Point("flip", 0.2, an_orbit()), "along": "d", "within": (0.1, 0.3)},
+    "continuation.switch": (
+        continuation.switch,
+        {"point": continuation.Point("flip", 0.2, an_orbit()), "along": "d", "within": (0.1, 0.3)},
         {
-            "point": (3, None, "flip", branch.Point("fold", 0.2, an_orbit())),
+            "point": (3, None, "flip", continuation.Point("fold", 0.2, an_orbit())),
             "along": (3, "mass"),
             "within": (3, (0.3, 0.1)),
             "points": (0, 1.5, 10**9),
         },
     ),
-    "branch.dataset": (branch.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
+    "continuation.dataset": (continuation.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
     "surroundings": (
         surroundings,
         {"optimum": an_optimum()},
@@ -434,36 +445,36 @@ CALLS: Table = {
     ),
     "report.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design(), {})}),
     "report.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
-    "blueprint.design": (
-        blueprint.design,
+    "designs.design": (
+        designs.design,
         {"diagram": a_map(), "report": {"best": None}},
         {"diagram": (*DATASET, a_map())},
     ),
-    "blueprint.design_map": (blueprint.design_map, {}, {"report": (3, None, "best")}),
+    "designs.design_map": (designs.design_map, {}, {"report": (3, None, "best")}),
     "report.optimum": (report.optimum, {}, {"one": (3, None, "best")}),
     **{
         f"plot.{door.__name__}": (door, {"dataset": a_map()}, {"dataset": DATASET})
-        for door in (plot.power_map, plot.label_map, plot.basin_map, plot.multistability_map, plot.difference_map)
+        for door in (maps.power_map, maps.label_map, maps.basin_map, maps.multistability_map, maps.difference_map)
     },
-    "plot.variable_map": (
-        plot.variable_map,
+    "maps.variable_map": (
+        maps.variable_map,
         {"dataset": a_map(), "name": "mass"},
         {"dataset": DATASET, "name": (3, None, ["mass"], "P")},
     ),
-    "chart.orbit_diagram": (chart.orbit_diagram, {}, {"dataset": DATASET}),
-    "chart.branches": (chart.branches, {}, {"dataset": DATASET}),
+    "orbit_diagrams.orbit_diagram": (orbit_diagrams.orbit_diagram, {}, {"dataset": DATASET}),
+    "branches.branches": (branches.branches, {}, {"dataset": DATASET}),
     "tolerance.nodes": (
         nodes,
         {"tolerances": (Tolerance("omega0", 0.05),)},
         {"tolerances": (3, "omega0", [3]), "samples": COUNT, "seed": SEED},
     ),
     "curve": (
-        curve.curve,
+        motion.curve,
         {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05]},
         {"pair": PAIR, "t": ("x", None, 0.1), "side": ("x", None, 1, [1, -1]), "samples": COUNT},
     ),
-    "curve.states": (
-        curve.states,
+    "motion.states": (
+        motion.states,
         {"pair": pair(), "t": [0.1], "side": [1], "v_in": [0.5], "v_out": [-0.4], "duration": [0.05], "when": [0.2]},
         {"pair": PAIR, "v_in": ("x", [0.1, 0.2]), "when": ("x", None, [], True, 0.2)},
     ),
@@ -473,12 +484,12 @@ CALLS: Table = {
         {"found": (*DATASET, a_map()), "tolerance": (*REAL, 0)},
     ),
     "with_constants": (
-        model.with_constants,
+        device.with_constants,
         {"device": vijax.Harvester()},
         {"device": (*DEVICE, None), "mass": (1.0,), "k": (0, "560 N/m", NAN), "m_b": (0, "3 g")},
     ),
     "with_pair": (
-        model.with_pair,
+        device.with_pair,
         {"device": vijax.Harvester(), "pair": pair()},
         {"device": (*DEVICE, None), "pair": PAIR},
     ),
@@ -502,9 +513,9 @@ TRACED: dict[str, Callable[[Any], Any]] = {
     "kappa of orbit_diagram": lambda x: vijax.orbit_diagram(along="d", values=[0.1, 0.2], kappa=x),
     "device of optimise": lambda x: vijax.optimise(vijax.Harvester(s=x)),
     "bounds of optimise": lambda x: vijax.optimise(bounds={"omega0": (20.0, x)}),
-    "pair of search": lambda x: orbit.search(vijax.impact_pair(x, 40.0, 0.5), "1:1"),
-    "u of from_state": lambda x: orbit.from_state(_PAIR, x, 0.1),
-    "within of follow": lambda x: branch.follow(_ORBIT, "d", (0.1, x)),
+    "pair of search": lambda x: periodic.search(vijax.impact_pair(x, 40.0, 0.5), "1:1"),
+    "u of from_state": lambda x: periodic.from_state(_PAIR, x, 0.1),
+    "within of follow": lambda x: continuation.follow(_ORBIT, "d", (0.1, x)),
     "reach of surroundings": lambda x: weighted(a_design(), reach=x),
 }
 
@@ -520,10 +531,10 @@ SHAPES: dict[str, Callable[[], Any]] = {
     "u0 outside a rigid gap": lambda: vijax.sweep(**CELL, u0=0.2, wall="rigid"),
     "values missing": lambda: vijax.orbit_diagram(along="d"),
     "d given twice": lambda: vijax.orbit_diagram(along="d", values=[0.1, 0.2], d=0.3),
-    "gamma of with_pair": lambda: model.with_pair(vijax.Harvester(), vijax.impact_pair(0.2, 40.0, 0.5, 20.0)),
+    "gamma of with_pair": lambda: device.with_pair(vijax.Harvester(), vijax.impact_pair(0.2, 40.0, 0.5, 20.0)),
     "d and kappa of other shapes": lambda: vijax.impact_pair([0.1, 0.2], [1.0, 2.0, 3.0], 0.5),
     "u0 and v0 of other shapes": lambda: vijax.trajectory(pair(), [0.0, 0.1], [0.1, 0.2, 0.3], 4),
-    "u and v of other shapes": lambda: orbit.from_state(pair(), [0.0, 0.1], [0.1, 0.2, 0.3]),
+    "u and v of other shapes": lambda: periodic.from_state(pair(), [0.0, 0.1], [0.1, 0.2, 0.3]),
     "r with Hunt-Crossley": lambda: vijax.trajectory(
         pair(), 0.05, -0.4, 4, method="ode", membrane=vijax.HuntCrossley(0.5)
     ),
@@ -531,7 +542,7 @@ SHAPES: dict[str, Callable[[], Any]] = {
     "mass of Harvester": lambda: vijax.Harvester(mass=1.0),
     "V of optimise": lambda: vijax.optimise(vijax.Harvester(V=0.0)),
     "device of several": lambda: vijax.optimise(vijax.Harvester(s=np.array([0.1, 0.2]))),
-    "kappa of a rigid wall": lambda: branch.follow(rigid_orbit(), "kappa", (3.0, 40.0)),
+    "kappa of a rigid wall": lambda: continuation.follow(rigid_orbit(), "kappa", (3.0, 40.0)),
 }
 
 # More than any machine holds, or would finish.
@@ -552,21 +563,21 @@ LARGE: dict[str, Callable[[], Any]] = {
     "keep of 10^9": lambda: vijax.orbit_diagram(along="d", values=[0.1, 0.2], periods=10**9, keep=10**9),
     "periods of 10^9 recorded": lambda: vijax.trajectory(pair(), 0.05, -0.4, 10**9),
     "periods of 10^8 and u0 of many": lambda: vijax.trajectory(pair(), np.zeros(10**4), -0.4, 10**7),
-    "samples of 10^9": lambda: orbit.path(an_orbit(), 10**9),
-    "guesses of 5005 sequences": lambda: orbit.search(pair(), "6:9", guesses=10**7),
-    "points of 10^9": lambda: branch.follow(an_orbit(), "d", (0.1, 0.3), points=10**9),
+    "samples of 10^9": lambda: periodic.path(an_orbit(), 10**9),
+    "guesses of 5005 sequences": lambda: periodic.search(pair(), "6:9", guesses=10**7),
+    "points of 10^9": lambda: continuation.follow(an_orbit(), "d", (0.1, 0.3), points=10**9),
     "steps and balls of 10^12": lambda: vijax.optimise(steps=10**6, balls=10**6),
     "samples of optimise": lambda: vijax.optimise(
         objective="mean", tolerances=[Tolerance("omega0", 0.05)], samples=10**12
     ),
-    "devices of many": lambda: design.optimise_all([vijax.Harvester()] * 10**4, steps=1000, balls=1000),
+    "devices of many": lambda: optimise.optimise_all([vijax.Harvester()] * 10**4, steps=1000, balls=1000),
 }
 
 
-def rigid_orbit() -> orbit.Orbit:
+def rigid_orbit() -> periodic.Orbit:
     """As `an_orbit`, between rigid walls."""
     soft = an_orbit()
-    return orbit.Orbit(**(vars(soft) | {"pair": vijax.impact_pair([0.2], None, [0.5])}))
+    return periodic.Orbit(**(vars(soft) | {"pair": vijax.impact_pair([0.2], None, [0.5])}))
 
 
 def calls() -> Iterator[Case]:

@@ -224,6 +224,7 @@ SHAPES = (
 )
 # What a line needs besides, so that the option is looked at.
 _WITH = {"into": ("--figure", "3")}
+_MODULES = {"paper": "paper.__main__"}
 _COMMANDS = {"grid": "power_map"}
 
 
@@ -244,4 +245,5 @@ def _run(script: str, arguments: tuple[str, ...]) -> int:
     """Exit code of a script, in this process."""
     import command
 
-    return command.run(getattr(import_module(script), _COMMANDS.get(script, script)), list(arguments))
+    module = import_module(_MODULES.get(script, script))
+    return command.run(getattr(module, _COMMANDS.get(script, script)), list(arguments))

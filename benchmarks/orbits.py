@@ -28,10 +28,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import vijax
-from vijax import branch
-from vijax import orbit as orbits
-from vijax.model import Harvester, ImpactPair, Status, impact_pair
-from vijax.shooting import Sequence
+from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.records import Status
+from vijax.orbits import continuation
+from vijax.orbits import periodic as orbits
+from vijax.orbits.shooting import Sequence
 
 DATA = Path(__file__).parent.parent / "tests" / "data"
 ORBITS = 150_000
@@ -79,7 +81,7 @@ def throughput() -> None:
     start = orbits.search(impact_pair(D, 40.0, 0.5), "RL", guesses=1024)
     start = orbits.halved(start[np.flatnonzero(np.asarray(orbits.symmetric(start)))])
     fast = start[jnp.argmax(start.knots[:, 0, 1], keepdims=True)]
-    (along,) = branch.follow(fast, "kappa", (3.0, 400.0))
+    (along,) = continuation.follow(fast, "kappa", (3.0, 400.0))
     say("the branch they lie on: kappa from, to", f"{along.values.min():.4g}, {along.values.max():.4g}")
     kappa = np.geomspace(max(along.values.min(), 3.0), min(along.values.max(), 400.0), ORBITS)
     order = np.argsort(along.values)
@@ -146,7 +148,7 @@ def bifurcations() -> None:
 def met(what: str, at: dict, impacts: str, along: str, within, kind: str, known: float, device=None) -> None:
     """The point of a kind nearest to the known one, on the branches from one orbit."""
     found = orbits.search(impact_pair(**at), impacts, guesses=1024)
-    points = [point for one in branch.family(found, along, within, device=device) for point in one.points]
+    points = [point for one in continuation.family(found, along, within, device=device) for point in one.points]
     point = min((point for point in points if point.kind == kind), key=lambda point: abs(point.value - known))
     value = {"flip": -1}.get(kind, 1)
     off = abs(complex(point.orbit.multipliers[0, 0]) - value)

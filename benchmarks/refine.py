@@ -30,7 +30,7 @@ import jax
 import numpy as np
 
 import vijax
-from vijax.label import label
+from vijax.model.label import label
 
 WITHIN = 0.01  # relative, of P
 GOALS = "at most 25 % computed, labels equal in 99.3 % of all cells, P within 1 % in 99 % of the periodic filled ones"

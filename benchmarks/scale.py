@@ -77,7 +77,7 @@ def study(side: int, settings: str, cores: int, workers: int | None = None, engi
     import vijax
 
     if not engine:
-        vijax.simulate.summarise = idle
+        vijax.batch.simulate.summarise = idle
     with tempfile.TemporaryDirectory() as folder:
         if workers is None:
             sweep(min(side, _WARM), settings, Path(folder) / "warm.zarr")
@@ -120,7 +120,7 @@ def idle(pair: Any, u0: Any, v0: Any, scale: Any, device: Any, **settings: Any) 
 def _numbers(cells: int, variants: int) -> Any:
     import jax
 
-    from vijax import simulate
+    from vijax.batch import simulate
 
     blank = simulate.blank(cells, variants, "float64")
     return jax.tree.map(lambda x: np.random.default_rng(0).random(x.shape).astype(x.dtype), blank)
@@ -150,7 +150,7 @@ def resume(side: int) -> float:
     confine(1)
     import vijax
 
-    vijax.simulate.summarise = idle
+    vijax.batch.simulate.summarise = idle
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "plane.zarr"
         sweep(side, "default", out)
@@ -162,7 +162,7 @@ def resume(side: int) -> float:
 
 def dealing(tasks: int) -> float:
     """Tasks a second that one driver and its scheduler come to, when workers have nothing to do but take them."""
-    from vijax import cluster
+    from vijax.planes import cluster
 
     os.cpu_count = lambda: _THREADS
     done = cluster.done(nothing, range(tasks + 1), 2)
@@ -177,13 +177,13 @@ def nothing(task: int) -> None:
 
 def weights(side: int) -> tuple[int, float]:
     """Bytes of a task, and bytes a cell that a driver holds of a plane whose kappa follows from two axes."""
-    from vijax import grid
-    from vijax import study as studies
+    from vijax.planes import sweep as sweeps
+    from vijax.planes import tiled_store as studies
 
     settings: dict[str, Any] = {"periods": 400, "until": "attractor", "transient": 0}
     settings |= {"wall": "soft", "method": "exact", "dtype": "float64"}
-    plain = grid.plan({"d": np.linspace(0.05, 0.3, side), "kappa": np.geomspace(3, 400, side)}, **settings)
-    physical = grid.plan({"omega": np.linspace(3, 9, side), "omega0": np.linspace(50, 400, side)}, **settings)
+    plain = sweeps.plan({"d": np.linspace(0.05, 0.3, side), "kappa": np.geomspace(3, 400, side)}, **settings)
+    physical = sweeps.plan({"omega": np.linspace(3, 9, side), "omega0": np.linspace(50, 400, side)}, **settings)
     with tempfile.TemporaryDirectory() as folder, studies.opened(plain, Path(folder) / "plane.zarr") as plane:
         return len(pickle.dumps(plane.tile(0))), len(pickle.dumps(physical)) / physical.count
 

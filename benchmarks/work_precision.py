@@ -30,9 +30,9 @@ import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
+from charts import work_precision
 
 import vijax
-from vijax.chart import work_precision
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]

@@ -21,7 +21,7 @@ from command import keep_compiled
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.dataset import Plan
+    from vijax.planes.dataset import Plan
 
 _DEFAULT_CELL = {"d": "0.2", "kappa": "3"}
 _DEFAULT_FILES = ("basins.zarr", "basins.png")
@@ -75,11 +75,11 @@ def basins(
         _agree(planned, yes)
     began = time.perf_counter()
     with command.progress(planned.count, "starts") as show:
-        from vijax import grid
+        from vijax.planes import sweep
 
-        swept = grid.run(planned, show)
+        swept = sweep.run(planned, show)
     pace = command.pace(planned.count, time.perf_counter() - began, "starts")
-    from vijax.attractor import matched
+    from vijax.planes.basins import matched
 
     dataset = matched(swept, merge_mirrors)
     command.finish(dataset, "\n".join([pace, *_summary(dataset)]), out, plot, _draw, overwrite)
@@ -88,7 +88,7 @@ def basins(
 def _plan(
     axes: dict[str, Any], device: Any, starts: int | None, speed: float | None, seed: int | None, **settings: Any
 ) -> "Plan":
-    from vijax.attractor import SPEED, plan_basins, plan_fractions
+    from vijax.planes.basins import SPEED, plan_basins, plan_fractions
 
     if starts is not None:
         speed = SPEED if speed is None else speed
@@ -100,22 +100,21 @@ def _plan(
 
 
 def _agree(planned: "Plan", yes: bool) -> None:
-    from vijax import estimate, grid
+    from vijax.planes import estimate, sweep
 
-    grid.check_room(planned)
+    sweep.check_room(planned)
     command.agree(estimate.of(planned), yes)
 
 
 def _check_picture(path: Path, planned: "Plan") -> None:
-    from vijax.panels import layout_of_kinds
-    from vijax.style import check_format
+    from vijax.plots.style import check_format, layout_of_kinds
 
     check_format(path)
     layout_of_kinds({dim: size for dim, size in planned.cells.sizes.items() if dim != "start"})
 
 
 def _draw(dataset: "xr.Dataset", path: Path) -> None:
-    from vijax import plot as pictures
+    from vijax.plots import maps as pictures
 
     (pictures.multistability_map if "start" in dataset.sizes else pictures.basin_map)(dataset, path)
 

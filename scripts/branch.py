@@ -20,9 +20,10 @@ import click
 import command
 
 if TYPE_CHECKING:
-    from vijax.branch import Branch
-    from vijax.model import Harvester, ImpactPair
-    from vijax.orbit import Orbit
+    from vijax.model.device import Harvester
+    from vijax.model.pair import ImpactPair
+    from vijax.orbits.continuation import Branch
+    from vijax.orbits.periodic import Orbit
 
 _DEFAULT_FILES = ("branch.zarr", "branch.png")
 _START = {"d": "0.2", "kappa": "400"}
@@ -65,9 +66,11 @@ def branch(
 
     With neither --out nor --plot, branch.zarr and branch.png are written.
     """
-    from vijax import branch as branches
-    from vijax import chart, checks, orbit
-    from vijax.style import check_format
+    from vijax.orbits import continuation as branches
+    from vijax.orbits import periodic
+    from vijax.plots import branches as pictures
+    from vijax.plots.style import check_format
+    from vijax.runtime import checks
 
     with command.door():
         store, picture = command.targets(out, plot, _DEFAULT_FILES, overwrite)
@@ -77,12 +80,12 @@ def branch(
         start = {} if name in command.DEVICE else _START
         pair, device = command.at_one_point(command.take_axes(given, start), command.device(constants), wall)
         checks.whole("generations", generations, 0, branches.MOST_GENERATIONS)
-        walls, _ = orbit.sequences(impacts)
-        orbit.check_guesses(guesses, len(walls))
+        walls, _ = periodic.sequences(impacts)
+        periodic.check_guesses(guesses, len(walls))
         with command.about("along"):
             branches.check_along(pair, name, within)
         places = list(_places(float(branches.value_at(pair, name, device)), name, within, chosen))
-        chart.check_branch_quantity(quantity)
+        pictures.check_branch_quantity(quantity)
         if picture is not None:
             check_format(picture)
     command.keep_compiled()
@@ -99,13 +102,14 @@ def branch(
     dataset = branches.dataset(followed, device)
 
     def draw(dataset: Any, path: Any) -> None:
-        chart.branches(dataset, path, quantity)
+        pictures.branches(dataset, path, quantity)
 
     command.finish(dataset, _summary(followed, seconds), store, picture, draw, overwrite)
 
 
 def _bounds(along: str) -> tuple[str, tuple[float, float]]:
-    from vijax.axes import AXES, parse_axis
+    from vijax.model.quantities import AXES
+    from vijax.planes.axes import parse_axis
 
     name, sign, text = along.partition("=")
     if not sign or name not in AXES or text.count(":") != 1:
@@ -130,11 +134,11 @@ def _found(
     pair: "ImpactPair", name: str, places: list[float], device: "Harvester", impacts: str, guesses: int
 ) -> "Orbit":
     """The orbits at the first place that has any."""
-    from vijax import branch as branches
-    from vijax import orbit
+    from vijax.orbits import continuation as branches
+    from vijax.orbits import periodic
 
     for place in places:
-        if len(found := orbit.search(branches.pair_at(pair, name, place, device), impacts, guesses=guesses)):
+        if len(found := periodic.search(branches.pair_at(pair, name, place, device), impacts, guesses=guesses)):
             return found
     tried = ", ".join(f"{place:.6g}" for place in places)
     raise ValueError(
@@ -145,12 +149,12 @@ def _found(
 
 def _summary(followed: "list[Branch]", seconds: float) -> str:
     """Each branch in a line: its label, its range, how much of it is stable, what it met, how it ends."""
-    from vijax import orbit
-    from vijax.label import label
+    from vijax.model.label import label
+    from vijax.orbits import periodic
 
     lines = [command.pace(sum(len(one.values) for one in followed), seconds, "orbits")]
     for one in followed:
-        counts = orbit.counts(one.orbit)
+        counts = periodic.counts(one.orbit)
         name = Counter(label(counts.period, counts.left, counts.right).tolist()).most_common(1)[0][0]
         met = ", ".join(f"{point.kind} {point.value:.8g}" for point in one.points) or "nothing"
         span = f"{one.along} {one.values.min():.6g} to {one.values.max():.6g}"

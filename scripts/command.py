@@ -24,8 +24,9 @@ import click
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.estimate import Estimate
-    from vijax.model import Harvester, ImpactPair
+    from vijax.model.device import Harvester
+    from vijax.model.pair import ImpactPair
+    from vijax.planes.estimate import Estimate
 
 _STARTED = time.perf_counter()
 _WAITING = logging.getLogger("vijax.waiting")
@@ -99,7 +100,7 @@ def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, A
         given: What click parsed, by name; the axes leave it.
         defaults: Texts of axes that count as given where no physical name is among those that are.
     """
-    from vijax.axes import parse_axis
+    from vijax.planes.axes import parse_axis
 
     axes = {name: given.pop(name) for name in list(given) if name in AXES}
     texts = {name: text for name, text in axes.items() if text is not None}
@@ -111,8 +112,8 @@ def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, A
 
 def device(constants: Iterable[str]) -> "Harvester":
     """The device of Tables I and II with other constants, each written NAME=VALUE, with a unit or in SI."""
-    from vijax import units
-    from vijax.model import Harvester, with_constants
+    from vijax.model import units
+    from vijax.model.device import Harvester, with_constants
 
     values = {}
     for text in constants:
@@ -153,9 +154,10 @@ def part(option: str, text: str) -> float:
 
 def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft") -> "tuple[ImpactPair, Harvester]":
     """The pair that the axes give, each by one number, and the device that has it."""
-    from vijax import checks
-    from vijax.axes import cells
-    from vijax.model import WALLS, impact_pair, with_constants, with_pair
+    from vijax.model.device import with_constants, with_pair
+    from vijax.model.pair import WALLS, impact_pair
+    from vijax.planes.axes import cells
+    from vijax.runtime import checks
 
     for name, values in axes.items():
         if values.size != 1:
@@ -178,7 +180,7 @@ def targets(
 ) -> tuple[Path | None, Path | None]:
     """Store and picture to write, both defaults where neither was given; raises unless they can be written.
 
-    With `goes_on` a store that is there is left to `study.check`, and its picture is drawn again if vijax drew it.
+    With `goes_on` a store that is there is left to `tiled_store.check`; its picture is drawn again if vijax drew it.
     """
     if out is None and plot is None:
         out, plot = defaults
@@ -188,8 +190,8 @@ def targets(
 
 
 def _store(out: str, ending: str, overwrite: bool, goes_on: bool) -> Path:
-    from vijax.files import check_ending, check_output
-    from vijax.store import check_place, check_store
+    from vijax.planes.store import check_place, check_store
+    from vijax.runtime.files import check_ending, check_output
 
     if ending != ".zarr":
         check_ending("out", out, ending)
@@ -199,8 +201,8 @@ def _store(out: str, ending: str, overwrite: bool, goes_on: bool) -> Path:
 
 
 def _picture(plot: str, overwrite: bool, again: bool) -> Path:
-    from vijax.files import check_output
-    from vijax.style import is_drawn
+    from vijax.plots.style import is_drawn
+    from vijax.runtime.files import check_output
 
     picture = check_output("plot", plot, overwrite or again)
     if again and picture.exists() and not is_drawn(picture):
@@ -290,7 +292,7 @@ def finish(
 ) -> None:
     """Write the store, unless the run did, and the picture; say what was found and written, and how long it took."""
     if out is not None and not kept:
-        from vijax.store import save
+        from vijax.planes.store import save
 
         save(dataset, out, overwrite=overwrite)
     if plot is not None:
@@ -319,7 +321,7 @@ def flags(variable: "xr.DataArray") -> str:
 
 def statuses(variable: "xr.DataArray", of: str = "cells") -> str:
     """How often each status occurs; below, what to do about those that are not OK."""
-    from vijax.model import Status
+    from vijax.model.records import Status
 
     lines = [f"{of} by status: {flags(variable)}"]
     found = [status for status in Status if status != Status.OK and (variable == status).any()]

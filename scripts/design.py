@@ -21,9 +21,9 @@ import numpy as np
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.design import Design
-    from vijax.model import Harvester
-    from vijax.tolerance import Tolerance
+    from vijax.design.optimise import Design
+    from vijax.design.tolerance import Tolerance
+    from vijax.model.device import Harvester
 
 _DEFAULT_FILES = ("design.json", "design.png")
 _POINTS, _NEAR = 320, 160  # of the picture, and of its close view
@@ -81,10 +81,11 @@ def design(
     **given: Any,
 ) -> None:
     """Find the membrane, and what else is tuned, that harvests most and can be built."""
-    from vijax import blueprint, report
-    from vijax import design as designs
-    from vijax.files import write_json
-    from vijax.style import check_format
+    from vijax.design import optimise as designs
+    from vijax.design import report
+    from vijax.plots import designs as pictures
+    from vijax.plots.style import check_format
+    from vijax.runtime.files import write_json
 
     with command.door():
         written, picture = command.targets(out, plot, _DEFAULT_FILES, overwrite, ".json")
@@ -126,9 +127,9 @@ def design(
     if written is not None:
         write_json(whole, written)
     if picture is not None and diagram is not None:
-        blueprint.design(diagram, whole, picture)
+        pictures.design(diagram, whole, picture)
     elif picture is not None:
-        blueprint.design_map(whole, picture)
+        pictures.design_map(whole, picture)
     climbed = f"{sum(one.starts for one in found):,} ascents in {seconds:.1f} s"
     lines = report.lines(whole) if along is None else report.table(whole)
     command.close("\n".join([climbed, *lines]), written, picture)
@@ -138,8 +139,9 @@ def _devices(
     over: str | None, axes: dict[str, Any], device: "Harvester", names: tuple[str, ...]
 ) -> "tuple[tuple[str, np.ndarray] | None, list[Harvester]]":
     """The axis along which designs are wanted, if there is one, and the device at each of its values."""
-    from vijax.axes import AXES, parse_axis
-    from vijax.tuning import constant
+    from vijax.design.variables import constant
+    from vijax.model.quantities import AXES
+    from vijax.planes.axes import parse_axis
 
     if over is None:
         return None, [command.at_one_point(axes, device)[1]]
@@ -157,8 +159,8 @@ def _devices(
 
 def _bounds(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
     """Bounds written NAME=LO:HI."""
-    from vijax.axes import parse_axis
-    from vijax.tuning import NAMES
+    from vijax.design.variables import NAMES
+    from vijax.planes.axes import parse_axis
 
     found = {}
     for text in texts:
@@ -173,7 +175,7 @@ def _bounds(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
 
 def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
     """Tolerances written NAME=5%, NAME=0.05 or NAME=5%:lognormal, apart by commas."""
-    from vijax.tolerance import Tolerance, check_tolerances
+    from vijax.design.tolerance import Tolerance, check_tolerances
 
     found = []
     for text in (item.strip() for several in texts for item in several.split(",")):
@@ -188,10 +190,10 @@ def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
 
 def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
     """P up and down along the first tuned axis, closer by about the best design, all else as there."""
-    from vijax.axes import AXES
-    from vijax.blueprint import close_view
-    from vijax.diagram import orbit_diagram
-    from vijax.tuning import LINEAR, limits
+    from vijax.design.variables import LINEAR, limits
+    from vijax.model.quantities import AXES
+    from vijax.planes.orbit_diagram import orbit_diagram
+    from vijax.plots.designs import close_view
 
     along = next((name for name in found.tune if name in AXES), "omega0")
     device = found.best.device if found.best else device
@@ -206,8 +208,8 @@ def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
 
 def _judged(found: "Design", scatter: "tuple[Tolerance, ...]", alone: bool) -> dict[str, Any]:
     """What becomes of the best design over the tolerances; what lies around it, where it is the only one."""
-    from vijax.design import under
-    from vijax.surroundings import surroundings
+    from vijax.design.optimise import under
+    from vijax.design.robustness import surroundings
 
     if found.best is None:
         return {"tolerances": scatter}

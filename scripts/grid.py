@@ -25,8 +25,8 @@ from command import flags, keep_compiled, tally
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.compare import Comparison
-    from vijax.dataset import Plan
+    from vijax.planes.compare import Comparison
+    from vijax.planes.dataset import Plan
 
 _DEFAULT_PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
 _METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", "chi", "exponent")
@@ -120,7 +120,7 @@ def power_map(
         keep_compiled()
         _agree(planned, yes)
     if plot is not None:
-        command.import_beside("vijax.plot")
+        command.import_beside("vijax.plots.maps")
     dataset, pace = _run(planned, out, overwrite, crew)
     summary = (_summary if compare is None else _comparison_summary)(dataset)
     kept = compare is None
@@ -131,8 +131,8 @@ def _crew(
     planned: "Plan | Comparison", workers: int | None, scheduler: str | None, out: Path | None
 ) -> int | str | None:
     """Who runs the tiles, unless this process does."""
-    from vijax.compare import Comparison
-    from vijax.grid import check_workers
+    from vijax.planes.compare import Comparison
+    from vijax.planes.sweep import check_workers
 
     if workers is not None and scheduler is not None:
         raise ValueError(f"workers must be left out with scheduler, which has its own; got {workers}")
@@ -146,27 +146,27 @@ def _crew(
 
 
 def _check_room(planned: "Plan | Comparison", out: Path | None, overwrite: bool) -> None:
-    from vijax import grid
-    from vijax.compare import Comparison
+    from vijax.planes import sweep
+    from vijax.planes.compare import Comparison
 
     if isinstance(planned, Comparison):
-        grid.check_room(planned.soft)
+        sweep.check_room(planned.soft)
     elif out is None:
-        grid.check_room(planned)
+        sweep.check_room(planned)
     else:
-        grid.check(planned, out, overwrite)
+        sweep.check(planned, out, overwrite)
 
 
 def _agree(planned: "Plan | Comparison", yes: bool) -> None:
-    from vijax import estimate
-    from vijax.compare import Comparison
+    from vijax.planes import estimate
+    from vijax.planes.compare import Comparison
 
     plans = (planned.soft, planned.rigid) if isinstance(planned, Comparison) else (planned,)
     command.agree(estimate.of(*plans), yes)
 
 
 def _check_show(show: str, compare: str | None, until: str) -> None:
-    from vijax.dataset import OUTPUTS
+    from vijax.planes.dataset import OUTPUTS
 
     if show != "label" and show not in OUTPUTS:
         raise ValueError(f"show must be label, or among {', '.join(OUTPUTS)}; got {show!r}")
@@ -179,14 +179,14 @@ def _check_show(show: str, compare: str | None, until: str) -> None:
 def _wanted(outputs: str | None, show: str) -> list[str] | None:
     if outputs is not None:
         return [name.strip() for name in outputs.split(",")]
-    from vijax.dataset import ON_REQUEST, OUTPUTS
+    from vijax.planes.dataset import ON_REQUEST, OUTPUTS
 
     shown = "lyapunov" if show == "label" else show
     return [name for name in OUTPUTS if name not in ON_REQUEST or name == shown]
 
 
 def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, settings: dict[str, Any]) -> "Plan":
-    from vijax.grid import plan
+    from vijax.planes.sweep import plan
 
     settings["membrane"] = _membrane(settings["membrane"], settings.pop("chi"), settings.pop("exponent"))
     return plan(axes, outputs, device, **settings)
@@ -200,7 +200,7 @@ def _comparison(
     tolerance: str | None,
     settings: dict[str, Any],
 ) -> "Comparison":
-    from vijax.compare import plan
+    from vijax.planes.compare import plan
 
     if other != "rigid":
         raise ValueError(f'compare must be "rigid"; got {other!r}')
@@ -217,7 +217,7 @@ def _comparison(
 
 
 def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
-    from vijax.membrane import HuntCrossley, Linear
+    from vijax.model.membrane import HuntCrossley, Linear
 
     if name == "hunt-crossley":
         if chi is None:
@@ -232,28 +232,28 @@ def _membrane(name: str | None, chi: float | None, exponent: float | None) -> An
 
 
 def _check_picture(path: Path, planned: "Plan | Comparison", show: str) -> None:
-    from vijax import panels
-    from vijax.compare import Comparison
-    from vijax.dataset import specimen
-    from vijax.style import check_format
+    from vijax.planes.compare import Comparison
+    from vijax.planes.dataset import specimen
+    from vijax.plots import style
+    from vijax.plots.style import check_format
 
     check_format(path)
     if isinstance(planned, Comparison):
-        panels.layout(planned.soft.cells.sizes)
+        style.layout(planned.soft.cells.sizes)
         return
-    needs = {"label": panels.LABEL_NEEDS, "P": panels.NEEDS}.get(show, (show,))
+    needs = {"label": style.LABEL_NEEDS, "P": style.NEEDS}.get(show, (show,))
     missing = [name for name in needs if name not in planned.outputs]
     if missing:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
     sizes = planned.cells.sizes
     if show == "label":
-        panels.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
+        style.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
         return
     if show == "P":
-        panels.layout(sizes)
+        style.layout(sizes)
         return
     drawn = specimen(planned)[show]  # its dimensions are those that it depends on
-    fits = panels.layout_of_kinds if panels.is_kind(drawn) else panels.layout
+    fits = style.layout_of_kinds if style.is_kind(drawn) else style.layout
     fits({str(dim): sizes[str(dim)] for dim in drawn.dims})
 
 
@@ -261,8 +261,8 @@ def _run(
     planned: "Plan | Comparison", out: Path | None, overwrite: bool, crew: int | str | None
 ) -> "tuple[xr.Dataset, str]":
     """The map, and how fast it was made."""
-    from vijax import grid
-    from vijax.compare import Comparison, run
+    from vijax.planes import sweep
+    from vijax.planes.compare import Comparison, run
 
     told: list[int] = []  # cells done, at first those that a store held already
 
@@ -273,13 +273,15 @@ def _run(
             show(done, total)
 
         began = time.perf_counter()
-        found = run(planned, tell) if isinstance(planned, Comparison) else grid.run(planned, tell, out, overwrite, crew)
+        found = (
+            run(planned, tell) if isinstance(planned, Comparison) else sweep.run(planned, tell, out, overwrite, crew)
+        )
     pace = command.pace(told[-1] - told[0], time.perf_counter() - began)
     return found, f"{pace}, {told[0]:,} were there" if told[0] else pace
 
 
 def _draw(picture: str, dataset: "xr.Dataset", path: Path) -> None:
-    from vijax import plot as pictures
+    from vijax.plots import maps as pictures
 
     known = {"P": pictures.power_map, "label": pictures.label_map, "difference": pictures.difference_map}
     if picture in known:
@@ -290,7 +292,7 @@ def _draw(picture: str, dataset: "xr.Dataset", path: Path) -> None:
 
 def _summary(dataset: "xr.Dataset") -> str:
     """What the map holds, in a few lines: cells by status and by period, the best of them."""
-    from vijax.dataset import best
+    from vijax.planes.dataset import best
 
     lines = [command.statuses(dataset["status"])]
     if "computed" in dataset:

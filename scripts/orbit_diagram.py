@@ -20,7 +20,7 @@ import command
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.diagram import Diagram
+    from vijax.planes.orbit_diagram import Diagram
 
 _DEFAULT_ALONG = "d=0.3:0.05:126"
 _DEFAULT_FILES = ("orbit_diagram.zarr", "orbit_diagram.png")
@@ -68,11 +68,11 @@ def orbit_diagram(
         store, picture = command.targets(out, plot, _DEFAULT_FILES, overwrite)
         diagram = _plan(along, command.take_axes(given, {}), command.device(constants), given)
         if picture is not None:
-            from vijax import chart
-            from vijax.style import check_format
+            from vijax.plots import orbit_diagrams
+            from vijax.plots.style import check_format
 
-            chart.check_quantity(quantity)
-            chart.check_layout(diagram.along, diagram.dims)
+            orbit_diagrams.check_quantity(quantity)
+            orbit_diagrams.check_layout(diagram.along, diagram.dims)
             check_format(picture)
         command.keep_compiled()
         command.agree(diagram.expected, yes)
@@ -81,14 +81,15 @@ def orbit_diagram(
     seconds = time.perf_counter() - began
 
     def draw(dataset: "xr.Dataset", path: Any) -> None:
-        chart.orbit_diagram(dataset, path, quantity)
+        orbit_diagrams.orbit_diagram(dataset, path, quantity)
 
     command.finish(dataset, _summary(dataset, diagram.count, seconds), store, picture, draw, overwrite)
 
 
 def _plan(along: str, axes: dict[str, Any], device: Any, settings: dict[str, Any]) -> "Diagram":
-    from vijax.axes import AXES, parse_axis
-    from vijax.diagram import plan
+    from vijax.model.quantities import AXES
+    from vijax.planes.axes import parse_axis
+    from vijax.planes.orbit_diagram import plan
 
     name, sign, text = along.partition("=")
     if not sign or name not in AXES:
@@ -101,7 +102,7 @@ def _plan(along: str, axes: dict[str, Any], device: Any, settings: dict[str, Any
 
 
 def _run(diagram: "Diagram") -> "xr.Dataset":
-    from vijax.diagram import run
+    from vijax.planes.orbit_diagram import run
 
     with command.progress(diagram.count, "points") as show:
         return run(diagram, show)
@@ -109,7 +110,7 @@ def _run(diagram: "Diagram") -> "xr.Dataset":
 
 def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
     """What the diagram holds, in a few lines: points by how they ended and by label, the time."""
-    from vijax.label import label
+    from vijax.model.label import label
 
     labels = Counter(
         label(*(dataset[name].values for name in ("period", "impacts_left", "impacts_right", "status"))).ravel()

@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 
-from vijax import exact, simulate
-from vijax.model import ImpactPair, State
+from vijax.batch import simulate
+from vijax.engine import exact
+from vijax.model.pair import ImpactPair
+from vijax.model.records import State
 
 DATA = Path(__file__).parent / "data"
 SCRIPTS = Path(__file__).parent.parent / "scripts"

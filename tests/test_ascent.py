@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax.ascent import Box, Climb, Look, ascend
+from vijax.design.ascent import Box, Climb, Look, ascend
 
 LOOKS = 60
 BOX = Box(jnp.full((1, 2), -2.0), jnp.full((1, 2), 2.0), 0.3)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vijax import attractor, grid
-from vijax.attractor import basin_fractions, basins, matched, plan_basins, plan_fractions
-from vijax.model import Status
+from vijax.model.records import Status
+from vijax.planes import basins as tables
+from vijax.planes import sweep
+from vijax.planes.basins import basin_fractions, basins, matched, plan_basins, plan_fractions
 
 NOISE = 1e-10  # of invariants from start to start; the engine's is below 3e-11
 
@@ -23,7 +24,7 @@ def planted(kinds, which, dims=("d", "u0", "v0"), noise=NOISE, **further):
     found = {}
     for name, usual in blank.items():
         values = np.array([kind.get(name, usual) for kind in kinds])[which]
-        if name in attractor._INVARIANTS:
+        if name in tables._INVARIANTS:
             values = values * (1 + noise * random.uniform(-1, 1, which.shape))
         found[name] = (dims, values)
     return xr.Dataset(found | further)
@@ -168,7 +169,7 @@ def test_a_plane_covers_the_widest_gap_unless_told():
     ],
 )
 def test_bad_input_runs_nothing(monkeypatch, call, say):
-    monkeypatch.setattr(grid, "run", None)
+    monkeypatch.setattr(sweep, "run", None)
     with pytest.raises((ValueError, TypeError), match=say):
         call()
 
@@ -194,7 +195,7 @@ def test_three_attractors_coexist_in_known_shares():
 
 def test_the_sign_of_the_mean_impact_velocity_tells_mirror_images_apart():
     settings = {"starts": 500, "speed": 0.6, "seed": None, "periods": 200, "wall": "soft"}
-    swept = grid.run(plan_fractions({"d": [0.2, 0.3], "kappa": 3.0, "r": 0.5}, **settings)).isel(d=0)
+    swept = sweep.run(plan_fractions({"d": [0.2, 0.3], "kappa": 3.0, "r": 0.5}, **settings)).isel(d=0)
     few, many, both = (
         swept["asymmetry"].values[(swept["impacts_left"] == left) & (swept["impacts_right"] == right)]
         for left, right in ((1, 2), (2, 1), (2, 2))

@@ -6,7 +6,7 @@ import basins as script
 import numpy as np
 import pytest
 
-from vijax import grid
+from vijax.planes import sweep
 
 TINY = ["--d", "0.2", "--kappa", "3", "--periods", "200"]
 
@@ -38,7 +38,7 @@ BAD = [
 
 @pytest.mark.parametrize(("arguments", "say"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
 def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, monkeypatch, arguments, say):
-    monkeypatch.setattr(grid, "run", None)  # nothing may run
+    monkeypatch.setattr(sweep, "run", None)  # nothing may run
     assert script.main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -55,7 +55,7 @@ def test_the_default_is_the_whole_gap(folder, monkeypatch):
         plans.append(plan)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(grid, "run", run)
+    monkeypatch.setattr(sweep, "run", run)
     monkeypatch.setattr("os._exit", lambda code: None)
     script.main([])
     (plan,) = plans
@@ -72,7 +72,7 @@ def test_the_default_is_the_whole_gap(folder, monkeypatch):
 def test_a_plane_of_starts_to_store_picture_and_table(folder, capsys):
     assert script.main([*TINY, "--v0=-0.6:0.6:24", "--merge-mirrors"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["basins.png", "basins.zarr"]
-    found = grid.load(folder / "basins.zarr")
+    found = sweep.load(folder / "basins.zarr")
     assert dict(found.sizes) == {"u0": 24, "v0": 24, "attractor": 3}
     said = capsys.readouterr().out
     assert "576 starts in" in said
@@ -84,7 +84,7 @@ def test_a_plane_of_starts_to_store_picture_and_table(folder, capsys):
 def test_a_plane_of_parameters_counts_attractors(folder, capsys):
     arguments = ["--d", "0.19,0.2", "--kappa", "3,3.2", "--periods", "200", "--starts", "40", "--plot", "map.png"]
     assert script.main([*arguments, "--out", "map.zarr"]) == 0
-    found = grid.load(folder / "map.zarr")
+    found = sweep.load(folder / "map.zarr")
     assert dict(found.sizes) == {"d": 2, "kappa": 2, "start": 40, "attractor": found.sizes["attractor"]}
     numbers, cells = np.unique(found.attractors, return_counts=True)
     tally = ", ".join(f"{number}: {count}" for number, count in zip(numbers, cells, strict=True))

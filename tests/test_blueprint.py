@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_rgba
 
-from vijax import blueprint
+from vijax.plots import designs
 
-GREEN = to_rgba(blueprint._STAR["color"])
+GREEN = to_rgba(designs._STAR["color"])
 
 
 def diagram(along="omega0", bounds=(20.0, 60.0)) -> xr.Dataset:
@@ -56,18 +56,18 @@ def span(axes, label):
 
 
 def test_the_optimum_its_band_its_edge_and_the_ascent_are_where_the_report_says(tmp_path):
-    figure = blueprint.design(diagram(), report(), tmp_path / "design.png")
+    figure = designs.design(diagram(), report(), tmp_path / "design.png")
     assert (tmp_path / "design.png").stat().st_size > 0
     for axes in figure.axes:
         np.testing.assert_allclose(line(axes, "optimum").get_xydata(), [[50, 1e-6]])
         np.testing.assert_allclose(line(axes, "ascent").get_xdata(), [58, 52, 50])
         assert set(line(axes, "fold").get_xdata()) == {45.0}
         assert span(axes, "tolerance") == (47.5, 52.5)
-    assert figure.axes[1].get_xlim() == pytest.approx(blueprint.close_view("omega0", 50.0))
+    assert figure.axes[1].get_xlim() == pytest.approx(designs.close_view("omega0", 50.0))
 
 
 def test_what_an_optimiser_without_constraints_would_report_is_marked_and_its_range_veiled():
-    figure = blueprint.design(diagram(), report())
+    figure = designs.design(diagram(), report())
     naive = line(figure.axes[0], "what $P$ alone would choose")
     np.testing.assert_allclose(naive.get_xydata(), [[35, 9e-6]])
     assert "9 $\\mu$J, 20 mm deep" in naive.get_label()
@@ -79,18 +79,18 @@ def test_what_an_optimiser_without_constraints_would_report_is_marked_and_its_ra
 
 def test_nothing_unphysical_is_shown_where_the_optimum_is_the_highest():
     highest = report()["highest"] | {"P": 0.5e-6}
-    assert not [word for word in words(blueprint.design(diagram(), report(highest=highest))) if "alone" in word]
+    assert not [word for word in words(designs.design(diagram(), report(highest=highest))) if "alone" in word]
 
 
 def test_the_edge_and_the_band_move_with_the_square_in_k():
     best = report()["best"] | {"values": {"k": 8.75}, "path": [[9.0], [8.75]], "heights": [0.9e-6, 1e-6]}
-    axes = blueprint.design(diagram("k", (5.0, 12.0)), report(best=best, tune=["k"])).axes[0]
+    axes = designs.design(diagram("k", (5.0, 12.0)), report(best=best, tune=["k"])).axes[0]
     assert span(axes, "tolerance") == (8.75 * 0.95**2, 8.75 * 1.05**2)
     np.testing.assert_allclose(line(axes, "fold").get_xdata(), 8.75 * 0.9**2)
 
 
 def test_without_an_optimum_the_curves_remain():
-    figure = blueprint.design(diagram(), report(best=None))
+    figure = designs.design(diagram(), report(best=None))
     assert len(figure.axes) == 1
     assert "optimum" not in " ".join(words(figure))
 
@@ -101,7 +101,7 @@ def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
     held[0]["best"]["active"] = ["penetration limit at the right wall"]
     held[3]["best"]["stopped"] = "stalled"
     found = {"over": {"name": "d", "values": [0.1, 0.2, 0.3, 0.4]}, "designs": held}
-    figure = blueprint.design_map(found, tmp_path / "map.png")
+    figure = designs.design_map(found, tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 0
     upper, lower = figure.axes
     assert words(figure) == [
@@ -121,7 +121,7 @@ def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
 
 
 def test_a_picture_of_another_kind_is_refused(tmp_path):
-    for draw in (lambda path: blueprint.design(diagram(), report(), path), lambda path: blueprint.design_map({}, path)):
+    for draw in (lambda path: designs.design(diagram(), report(), path), lambda path: designs.design_map({}, path)):
         with pytest.raises(ValueError, match="plot must end in"):
             draw(tmp_path / "picture.txt")
     assert not list(tmp_path.iterdir())

@@ -5,10 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax import branch, chart
-from vijax import orbit as orbits
-from vijax.model import Harvester, Status, impact_pair, with_constants
-from vijax.shooting import Sequence
+from vijax.model.device import Harvester, with_constants
+from vijax.model.pair import impact_pair
+from vijax.model.records import Status
+from vijax.orbits import continuation
+from vijax.orbits import periodic as orbits
+from vijax.orbits.shooting import Sequence
+from vijax.plots import branches as pictures
 
 SPAN = (0.1, 0.3)
 # Of the issue's reference: where the symmetric orbit breaks, and where two left and one right impact fold.
@@ -20,7 +23,7 @@ def family():
     """The symmetric period-1 orbits of rigid walls, closed half way, and what bifurcates from them."""
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
     start = orbits.solve(impact_pair([0.2], None, 0.5), half, jnp.array([[[0.15, 0.5, 0.0]]]))
-    return branch.family(start, "d", SPAN)
+    return continuation.family(start, "d", SPAN)
 
 
 def largest(point):
@@ -77,7 +80,7 @@ def test_grazing_ends_a_branch_where_the_ball_just_touches(family):
 
 def test_a_branch_goes_through_its_fold():
     found = orbits.search(impact_pair(0.19, None, 0.5), "RLL", guesses=32)
-    (one,) = branch.follow(found[:1], "d", SPAN, direction="up")
+    (one,) = continuation.follow(found[:1], "d", SPAN, direction="up")
     (fold,) = (point for point in one.points if point.kind == "fold")
     assert fold.value == pytest.approx(FOLD, abs=5e-6)
     assert abs(largest(fold) - 1) < 1e-5
@@ -86,7 +89,7 @@ def test_a_branch_goes_through_its_fold():
 
 
 def test_the_dataset_and_its_picture(family, tmp_path):
-    found = branch.dataset(family, Harvester())
+    found = continuation.dataset(family, Harvester())
     assert found.sizes["branch"] == len(family)
     assert found["d"].attrs["units"] == "1"
     first = family[0]
@@ -97,7 +100,7 @@ def test_the_dataset_and_its_picture(family, tmp_path):
         for number, point in enumerate(one.points):
             place = int(found["event_point"][index, number])
             assert np.nanmax(np.abs(one.orbit.knots[place, :, 1] - point.orbit.knots[0, :, 1])) < 0.02
-    chart.branches(found, tmp_path / "branches.png")
+    pictures.branches(found, tmp_path / "branches.png")
     assert (tmp_path / "branches.png").stat().st_size > 10_000
 
 
@@ -118,12 +121,12 @@ def test_the_dataset_and_its_picture(family, tmp_path):
 def test_bad_input_is_told(family, change, message):
     start = family[0].orbit[len(family[0].values) // 2 :][:1]
     with pytest.raises(ValueError, match=message):
-        branch.follow(start, **{"along": "d", "within": SPAN} | change)
+        continuation.follow(start, **{"along": "d", "within": SPAN} | change)
 
 
 def test_nothing_begins_at_a_grazing(family):
     with pytest.raises(ValueError, match="point must be a flip"):
-        branch.switch(points(family, "grazing flight")[0], "d", SPAN)
+        continuation.switch(points(family, "grazing flight")[0], "d", SPAN)
 
 
 DEVICE = Harvester(s=0.2, omega0=60.0, beta=0.01)
@@ -134,10 +137,12 @@ OTHER = {"omega": 3.3, "omega0": 70.0, "k": 10.0, "s": 0.21, "A": 1.2, "beta": -
 @pytest.mark.parametrize("wall", ["soft", "rigid"])
 def test_a_quantity_of_the_device_moves_the_pair_as_it_does_the_device(along, wall):
     pair = DEVICE.pair(wall)
-    assert float(branch.value_at(DEVICE.pair(), along, DEVICE)) == pytest.approx(getattr(DEVICE, along), rel=1e-14)
+    assert float(continuation.value_at(DEVICE.pair(), along, DEVICE)) == pytest.approx(
+        getattr(DEVICE, along), rel=1e-14
+    )
     if wall == "rigid" and along in ("omega0", "k"):
         return
-    there = branch.pair_at(pair, along, OTHER[along], DEVICE)
+    there = continuation.pair_at(pair, along, OTHER[along], DEVICE)
     for own, expected in zip(
         jax.tree.leaves(there), jax.tree.leaves(with_constants(DEVICE, **{along: OTHER[along]}).pair(wall)), strict=True
     ):
@@ -146,14 +151,14 @@ def test_a_quantity_of_the_device_moves_the_pair_as_it_does_the_device(along, wa
 
 def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     found = orbits.search(DEVICE.pair("rigid"), "RL", guesses=32)
-    (one,) = branch.follow(found[:1], "A", (1, 2), device=DEVICE, direction="up", points=8)
+    (one,) = continuation.follow(found[:1], "A", (1, 2), device=DEVICE, direction="up", points=8)
     assert one.values[0] == pytest.approx(1.0, abs=1e-14)
     assert one.values[-1] > 1.004
     assert (np.asarray(one.orbit.status) == Status.OK).all()
     shaken = with_constants(DEVICE, A=jnp.asarray(one.values)).pair("rigid")
     np.testing.assert_allclose(one.orbit.pair.d, shaken.d, rtol=1e-14)
     np.testing.assert_allclose(one.orbit.pair.gamma, shaken.gamma, rtol=1e-14)
-    table = branch.dataset([one], DEVICE)
+    table = continuation.dataset([one], DEVICE)
     assert table["A"].attrs["units"] == "m s-2"
     last = with_constants(DEVICE, A=float(one.values[-1]))
     assert float(table["P"][0, -1]) == pytest.approx(float(orbits.power(one.orbit[-1:], last)[0]), rel=1e-12)

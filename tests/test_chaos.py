@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vijax import grid
-from vijax.chaos import lyapunov, survival
+from vijax.planes import sweep
+from vijax.planes.chaos import lyapunov, survival
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ from vijax.chaos import lyapunov, survival
     ],
 )
 def test_bad_input_runs_nothing(monkeypatch, call, say):
-    monkeypatch.setattr(grid, "run", None)
+    monkeypatch.setattr(sweep, "run", None)
     with pytest.raises(ValueError, match=say):
         call()
 
@@ -62,7 +62,7 @@ def test_chaos_that_ends_at_random_has_its_mean_lifetime(monkeypatch):
         dims = ("d", "start")
         return xr.Dataset({"lyapunov": (dims, exponents), "impacts_per_period": (dims, impacts)})
 
-    monkeypatch.setattr(grid, "run", run)
+    monkeypatch.setattr(sweep, "run", run)
     found = survival(d=[0.2, 0.3, 0.4], starts=4000, periods=8000)
     assert found.after.values.tolist() == list(range(1000, 9000, 1000))
     error = float(found.lifetime_stderr[0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vijax import chart
+from vijax.plots import orbit_diagrams
 
 ALONG = {"units": "1", "symbol": "d"}
 
@@ -41,7 +41,7 @@ def points(line) -> set[tuple[float, float]]:
 
 def test_each_direction_has_its_panel_and_the_other_one_behind_it(tmp_path):
     ds = drawn()
-    figure = chart.orbit_diagram(ds, tmp_path / "diagram.png")
+    figure = orbit_diagrams.orbit_diagram(ds, tmp_path / "diagram.png")
     assert (tmp_path / "diagram.png").stat().st_size > 0
     down, up = figure.axes
     assert "falling" in down.get_title(loc="left")
@@ -60,7 +60,7 @@ def test_each_direction_has_its_panel_and_the_other_one_behind_it(tmp_path):
 
 
 def test_one_direction_of_one_value_needs_no_legend(tmp_path):
-    figure = chart.orbit_diagram(drawn(kappa=(40.0,), ways=("up",)), quantity="P")
+    figure = orbit_diagrams.orbit_diagram(drawn(kappa=(40.0,), ways=("up",)), quantity="P")
     assert len(figure.axes) == 1
     assert not figure.legends
     assert figure.axes[0].get_xlabel() == "$d$"
@@ -68,17 +68,20 @@ def test_one_direction_of_one_value_needs_no_legend(tmp_path):
 
 
 def test_energies_are_drawn_over_decades_and_speeds_are_not():
-    assert chart.orbit_diagram(drawn(), quantity="E").axes[0].get_yscale() == "log"
-    assert chart.orbit_diagram(drawn(), quantity="v_in").axes[0].get_yscale() == "linear"
+    assert orbit_diagrams.orbit_diagram(drawn(), quantity="E").axes[0].get_yscale() == "log"
+    assert orbit_diagrams.orbit_diagram(drawn(), quantity="v_in").axes[0].get_yscale() == "linear"
 
 
 @pytest.mark.parametrize(
     ("call", "say"),
     [
-        (lambda path: chart.orbit_diagram(drawn(), path, "speed"), "quantity must be among v_in"),
-        (lambda path: chart.orbit_diagram(drawn(kappa=range(1, 20)), path), "at most 10 values of kappa"),
-        (lambda path: chart.orbit_diagram(drawn(), path.with_suffix(".txt")), "plot must end in"),
-        (lambda path: chart.check_layout("d", {"direction": 2, "d": 9, "r": 2, "kappa": 3}), "besides d; got r, kappa"),
+        (lambda path: orbit_diagrams.orbit_diagram(drawn(), path, "speed"), "quantity must be among v_in"),
+        (lambda path: orbit_diagrams.orbit_diagram(drawn(kappa=range(1, 20)), path), "at most 10 values of kappa"),
+        (lambda path: orbit_diagrams.orbit_diagram(drawn(), path.with_suffix(".txt")), "plot must end in"),
+        (
+            lambda path: orbit_diagrams.check_layout("d", {"direction": 2, "d": 9, "r": 2, "kappa": 3}),
+            "besides d; got r, kappa",
+        ),
     ],
 )
 def test_what_cannot_be_drawn_is_said(tmp_path, call, say):

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from vijax import claims, evidence, figures
-from vijax.cached import diagram
-from vijax.paper import RIGID, Source
+from paper import claims, evidence, figures
+from paper.cached import diagram
+from paper.captions import RIGID, Source
 
 REFERENCE = {c["id"]: c for c in json.loads((Path(__file__).parent / "data" / "claims.json").read_text())}
 

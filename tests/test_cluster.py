@@ -19,8 +19,10 @@ import pytest
 import xarray as xr
 from helpers import SETTINGS, stand_in
 
-from vijax import cluster, grid, simulate, study
-from vijax.grid import load, sweep
+from vijax.batch import simulate
+from vijax.planes import cluster, tiled_store
+from vijax.planes import sweep as sweeps
+from vijax.planes.sweep import load, sweep
 
 AXES = {"d": np.linspace(0.1, 0.3, 5), "kappa": np.geomspace(3, 400, 4)}
 MOST = 6  # cells of a tile, here
@@ -30,7 +32,7 @@ MOST = 6  # cells of a tile, here
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(simulate, "summarise", stand_in)
-    monkeypatch.setattr(study, "LARGEST_TILE", MOST)
+    monkeypatch.setattr(tiled_store, "LARGEST_TILE", MOST)
     return tmp_path
 
 
@@ -73,7 +75,7 @@ def test_what_a_worker_raises_is_raised_here(folder, scheduler, monkeypatch):
     def full(tile, found, seconds):
         raise OSError(28, "No space left on device", "somewhere")
 
-    monkeypatch.setattr(study, "write", full)
+    monkeypatch.setattr(tiled_store, "write", full)
     with pytest.raises(OSError, match="No space left") as error:
         sweep(**AXES, out="map.zarr", workers=scheduler)
     assert error.value.filename == "somewhere"
@@ -117,10 +119,10 @@ def test_a_scheduler_that_is_lost_is_one_line(capfd, seconds):
 
 
 def test_a_tile_is_as_light_as_its_cells(folder, monkeypatch):
-    monkeypatch.setattr(study, "LARGEST_TILE", 1024)
+    monkeypatch.setattr(tiled_store, "LARGEST_TILE", 1024)
     side = 10_000
-    planned = grid.plan({"d": np.linspace(0.1, 0.3, side), "kappa": np.geomspace(3, 400, side)}, **SETTINGS)
-    with study.opened(planned, "map.zarr") as plane:
+    planned = sweeps.plan({"d": np.linspace(0.1, 0.3, side), "kappa": np.geomspace(3, 400, side)}, **SETTINGS)
+    with tiled_store.opened(planned, "map.zarr") as plane:
         sent = pickle.dumps(plane.tile(7))
     assert len(sent) < 20_000
     again = pickle.loads(sent)
@@ -130,11 +132,11 @@ def test_a_tile_is_as_light_as_its_cells(folder, monkeypatch):
 
 
 def test_a_tile_that_is_written_late_does_not_spoil_another_plane(folder):
-    with study.opened(grid.plan(AXES, **SETTINGS), "map.zarr") as plane:
+    with tiled_store.opened(sweeps.plan(AXES, **SETTINGS), "map.zarr") as plane:
         late = plane.tile(0)
     whole = sweep(**AXES, r=0.4, out="map.zarr", overwrite=True).load()
     with pytest.raises(FileExistsError, match="no longer the store that tile 0"):
-        grid._make(1024, late)
+        sweeps._make(1024, late)
     xr.testing.assert_identical(load("map.zarr"), whole)
 
 

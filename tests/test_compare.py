@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vijax import grid, plot
-from vijax.compare import SURE, Label, Model, cheapest_model, compare, plan, rigid_from, run
-from vijax.grid import load, save, sweep
-from vijax.model import Status
+from vijax.model.records import Status
+from vijax.planes import sweep as sweeps
+from vijax.planes.compare import SURE, Label, Model, cheapest_model, compare, plan, rigid_from, run
+from vijax.planes.sweep import load, save, sweep
+from vijax.plots import maps
 
 # Rigid walls at d 0.12: chaos; at 0.2: an orbit 2:1/1T that soft walls reach beyond kappa 1e3; above: the orbit 1:1/1T.
 AXES = {"d": [0.12, 0.2, 0.25, 0.3], "kappa": [4.0, 1e2, 1e3, 1e4, 1e5]}
@@ -42,7 +43,7 @@ def _run_on(values, kappa) -> xr.Dataset:
         return xr.Dataset(variables, coordinates, {"outputs": "", "wall": wall})
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(grid, "run", swept)
+        patch.setattr(sweeps, "run", swept)
         return run(plan({}, None, None, periods=1, until="attractor", transient=0, dtype="float64"))
 
 
@@ -201,7 +202,7 @@ def test_progress_counts_the_cells_of_both_walls():
 def test_a_comparison_comes_back_equal_and_is_drawn(found, tmp_path):
     save(found, tmp_path / "comparison.zarr")
     xr.testing.assert_identical(load(tmp_path / "comparison.zarr"), found)
-    figure = plot.difference_map(found, tmp_path / "comparison.png")
+    figure = maps.difference_map(found, tmp_path / "comparison.png")
     assert (tmp_path / "comparison.png").stat().st_size
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "rigid is enough within 1 %" in said
@@ -243,7 +244,7 @@ def test_from_arguments_to_store_and_picture(found, tmp_path, monkeypatch, capsy
     ],
 )
 def test_bad_input_runs_nothing(monkeypatch, given, say):
-    monkeypatch.setattr(grid, "run", None)
+    monkeypatch.setattr(sweeps, "run", None)
     with pytest.raises(ValueError, match=say):
         compare(**given)
 

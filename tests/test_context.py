@@ -16,8 +16,12 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax import branch, curve, energy, model, orbit, report, tolerance, tuning
-from vijax.model import membrane_pair
+from vijax.design import report, tolerance, variables
+from vijax.model import device as devices
+from vijax.model import energy
+from vijax.model import pair as pairs
+from vijax.model.pair import membrane_pair
+from vijax.orbits import continuation, motion, periodic
 
 ROOT = Path(__file__).parent.parent
 SETTINGS = {
@@ -44,7 +48,7 @@ def setting(request) -> Iterator[str]:
 def answers() -> Any:
     """What public functions of each kind say: planes on many threads, Newton with guesses that fail, closed forms."""
     device = vijax.Harvester()
-    found = orbit.search(device.pair(), "RL", guesses=64)
+    found = periodic.search(device.pair(), "RL", guesses=64)
     attracting = found[np.abs(np.asarray(found.multipliers)).max(axis=1) < 1]
     path = vijax.trajectory(vijax.impact_pair(0.2, 40.0, 0.5), 0.02, 0.3, periods=5)
     plane = vijax.sweep(d=[0.12, 0.2], kappa=40.0, r=0.5)
@@ -83,7 +87,7 @@ def test_settings_change_nothing_in_the_threads_of_a_program(plain, setting):
 def slopes() -> list[Any]:
     """Derivatives of both kinds of motion by a program's own closures."""
     device = vijax.Harvester()
-    known = orbit.search(device.pair(), "RL", guesses=64)
+    known = periodic.search(device.pair(), "RL", guesses=64)
     known = known[np.abs(np.asarray(known.multipliers)).max(axis=1) < 1][0]
     pair = vijax.impact_pair(0.2, 40.0, 0.5)
     return [
@@ -111,7 +115,7 @@ def test_a_door_looks_like_its_function():
 
 
 def test_an_orbit_in_single_precision_is_refused():
-    found = orbit.search(vijax.Harvester().pair(), "RL", guesses=64)[0]
+    found = periodic.search(vijax.Harvester().pair(), "RL", guesses=64)[0]
     single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, found)
     with pytest.raises(ValueError, match="orbit must hold 64 bits; got float32"):
         vijax.steady(vijax.Harvester(), single)
@@ -169,12 +173,12 @@ CLOSED_FORMS = {
     "ImpactPair": lambda: (PAIR.mu, PAIR.zeta, PAIR.omega1),
     "Harvester": lambda: (DEVICES.k, DEVICES.length_unit, DEVICES.speed_unit, DEVICES.pair()),
     "MembranePair": lambda: (MEMBRANE.length_unit, MEMBRANE.time_unit),
-    "model.impact_pair": lambda: vijax.impact_pair([0.1, 0.2], 40.0, 0.3),
-    "model.damping_ratio": lambda: model.damping_ratio(NUMBERS),
-    "model.with_pair": lambda: model.with_pair(vijax.Harvester(), PAIR),
-    "model.with_constants": lambda: model.with_constants(vijax.Harvester(), k=NUMBERS),
-    "model.membrane_pair": lambda: membrane_pair(PAIR),
-    "model.from_membrane_pair": lambda: model.from_membrane_pair(MEMBRANE),
+    "pair.impact_pair": lambda: vijax.impact_pair([0.1, 0.2], 40.0, 0.3),
+    "pair.damping_ratio": lambda: pairs.damping_ratio(NUMBERS),
+    "device.with_pair": lambda: devices.with_pair(vijax.Harvester(), PAIR),
+    "device.with_constants": lambda: devices.with_constants(vijax.Harvester(), k=NUMBERS),
+    "pair.membrane_pair": lambda: membrane_pair(PAIR),
+    "pair.from_membrane_pair": lambda: pairs.from_membrane_pair(MEMBRANE),
     "energy.stretch": lambda: energy.stretch(vijax.Harvester(), NUMBERS),
     "energy.capacitance": lambda: energy.capacitance(vijax.Harvester(), NUMBERS),
     "energy.harvested_energy": lambda: energy.harvested_energy(vijax.Harvester(), NUMBERS),
@@ -184,28 +188,28 @@ CLOSED_FORMS = {
     "energy.energy_ratio": lambda: energy.energy_ratio(NUMBERS, 3 * NUMBERS),
     # Equal in single precision, and admissible there.
     "energy.admissible": lambda: energy.admissible(vijax.Harvester(), PAIR.d, np.array([0.2, 0.3 * (1 - 1e-9)]), 0.0),
-    "tuning.values": lambda: tuning.values(("omega0", "beta"), np.array([[1.0, 2.0], [3.0, 4.0]])),
-    "tuning.tuned": lambda: tuning.tuned(vijax.Harvester(), ("k", "d"), NUMBERS),
-    "tuning.value_of": lambda: [tuning.value_of(DEVICES, name) for name in tuning.NAMES],
-    "tuning.limits": lambda: tuning.limits(("k", "d"), {}, vijax.Harvester()),
-    "branch.value_at": lambda: branch.value_at(PAIR, "omega", vijax.Harvester()),
-    "branch.pair_at": lambda: branch.pair_at(PAIR, "omega", 7.0, vijax.Harvester()),
-    "orbit.depth_unit": lambda: orbit.depth_unit(two_orbits(), DEVICES),
-    "orbit.power": lambda: orbit.power(two_orbits(), vijax.Harvester()),
+    "variables.values": lambda: variables.values(("omega0", "beta"), np.array([[1.0, 2.0], [3.0, 4.0]])),
+    "variables.tuned": lambda: variables.tuned(vijax.Harvester(), ("k", "d"), NUMBERS),
+    "variables.value_of": lambda: [variables.value_of(DEVICES, name) for name in variables.NAMES],
+    "variables.limits": lambda: variables.limits(("k", "d"), {}, vijax.Harvester()),
+    "continuation.value_at": lambda: continuation.value_at(PAIR, "omega", vijax.Harvester()),
+    "continuation.pair_at": lambda: continuation.pair_at(PAIR, "omega", 7.0, vijax.Harvester()),
+    "periodic.depth_unit": lambda: periodic.depth_unit(two_orbits(), DEVICES),
+    "periodic.power": lambda: periodic.power(two_orbits(), vijax.Harvester()),
     "Orbit": lambda: (two_orbits()[:1], two_orbits().count),
-    "curve.curve": lambda: curve.curve(vijax.impact_pair(0.2, 40.0, 0.5), NUMBERS, [1, 1], NUMBERS, NUMBERS, NUMBERS),
+    "motion.curve": lambda: motion.curve(vijax.impact_pair(0.2, 40.0, 0.5), NUMBERS, [1, 1], NUMBERS, NUMBERS, NUMBERS),
     "report.describe": lambda: plain_numbers(report.describe(designed())),
     "tolerance.nodes": lambda: tolerance.nodes((tolerance.Tolerance("s", 0.1),))[1:],
 }
 
 
 @cache
-def two_orbits() -> orbit.Orbit:
-    return orbit.search(vijax.Harvester().pair(), "RL", guesses=64)[:2]
+def two_orbits() -> periodic.Orbit:
+    return periodic.search(vijax.Harvester().pair(), "RL", guesses=64)[:2]
 
 
 @cache
-def designed() -> vijax.design.Design:
+def designed() -> vijax.design.optimise.Design:
     return vijax.optimise(vijax.Harvester(s=0.2), steps=8, balls=2, impacts=2, looks=6)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax.curve import curve, states
+from vijax.orbits.motion import curve, states
 
 PERIODS = 6
 

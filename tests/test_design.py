@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax import design, objective
-from vijax import report as reports
-from vijax import surroundings as around
-from vijax.files import write_json
-from vijax.model import Harvester, Status
-from vijax.objective import Batch, Scene
-from vijax.tolerance import Tolerance, nodes
+from vijax.design import objective, optimise
+from vijax.design import report as reports
+from vijax.design import robustness as around
+from vijax.design.objective import Batch, Scene
+from vijax.design.tolerance import Tolerance, nodes
+from vijax.model.device import Harvester
+from vijax.model.records import Status
+from vijax.runtime.files import write_json
 
 FAST = Harvester(A=3.0, omega=10 * math.pi, V=1700.0)
 FAST = dataclasses.replace(FAST, s=0.2 * FAST.length_unit)
@@ -37,7 +38,7 @@ def kappa(optimum):
 @pytest.fixture(scope="module")
 def found():
     """Both devices in one call; with `impacts` as low as here little is compiled."""
-    return design.optimise_all([FAST, PAPER], steps=128, balls=2, impacts=2)
+    return optimise.optimise_all([FAST, PAPER], steps=128, balls=2, impacts=2)
 
 
 def test_the_small_fast_device(found):
@@ -119,24 +120,24 @@ def test_a_supremum_is_no_maximum(found):
 
 def test_tolerances_of_a_design(found):
     best = found[0].best
-    narrow = design.under(best, [Tolerance("omega0", 0.05)])
+    narrow = optimise.under(best, [Tolerance("omega0", 0.05)])
     assert narrow.lost == narrow.inadmissible == 0
     assert narrow.worst < narrow.mean < best.height
     # The orbit ends 7.8 % below: of a wider distribution some devices fall off.
-    wide = design.under(best, [Tolerance("omega0", 0.1)])
+    wide = optimise.under(best, [Tolerance("omega0", 0.1)])
     assert wide.lost == pytest.approx((0.1 - 0.078) / 0.2, abs=0.06)
     assert wide.worst == 0
 
 
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
-    robust = design.optimise(
+    robust = optimise.optimise(
         FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, steps=128, balls=1, impacts=2
     ).best
     nominal = found[0].best
-    assert robust.height > design.under(nominal, tolerance).worst
+    assert robust.height > optimise.under(nominal, tolerance).worst
     assert float(robust.state.P) < nominal.height
-    assert design.under(robust, tolerance).worst == pytest.approx(robust.height, rel=1e-12)
+    assert optimise.under(robust, tolerance).worst == pytest.approx(robust.height, rel=1e-12)
     # At the kink both ends of the tolerance yield alike: no step along kappa raises both.
     assert robust.values["omega0"] > nominal.values["omega0"]
 
@@ -157,16 +158,16 @@ def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
 )
 def test_bad_input_is_told(settings, words):
     with pytest.raises(ValueError, match=words):
-        design.optimise(FAST, **settings)
+        optimise.optimise(FAST, **settings)
 
 
 def test_devices_that_cannot_be_designed_are_told():
     with pytest.raises(ValueError, match="must hold at least one"):
-        design.optimise_all([])
+        optimise.optimise_all([])
     with pytest.raises(ValueError, match="V must not be zero"):
-        design.optimise(dataclasses.replace(FAST, V=0.0))
+        optimise.optimise(dataclasses.replace(FAST, V=0.0))
     with pytest.raises(ValueError, match="must be one number; got shape"):
-        design.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
+        optimise.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
 
 
 def test_weighing_basins_moves_away_from_where_few_starts_lead(found, monkeypatch):

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax import diagram
-from vijax.diagram import orbit_diagram
-from vijax.label import label
-from vijax.model import State, Status
-from vijax.record import record
+from vijax.batch.impact_log import record
+from vijax.model.label import label
+from vijax.model.records import State, Status
+from vijax.planes import orbit_diagram as diagrams
+from vijax.planes.orbit_diagram import orbit_diagram
 
 
 def labels(ds) -> list[str]:
@@ -130,10 +130,10 @@ def test_an_orbit_is_taken_to_the_end_of_its_periods(periods):
 def test_the_last_state_recorded_is_handed_on(wall):
     """Of orbits of periods 1 to 8 and of chaos; the record is flown from elsewhere on them."""
     settings = {"direction": "down", "periods": 101, "keep": 3, "wall": wall, "dtype": "float64"}
-    asked = diagram.plan("d", [0.3, 0.19, 0.18, 0.175, 0.16, 0.12], {"kappa": 400.0}, None, **settings)
-    ds = diagram.run(asked)
+    asked = diagrams.plan("d", [0.3, 0.19, 0.18, 0.175, 0.16, 0.12], {"kappa": 400.0}, None, **settings)
+    ds = diagrams.run(asked)
     assert {1, 2} < set(ds.period.values.tolist())
-    end = diagram._follow(asked.planned, diagram._table(asked), 8, 101, 3).handover
+    end = diagrams._follow(asked.planned, diagrams._table(asked), 8, 101, 3).handover
     aloft = end.t[0] == 0
     assert aloft.sum() >= 5
     np.testing.assert_allclose(end.u[0, aloft], ds.u_strobe.values[aloft, -1], atol=1e-9)
@@ -206,7 +206,7 @@ def test_the_door(changed, say):
     axes = {name: asked.pop(name) for name in ("d", "s", "r") if name in asked}
     settings = {"wall": "soft", "dtype": "float64"} | asked
     with pytest.raises(ValueError, match=say):
-        diagram.plan(settings.pop("along"), settings.pop("values"), axes, None, **settings)
+        diagrams.plan(settings.pop("along"), settings.pop("values"), axes, None, **settings)
 
 
 def test_an_axis_that_is_none_is_named():

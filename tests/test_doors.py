@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax import checks, estimate, grid
-from vijax.axes import parse_axis
+from vijax.planes import estimate, sweep
+from vijax.planes.axes import parse_axis
+from vijax.runtime import checks
 
 sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))  # after the scripts, some of which it has too
 
@@ -46,7 +47,7 @@ def unrun(monkeypatch):
         begun.append(planned)
         raise BegunError
 
-    monkeypatch.setattr(grid, "_run", run)
+    monkeypatch.setattr(sweep, "_run", run)
     return begun
 
 
@@ -133,7 +134,7 @@ def kept(tmp_path):
 def planned(side, **axes):
     plane = {"d": np.linspace(0.1, 0.3, side), "kappa": np.linspace(3, 40, side)}
     settings = {"periods": 400, "until": "attractor", "transient": 0, "wall": "soft", "method": "exact"}
-    return grid.plan(plane | axes, **settings, dtype="float64")
+    return sweep.plan(plane | axes, **settings, dtype="float64")
 
 
 @pytest.fixture

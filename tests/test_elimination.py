@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax import elimination
+from vijax.runtime import linear_solve
 
 
 @pytest.mark.parametrize("size", [1, 3, 7])
@@ -15,7 +15,7 @@ def test_systems_are_solved(size):
     if size > 1:
         matrix[:32, 0, 0] = 0.0  # no pivot where elimination begins
     right = np.einsum("bij,bj->bi", matrix, x)
-    found = jax.jit(jax.vmap(elimination.solve))(matrix, right)
+    found = jax.jit(jax.vmap(linear_solve.solve))(matrix, right)
     backward = np.abs(np.einsum("bij,bj->bi", matrix, found) - right).max(axis=1)
     scale = np.abs(matrix).sum(axis=(1, 2)) * np.abs(found).max(axis=1)
     assert (backward < 1e-14 * scale).all()
@@ -30,10 +30,10 @@ def test_derivatives_are_those_of_lapack():
 
     for order in (jax.grad, jax.jacfwd, jax.hessian):
         mine, theirs = (
-            order(lambda b, solve=solve: norm(solve, b))(right) for solve in (elimination.solve, jnp.linalg.solve)
+            order(lambda b, solve=solve: norm(solve, b))(right) for solve in (linear_solve.solve, jnp.linalg.solve)
         )
         np.testing.assert_allclose(mine, theirs, rtol=1e-10)
 
 
 def test_a_singular_system_has_no_finite_solution():
-    assert not np.isfinite(elimination.solve(jnp.ones((2, 2)), jnp.array([1.0, 2.0]))).any()
+    assert not np.isfinite(linear_solve.solve(jnp.ones((2, 2)), jnp.array([1.0, 2.0]))).any()

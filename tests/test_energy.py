@@ -12,7 +12,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from vijax.energy import (
+from vijax.model.device import Harvester
+from vijax.model.energy import (
     admissible,
     capacitance,
     energy_ratio,
@@ -22,7 +23,7 @@ from vijax.energy import (
     rigid_penetration,
     stretch,
 )
-from vijax.model import Harvester, impact_pair
+from vijax.model.pair import impact_pair
 
 DATA = Path(__file__).parent / "data"
 DEVICE = Harvester()  # one unit of u is a metre, one of u' a metre per second

@@ -23,8 +23,9 @@ from helpers import (
     start,
 )
 
-from vijax import exact, flow
-from vijax.model import State
+from vijax.engine import exact
+from vijax.model import flow
+from vijax.model.records import State
 
 CASES = reference_trajectories()
 SOFT = [case for case in CASES if not case["case"].get("hard")]

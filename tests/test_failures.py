@@ -12,9 +12,8 @@ import pytest
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import charts  # noqa: E402
 import failures  # noqa: E402
-
-from vijax import chart  # noqa: E402
 
 
 @cache
@@ -41,10 +40,10 @@ def test_stability():
 
 def test_the_stability_map_is_drawn(tmp_path):
     found = failures.stability_map(12)
-    chart.stability_map(found, tmp_path / "map.png")
+    charts.stability_map(found, tmp_path / "map.png")
     assert np.ptp(matplotlib.image.imread(tmp_path / "map.png")) > 0.5
     with pytest.raises(ValueError, match="plot must end in"):
-        chart.stability_map(found, tmp_path / "map.csv")
+        charts.stability_map(found, tmp_path / "map.csv")
 
 
 def test_order():

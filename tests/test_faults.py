@@ -20,9 +20,13 @@ import pytest
 import xarray as xr
 from helpers import SCRIPTS, stand_in
 
-from vijax import calls, files, grid, plot, simulate, study
-from vijax.grid import load, sweep
-from vijax.style import is_drawn
+from vijax.batch import simulate
+from vijax.planes import dispatch, tiled_store
+from vijax.planes import sweep as sweeps
+from vijax.planes.sweep import load, sweep
+from vijax.plots import maps
+from vijax.plots.style import is_drawn
+from vijax.runtime import files
 
 AXES = {"d": np.linspace(0.1, 0.3, 8), "kappa": np.geomspace(3, 400, 6)}
 ARGUMENTS = ["--d", "0.1:0.3:8", "--kappa", "3:400:6:log", "--out", "map.zarr"]
@@ -36,15 +40,15 @@ def slow_engine(*args, **settings):
 
 def prepare():
     """The stand-in and small tiles, in this process."""
-    simulate.summarise, study.LARGEST_TILE, calls.places = slow_engine, MOST, lambda: jax.devices()[:1]
+    simulate.summarise, tiled_store.LARGEST_TILE, dispatch.places = slow_engine, MOST, lambda: jax.devices()[:1]
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(simulate, "summarise", stand_in)
-    monkeypatch.setattr(study, "LARGEST_TILE", MOST)
-    monkeypatch.setattr(calls, "places", lambda: jax.devices()[:1])
+    monkeypatch.setattr(tiled_store, "LARGEST_TILE", MOST)
+    monkeypatch.setattr(dispatch, "places", lambda: jax.devices()[:1])
     return tmp_path
 
 
@@ -147,9 +151,9 @@ def test_a_full_disk_is_one_line_and_what_is_done_stays(folder, capsys, monkeypa
             raise full
         return chunks(path, dims, place)
 
-    chunks = study._files
+    chunks = tiled_store._files
     with monkeypatch.context() as disk:
-        disk.setattr(*((study, "write_json", write_json) if at == "record" else (study, "_files", _files)))
+        disk.setattr(*((tiled_store, "write_json", write_json) if at == "record" else (tiled_store, "_files", _files)))
         script.main(ARGUMENTS)
     assert leaves == [1]
     assert capsys.readouterr().err.splitlines()[-1] == (
@@ -264,11 +268,11 @@ def test_a_folder_of_somebody_else_is_not_overwritten(folder, capsys, option):
 
 
 def test_a_picture_never_replaces_a_folder(folder):
-    grid.save(sweep(**AXES), "map.zarr")
+    sweeps.save(sweep(**AXES), "map.zarr")
     (folder / "map.png").mkdir()
     (folder / "map.png" / "thesis.tex").write_text("precious")
     with pytest.raises(IsADirectoryError):
-        plot.power_map(load("map.zarr"), "map.png")
+        maps.power_map(load("map.zarr"), "map.png")
     assert [path.name for path in (folder / "map.png").iterdir()] == ["thesis.tex"]
 
 

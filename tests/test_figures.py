@@ -2,18 +2,17 @@
 
 import numpy as np
 import pytest
-
-from vijax import paper
-from vijax.paper import FIGURES
+from paper import captions
+from paper.captions import FIGURES
 
 NUMBERS = range(3, 17)
 
 
-def runs(number: int) -> list[paper.Run]:
+def runs(number: int) -> list[captions.Run]:
     return [source.run for view in FIGURES[number].views for source in view.sources]
 
 
-def held(run: paper.Run) -> dict:
+def held(run: captions.Run) -> dict:
     return dict(run.axes)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from helpers import DIGITS, EPS, mp_flight, mp_oscillate
 
-from vijax import flow
-from vijax.model import ImpactPair
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
 
 NEAR_PI = np.pi * (1 + 1e-9)
 

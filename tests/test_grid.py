@@ -12,11 +12,14 @@ import pytest
 import xarray as xr
 from helpers import SETTINGS, stand_in
 
-from vijax import calls, dataset, grid, simulate
-from vijax.axes import cells, parse_axis
-from vijax.grid import load, save, sweep
-from vijax.membrane import HuntCrossley
-from vijax.model import Harvester, Status
+from vijax.batch import simulate
+from vijax.model.device import Harvester
+from vijax.model.membrane import HuntCrossley
+from vijax.model.records import Status
+from vijax.planes import dataset, dispatch
+from vijax.planes import sweep as sweeps
+from vijax.planes.axes import cells, parse_axis
+from vijax.planes.sweep import load, save, sweep
 
 LONG = 40  # periods: enough for the 1:1 orbits of these tests
 ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "max_penetration", "max_impact_speed"}
@@ -214,8 +217,8 @@ def test_an_unknown_axis_is_named(no_engine):
 
 
 def test_every_cell_lands_in_its_place(engine, monkeypatch):
-    monkeypatch.setattr(calls, "SMALLEST_TILE", 4)
-    monkeypatch.setattr(calls, "LARGEST_TILE", 8)
+    monkeypatch.setattr(dispatch, "SMALLEST_TILE", 4)
+    monkeypatch.setattr(dispatch, "LARGEST_TILE", 8)
     axes = {"A": [1.0, 2.0, 5.0], "kappa": [3.0, 30.0, 300.0], "gamma": [0.1, 0.0], "d": np.linspace(0.1, 0.3, 11)}
     steps = []
     here = threading.current_thread()
@@ -281,7 +284,7 @@ def test_only_what_is_asked_for_is_computed(engine):
 
 
 def test_admissible_asks_for_energy_and_depth(monkeypatch):
-    plan = grid.plan({"d": [0.1, 0.2, 0.3, 0.4], "kappa": 20.0, "omega": math.pi}, ["admissible"], None, **SETTINGS)
+    plan = sweeps.plan({"d": [0.1, 0.2, 0.3, 0.4], "kappa": 20.0, "omega": math.pi}, ["admissible"], None, **SETTINGS)
     ratio = np.array([[0.5], [1.5], [0.5], [np.nan]])
     found = dataset.label(
         plan, {"energy_ratio": ratio, "deepest": np.array([0.0062, 0.001, 0.0064, 0.001]), "status": np.zeros(4, int)}
@@ -290,8 +293,8 @@ def test_admissible_asks_for_energy_and_depth(monkeypatch):
 
 
 def test_ctrl_c_drops_the_waiting_tiles(engine, monkeypatch):
-    monkeypatch.setattr(calls, "SMALLEST_TILE", 2)
-    monkeypatch.setattr(calls, "LARGEST_TILE", 2)
+    monkeypatch.setattr(dispatch, "SMALLEST_TILE", 2)
+    monkeypatch.setattr(dispatch, "LARGEST_TILE", 2)
     slow = simulate.summarise
 
     def summarise(*args, **settings):

@@ -6,170 +6,30 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
+import house
 import pytest
 
 ROOT = Path(__file__).parent.parent
 FOLDERS = ("vijax", "scripts", "benchmarks", "tests")
-SOURCES = sorted(path for folder in FOLDERS for path in (ROOT / folder).glob("*.py"))
-PUBLIC = [path for path in SOURCES if path.parent.name != "tests"]
-PACKAGE = [path for path in SOURCES if path.parent.name == "vijax"]
+SOURCES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+PUBLIC = [path for path in SOURCES if ROOT / "tests" not in path.parents]
+PACKAGE = [path for path in SOURCES if ROOT / "vijax" in path.parents]
 
-# What each room may import of the others: the README's room table. `__init__` names the public functions of all.
-ROOMS: dict[str, set[str]] = {
-    "context": set(),
-    "checks": set(),
-    "units": {"checks"},
-    "model": {"context", "checks", "units"},
-    "xla": set(),
-    "flow": {"model", "xla"},
-    "membrane": {"checks", "model"},
-    "method": {"checks", "model", "membrane"},
-    "lanes": {"xla"},
-    "energy": {"context", "checks", "units", "xla", "lanes", "model", "flow"},
-    "exact": {"xla", "model", "flow", "energy"},
-    "polynomial": {"xla", "flow"},
-    "quick": {"xla", "model", "flow", "energy", "exact", "polynomial"},
-    "sampled": {"xla", "model", "flow", "energy", "exact", "quick"},
-    "ode": {"xla", "model", "flow", "membrane", "method"},
-    "rk4": {"xla", "model", "flow", "membrane", "method"},
-    "cell": {"model", "method", "quick"},
-    "relay": {"lanes", "model", "flow", "quick", "cell"},
-    "recurrence": {"xla", "lanes", "model", "flow", "method", "quick", "cell", "relay"},
-    "fold": {"xla", "lanes", "model", "flow", "energy", "quick", "cell", "relay", "recurrence"},
-    "summary": {"model", "quick", "cell", "relay"},
-    "trips": {"xla", "lanes", "model", "flow", "exact", "quick", "sampled", "ode", "rk4", "cell", "recurrence", "fold"},
-    "files": {"checks"},
-    "inventory": {"files"},
-    "store": {"checks", "files", "inventory"},
-    "traced": {"xla", "lanes", "files"},
-    "simulate": {
-        "context",
-        "checks",
-        "membrane",
-        "traced",
-        "model",
-        "exact",
-        "quick",
-        "lanes",
-        "method",
-        "cell",
-        "relay",
-        "recurrence",
-        "summary",
-        "trips",
-    },
-    "trajectory": {"context", "checks", "lanes", "model", "flow", "exact", "ode", "rk4", "membrane", "method"},
-    "curve": {"context", "checks", "lanes", "model", "flow"},
-    "elimination": set(),
-    "shooting": {"model", "flow", "elimination"},
-    "clearance": {"model", "flow", "exact", "shooting"},
-    "steady": {"context", "checks", "elimination", "model", "flow", "energy", "exact", "shooting", "clearance"},
-    "ascent": set(),
-    "tolerance": {"checks", "model"},
-    "tuning": {"context", "checks", "units", "model"},
-    "objective": {"model", "shooting", "steady", "ascent", "tuning"},
-    "impact_map": {"xla", "model", "quick", "lanes", "cell", "trips"},
-    "label": {"model"},
-    "orbit": {
-        "context",
-        "checks",
-        "xla",
-        "model",
-        "flow",
-        "lanes",
-        "energy",
-        "curve",
-        "shooting",
-        "impact_map",
-        "label",
-        "trajectory",
-    },
-    "arc": {"elimination", "model", "lanes", "shooting", "clearance"},
-    "record": {"xla", "model", "exact", "lanes", "trajectory"},
-    "survey": {"context", "lanes", "model", "simulate", "record", "shooting"},
-    "starts": {"lanes", "model", "energy", "tuning", "survey"},
-    "axes": {"checks", "units", "model"},
-    "branch": {"context", "checks", "units", "lanes", "model", "shooting", "orbit", "arc", "axes"},
-    "dataset": {"lanes", "model", "method", "axes", "simulate"},
-    "frame": {"model", "dataset", "files", "inventory", "store"},
-    "study": {"lanes", "axes", "dataset", "files", "inventory", "store", "frame"},
-    "refine": {"label"},
-    "cluster": {"checks"},
-    "calls": {"context", "lanes", "model", "dataset", "study", "simulate"},
-    "estimate": {"context", "checks", "lanes", "dataset", "files", "traced"},
-    "grid": {
-        "context",
-        "checks",
-        "estimate",
-        "lanes",
-        "model",
-        "membrane",
-        "method",
-        "axes",
-        "dataset",
-        "store",
-        "study",
-        "cluster",
-        "refine",
-        "calls",
-    },
-    "attractor": {"context", "checks", "model", "axes", "dataset", "label", "grid"},
-    "chaos": {"context", "checks", "model", "grid", "attractor"},
-    "compare": {"context", "checks", "model", "dataset", "label", "grid"},
-    "design": {
-        "context",
-        "checks",
-        "estimate",
-        "xla",
-        "model",
-        "energy",
-        "lanes",
-        "steady",
-        "ascent",
-        "tolerance",
-        "tuning",
-        "objective",
-        "orbit",
-        "starts",
-        "axes",
-    },
-    "surroundings": {"context", "checks", "model", "orbit", "steady", "branch", "attractor", "tuning", "design"},
-    "diagram": {
-        "context",
-        "checks",
-        "estimate",
-        "lanes",
-        "model",
-        "energy",
-        "simulate",
-        "record",
-        "axes",
-        "dataset",
-        "grid",
-    },
-    "style": {"checks", "files"},
-    "paper": set(),
-    "portrait": {"style"},
-    "cached": {"model", "orbit", "branch", "diagram", "paper"},
-    "figures": {"model", "curve", "orbit", "paper", "portrait", "cached"},
-    "evidence": {"model", "orbit", "branch", "attractor", "chaos", "label", "cached", "paper"},
-    "claims": {"model", "branch", "chaos", "diagram", "grid", "cached", "paper", "evidence"},
-    "report": {"checks", "units", "model", "energy", "design", "objective", "surroundings", "tolerance", "tuning"},
-    "chart": {"checks", "style"},
-    "blueprint": {"checks", "units", "report", "style", "tuning"},
-    "panels": set(),
-    "plot": {"checks", "model", "axes", "dataset", "label", "grid", "compare", "style", "panels"},
-}
-ROOMS["__init__"] = set(ROOMS)
+# Folders from the bottom up; two on one floor do not know each other.
+FLOORS = (("runtime",), ("model",), ("engine",), ("batch",), ("planes", "orbits"), ("design",), ("plots",))
 
+# Heavy packages, and the files (or folders) that alone may import them.
 ONLY_IN = {
-    "diffrax": {"vijax/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
-    "distributed": {"vijax/cluster.py"},
-    "pint": {"vijax/units.py"},
-    "matplotlib": {"vijax/plot.py", "vijax/chart.py", "vijax/portrait.py", "vijax/blueprint.py"},
+    "diffrax": {"vijax/engine/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
+    "distributed": {"vijax/planes/cluster.py"},
+    "pint": {"vijax/model/units.py"},
+    "matplotlib": {"vijax/plots", "scripts/paper/portrait.py", "benchmarks/charts.py"},
 }
+KNOWN = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in PACKAGE}
+NO_ROOMS = {"vijax.waiting", "vijax.json"}  # a logger, a file
 NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax", "distributed", "pint"]
 IMPORT_SECONDS = 1.5
 
@@ -181,55 +41,80 @@ def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
 
-def imported(parsed: ast.AST) -> Iterator[str]:
-    """Dotted names that a file imports, at any depth: `from vijax import flow` gives vijax.flow."""
-    for node in ast.walk(parsed):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            package = ("vijax." if node.level else "") + (node.module or "")
-            yield from (f"{package.rstrip('.')}.{alias.name}" for alias in node.names)
-
-
-def rooms_imported(parsed: ast.AST) -> set[str]:
-    """Rooms among a file's imports; a public name taken from the package itself counts as the room `__init__`."""
-    parts = [name.split(".") for name in imported(parsed)]
-    return {part[1] if part[1:] and part[1] in ROOMS else "__init__" for part in parts if part[0] == "vijax"}
-
-
 def name(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def test_the_table_has_no_cycle_and_no_room_twice():
-    seen: set[str] = set()
-    for room, below in ROOMS.items():
-        assert below <= seen, f"{room} may import {below - seen}, which stand under it in the table"
-        seen.add(room)
+def test_folders_import_downwards():
+    floor = {f"vijax.{folder}": height for height, folders in enumerate(FLOORS) for folder in folders}
+    found = house.folders(house.rooms())
+    assert set(found) == set(floor)
+    upwards = [(folder, other) for folder, below in found.items() for other in below if floor[other] >= floor[folder]]
+    assert not upwards
 
 
-@pytest.mark.parametrize("path", PACKAGE, ids=name)
-def test_imports_point_downwards(path):
-    assert path.stem in ROOMS, f"{name(path)} has no line in the room table of tests/test_house.py"
-    upwards = rooms_imported(tree(path)) - ROOMS[path.stem]
-    assert not upwards, f"{name(path)} must not import {sorted(upwards)}"
+def test_the_house_is_small_enough_to_know():
+    rooms = house.rooms()
+    assert len(house.at_the_top()) <= 14
+    assert house.floors(house.folders(rooms)) <= 10
+    assert house.count(house.folders(rooms)) <= 60
+    assert len(rooms) == len([path for path in PACKAGE if path.name != "__init__.py"])
+
+
+def test_rooms_arrows_and_floors_are_read_as_python_does(tmp_path):
+    package = tmp_path / "hut"
+    for file, text in {
+        "__init__": "from hut.top.roof import tile",
+        "low/__init__": "",
+        "low/ground": "import math",
+        "low/cellar": "if math:\n    def dig():\n        import hut.low.ground as ground",
+        "top/__init__": "",
+        "top/roof": "from hut.low import cellar, ground\nfrom hut.low.ground import floor",
+    }.items():
+        path = (package / file).with_suffix(".py")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    ground, cellar, roof = "hut.low.ground", "hut.low.cellar", "hut.top.roof"
+    rooms = house.rooms(package)
+    assert rooms == {ground: set(), cellar: {ground}, roof: {cellar, ground}}
+    assert house.folders(rooms) == {"hut.low": set(), "hut.top": {"hut.low"}}
+    assert house.at_the_top(package) == ["__init__.py", "low", "top"]
+    assert (house.floors(rooms), house.floors(house.folders(rooms))) == (3, 2)
+    with pytest.raises(ValueError, match=re.escape(f"{ground} -> {cellar} -> {ground}")):
+        house.floors({ground: {cellar}, cellar: {ground}})
 
 
 @pytest.mark.parametrize("path", PUBLIC, ids=name)
 def test_heavy_packages_stay_in_their_room(path):
-    packages = {package.split(".")[0] for package in imported(tree(path))}
-    strays = {package for package, rooms in ONLY_IN.items() if package in packages and name(path) not in rooms}
+    packages = {package.split(".")[0] for package in house.imported(tree(path))}
+    own = {name(path), *(folder.relative_to(ROOT).as_posix() for folder in path.parents if ROOT in folder.parents)}
+    strays = {package for package, rooms in ONLY_IN.items() if package in packages and not own & rooms}
     assert not strays, f"{name(path)} imports {strays}; only {[ONLY_IN[package] for package in strays]} may"
 
 
-def test_rooms_and_imports_are_read_as_python_does():
-    source = "from vijax import flow, sweep\nimport numpy\nimport vijax.grid as g\nif g:\n    from .model import State"
-    assert rooms_imported(ast.parse(source)) == {"flow", "grid", "model", "__init__"}
+def named(parsed: ast.AST) -> Iterator[str]:
+    """Rooms and folders that strings name: "vijax.plots.maps", and of f"vijax.engine.{name}" the folder."""
+    for node in ast.walk(parsed):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found = re.fullmatch(r"vijax((?:\.\w+)+)\.?", node.value)
+            if found and node.value not in NO_ROOMS:
+                yield "vijax" + found.group(1)
+
+
+# A misspelt one would be found when it is imported, which for a thread that imports ahead is never.
+@pytest.mark.parametrize("path", SOURCES, ids=name)
+def test_rooms_named_in_strings_are_there(path):
+    for dotted in named(tree(path)):
+        while dotted not in KNOWN:
+            dotted, _, attribute = dotted.rpartition(".")
+            assert dotted not in KNOWN or hasattr(import_module(dotted), attribute), f"{dotted} has no {attribute}"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=name)
 def test_annotations_are_not_deferred(path):
-    assert "__future__.annotations" not in set(imported(tree(path))), "jaxtyping reads annotations as they are defined"
+    assert "__future__.annotations" not in set(house.imported(tree(path))), (
+        "jaxtyping reads annotations as they are defined"
+    )
 
 
 def public(parsed: ast.Module) -> Iterator[ast.FunctionDef | ast.ClassDef]:

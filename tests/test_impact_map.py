@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from helpers import TILE, march, pairs, start
 
-from vijax.impact_map import next_impacts
-from vijax.model import impact_pair
+from vijax.batch.impact_map import next_impacts
+from vijax.model.pair import impact_pair
 
 
 @pytest.mark.parametrize(("wall", "gamma"), [("soft", 0.0), ("rigid", 0.0), ("soft", 0.3)])

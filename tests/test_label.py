@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vijax.label import label, ordered
-from vijax.model import Status
+from vijax.model.label import label, ordered
+from vijax.model.records import Status
 
 OK = Status.OK
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Bool, Float
 
-from vijax import lanes, xla
+from vijax.batch import lanes
+from vijax.runtime import tiles, xla
 
 Lane = Float[Array, "lane"]
 
@@ -238,10 +239,10 @@ def test_chains_and_links_that_are_padding_stay_zero_and_are_never_looked_at():
 @pytest.mark.parametrize(("wanted", "expected"), [(1, ["a", "b"]), (2, ["a", "b"]), (5, ["a", "b", "a", "b"])])
 def test_every_device_has_a_place_and_more_where_there_are_cores(monkeypatch, wanted, expected):
     monkeypatch.setattr(jax, "local_devices", lambda: ["a", "b"])
-    monkeypatch.setattr(lanes, "workers", lambda: wanted)
-    assert lanes.places() == expected
+    monkeypatch.setattr(tiles, "workers", lambda: wanted)
+    assert tiles.places() == expected
     with jax.default_device(jax.devices()[0]):
-        assert lanes.places() == jax.devices()[:1] * wanted
+        assert tiles.places() == jax.devices()[:1] * wanted
 
 
 @pytest.mark.parametrize(
@@ -249,7 +250,7 @@ def test_every_device_has_a_place_and_more_where_there_are_cores(monkeypatch, wa
     [(0, 0, 0), (1, 32, 1), (33, 32, 2), (100, 32, 4), (200, 256, 1), (400, 256, 2), (3000, 4096, 1), (9000, 4096, 3)],
 )
 def test_tiles_hold_every_row_once_and_little_padding(count, size, calls):
-    found = lanes.tiles(count, (32, 256, 4096))
+    found = tiles.tiles(count, (32, 256, 4096))
     assert [tile.rows.size for tile in found] == [size] * calls
     rows = [tile.rows[: tile.real] for tile in found]
     np.testing.assert_array_equal(np.concatenate([np.zeros(0, int), *rows]), np.arange(count))

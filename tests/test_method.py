@@ -6,9 +6,10 @@ import pytest
 
 import vijax
 from vijax import HuntCrossley, sweep
-from vijax.membrane import Linear
-from vijax.method import OPTIONS, Ode, choose, record
-from vijax.model import ImpactPair, Status, impact_pair
+from vijax.engine.method import OPTIONS, Ode, choose, record
+from vijax.model.membrane import Linear
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.records import Status
 
 PLANE = {"d": np.linspace(0.08, 0.3, 6), "kappa": np.geomspace(4, 300, 6), "r": 0.5, "u0": 0.0, "v0": 0.4}
 

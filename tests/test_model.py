@@ -10,16 +10,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from vijax.model import (
-    Harvester,
-    ImpactPair,
-    damping_ratio,
-    from_membrane_pair,
-    impact_pair,
-    membrane_pair,
-    with_constants,
-    with_pair,
-)
+from vijax.model.device import Harvester, with_constants, with_pair
+from vijax.model.pair import ImpactPair, damping_ratio, from_membrane_pair, impact_pair, membrane_pair
 
 # Round trips are a handful of roundings.
 ROUND_TRIP = 1e-14

@@ -8,10 +8,12 @@ import pytest
 from helpers import reference_trajectories
 
 import vijax
-from vijax import flow, ode
-from vijax.membrane import Linear
-from vijax.method import Ode, Rk4
-from vijax.model import ImpactPair, State, Status, impact_pair, membrane_pair
+from vijax.engine import ode
+from vijax.engine.method import Ode, Rk4
+from vijax.model import flow
+from vijax.model.membrane import Linear
+from vijax.model.pair import ImpactPair, impact_pair, membrane_pair
+from vijax.model.records import State, Status
 
 LANES, PERIODS, ROOM = 8, 6, 48  # the one shape in which trajectories are compiled
 FIELDS = ("t", "v_in", "v_out", "depth", "duration", "work")

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from helpers import reference_orbits, reference_rows
 
-from vijax import orbit as orbits
-from vijax.model import Harvester, Status, impact_pair
-from vijax.shooting import Sequence
+from vijax.model.device import Harvester
+from vijax.model.pair import impact_pair
+from vijax.model.records import Status
+from vijax.orbits import periodic as orbits
+from vijax.orbits.shooting import Sequence
 
 
 def guessed(knots, walls, pair, period=1):

@@ -9,8 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax import impact_pair, simulate, sweep
-from vijax.model import Harvester, ImpactPair, Status
+from vijax import impact_pair, sweep
+from vijax.batch import simulate
+from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Status
 
 CLAIMS = {c["id"]: c for c in json.loads((Path(__file__).parent / "data" / "claims.json").read_text())}
 TABLE_2 = Harvester()

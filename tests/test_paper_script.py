@@ -1,11 +1,10 @@
-"""`scripts/paper.py`: which figures it draws and where, the table of claims, and nothing at all after bad input."""
+"""`scripts/paper`: which figures it draws and where, the table of claims, and nothing at all after bad input."""
 
 import command
 import helpers  # noqa: F401, as it puts the scripts on the path
-import paper as script
 import pytest
-
-from vijax import claims, figures
+from paper import __main__ as script
+from paper import claims, figures
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ import xarray as xr
 from matplotlib.colors import LogNorm, to_rgba
 from matplotlib.legend import Legend
 
-from vijax import plot
-from vijax.compare import Label, Model
-from vijax.dataset import best
-from vijax.model import Status
-from vijax.panels import layout
+from vijax.model.records import Status
+from vijax.planes.compare import Label, Model
+from vijax.planes.dataset import best
+from vijax.plots import maps
+from vijax.plots.style import layout
 
 SYMBOLS = {
     "d": ("d", "1"),
@@ -83,7 +83,7 @@ def test_what_no_picture_holds_says_what_to_fix(sizes, say):
 
 def test_power_map_explains_itself(tmp_path):
     file = tmp_path / "map.png"
-    figure = plot.power_map(drawn_map(d=D, kappa=KAPPA), file)
+    figure = maps.power_map(drawn_map(d=D, kappa=KAPPA), file)
     assert file.read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
     said = words(figure)
@@ -109,13 +109,13 @@ def test_legend_names_only_what_is_there():
     found["period"][:] = 1
     found["admissible"][:] = True
     found["P"][:] = 1e-6
-    said = words(plot.power_map(found))
+    said = words(maps.power_map(found))
     assert not [part for part in ("inadmissible", "aperiodic", "undecided", "no impact") if part in said]
 
 
 def test_colours_are_logarithmic_and_span_the_admissible_cells():
     found = drawn_map(d=D, kappa=KAPPA)
-    mesh = plot.power_map(found).axes[0].collections[0]
+    mesh = maps.power_map(found).axes[0].collections[0]
     assert isinstance(mesh.norm, LogNorm)
     assert mesh.norm.vmax == pytest.approx(float(found["P"].where(found["admissible"]).max()))
 
@@ -124,7 +124,7 @@ def test_star_stands_on_the_largest_admissible_cell():
     found = drawn_map(d=D, kappa=KAPPA)
     peak = best(found)
     assert float(peak) == pytest.approx(36e-6)
-    star = next(line for line in plot.power_map(found).axes[0].lines if line.get_marker() == "*")
+    star = next(line for line in maps.power_map(found).axes[0].lines if line.get_marker() == "*")
     assert (star.get_xdata()[0], star.get_ydata()[0]) == (float(peak["d"]), float(peak["kappa"]))
 
 
@@ -132,12 +132,12 @@ def test_best_is_none_without_an_admissible_cell():
     found = drawn_map(d=D, kappa=KAPPA)
     found["admissible"][:] = False
     assert best(found) is None
-    assert "largest" not in words(plot.power_map(found))
+    assert "largest" not in words(maps.power_map(found))
 
 
 def test_hatch_border_and_dots_lie_on_their_cells():
     found = drawn_map(d=D, kappa=KAPPA)
-    axes = plot.power_map(found).axes[0]
+    axes = maps.power_map(found).axes[0]
     aperiodic = found["period"].stack(cell=["d", "kappa"])
     aperiodic = aperiodic[(aperiodic == 0).values]
     dots = next(line for line in axes.lines if line.get_marker() == ".")
@@ -164,7 +164,7 @@ def drawn_comparison(**axes) -> xr.Dataset:
 
 def test_difference_map_explains_itself(tmp_path):
     found = drawn_comparison(d=D, kappa=KAPPA)
-    figure = plot.difference_map(found, tmp_path / "map.png")
+    figure = maps.difference_map(found, tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     said = words(figure)
     for part in ("other labels", "rigid is enough within 0.5 %", "undecided", "P_\\mathrm{soft}"):
@@ -174,12 +174,12 @@ def test_difference_map_explains_itself(tmp_path):
     assert not np.ma.getmaskarray(mesh.get_array()).any()  # infinitely different is not missing
     norm = mesh.norm
     assert (type(norm), norm.vmin, norm.vmax) == (LogNorm, 1e-4, 1.0)
-    said = words(plot.difference_map(found.drop_vars("cheapest_model")))
+    said = words(maps.difference_map(found.drop_vars("cheapest_model")))
     assert not [part for part in ("enough", "undecided") if part in said]
 
 
 def test_lines_go_around_other_labels_and_where_rigid_is_enough():
-    axes = plot.difference_map(drawn_comparison(d=D, kappa=KAPPA)).axes[0]
+    axes = maps.difference_map(drawn_comparison(d=D, kappa=KAPPA)).axes[0]
     labels, enough = (piece.get_segments() for piece in axes.collections[1:3])
     assert {round(x, 12) for segment in labels for x, _ in segment} == {0.125}
     assert {round(y, 9) for segment in enough for _, y in segment} == {round(np.sqrt(KAPPA[4] * KAPPA[5]), 9)}
@@ -190,7 +190,7 @@ def test_lines_go_around_other_labels_and_where_rigid_is_enough():
 def test_a_difference_over_one_axis_is_a_curve():
     found = drawn_comparison(d=D, kappa=KAPPA)
     found["relative_difference"][0, 7] = np.nan
-    figure = plot.difference_map(found.isel(d=[0]))
+    figure = maps.difference_map(found.isel(d=[0]))
     (axes,) = figure.axes
     np.testing.assert_array_equal(axes.lines[0].get_ydata()[[0, 7]], [np.nan, np.nan])
     edges = [line.get_xdata()[0] for line in axes.lines[1:] if line.get_color() == "red"]
@@ -200,7 +200,7 @@ def test_a_difference_over_one_axis_is_a_curve():
 
 def test_borders_part_a_mask_from_the_rest():
     mask = np.array([[True, False, False], [True, True, False]])
-    segments = plot._borders(np.arange(4.0), np.arange(3.0), mask)
+    segments = maps._borders(np.arange(4.0), np.arange(3.0), mask)
     assert sorted(sorted(segment) for segment in segments) == [
         [(1.0, 0.0), (1.0, 1.0)],
         [(1.0, 1.0), (2.0, 1.0)],
@@ -209,20 +209,20 @@ def test_borders_part_a_mask_from_the_rest():
 
 
 def test_fine_maps_carry_marks_by_blocks():
-    size = 2 * plot._MARKS
+    size = 2 * maps._MARKS
     mask = np.zeros((size, size), bool)
     mask[:2, :2] = True
     mask[100, 100] = True
     places = np.arange(size)
-    most = plot._marks(mask, places, places, most=True)
-    anywhere = plot._marks(mask, places, places, most=False)
+    most = maps._marks(mask, places, places, most=True)
+    anywhere = maps._marks(mask, places, places, most=False)
     assert (most[0].tolist(), most[1].tolist()) == ([1], [1])
     assert len(anywhere[0]) == 2
 
 
 def test_panels_show_the_further_axes_in_order():
     found = drawn_map(d=D, kappa=KAPPA, A=[1.0, 2.0], r=[0.3, 0.5, 0.8])
-    figure = plot.power_map(found)
+    figure = maps.power_map(found)
     titles = [axes.get_title() for axes in figure.axes[:6]]
     assert titles[1] == "$A$ = 2 m s$^{-2}$, $r$ = 0.3"
     assert titles[2] == "$A$ = 1 m s$^{-2}$, $r$ = 0.5"
@@ -235,12 +235,12 @@ def test_panels_show_the_further_axes_in_order():
 def test_unsorted_values_are_drawn_sorted():
     found = drawn_map(d=D, kappa=KAPPA)
     mixed = found.isel(d=[3, 0, 5, 1, 4, 2])
-    want, got = (plot.power_map(each).axes[0].collections[0].get_array() for each in (found, mixed))
+    want, got = (maps.power_map(each).axes[0].collections[0].get_array() for each in (found, mixed))
     np.testing.assert_array_equal(np.ma.filled(got, 0.0), np.ma.filled(want, 0.0))
 
 
 def test_one_axis_is_a_curve():
-    figure = plot.power_map(drawn_map(omega0=np.linspace(20, 400, 30)))
+    figure = maps.power_map(drawn_map(omega0=np.linspace(20, 400, 30)))
     (axes,) = figure.axes
     assert (axes.get_xlabel(), axes.get_yscale()) == (r"$\omega_0$ [rad s$^{-1}$]", "log")
     assert isinstance(figure.legends[0], Legend)
@@ -249,14 +249,14 @@ def test_one_axis_is_a_curve():
 def test_a_map_without_energy_is_drawn():
     found = drawn_map(d=D, kappa=KAPPA)
     found["P"][:] = 0.0
-    assert "no impact" in words(plot.power_map(found))
+    assert "no impact" in words(maps.power_map(found))
 
 
 def test_missing_variables_and_endings_are_named(tmp_path):
     with pytest.raises(ValueError, match="without admissible"):
-        plot.power_map(drawn_map(d=D, kappa=KAPPA).drop_vars("admissible"))
+        maps.power_map(drawn_map(d=D, kappa=KAPPA).drop_vars("admissible"))
     with pytest.raises(ValueError, match=r"plot must end in \.png"):
-        plot.power_map(drawn_map(d=D, kappa=KAPPA), tmp_path / "map.doc")
+        maps.power_map(drawn_map(d=D, kappa=KAPPA), tmp_path / "map.doc")
 
 
 # --- maps of kinds ----------------------------------------------------------------------------------------------------
@@ -297,7 +297,7 @@ def legend(figure) -> dict[str, tuple]:
 
 def test_label_map_names_the_commonest_and_says_how_long_chaos_was_looked_at():
     found = labelled_map()
-    figure = plot.label_map(found)
+    figure = maps.label_map(found)
     shown = legend(figure)
     rare = {f"0.5 % 1:{n}" for n in range(3, 23)}
     assert list(shown)[:2] == ["50 % 1:1", "20 % 1:2/2T"]  # mirror images as one
@@ -315,7 +315,7 @@ def test_label_map_names_the_commonest_and_says_how_long_chaos_was_looked_at():
 
 
 def test_label_map_keeps_mirror_images_apart_under_gravity_and_needs_no_exponent(tmp_path):
-    figure = plot.label_map(labelled_map(gamma=0.1).drop_vars("lyapunov"), tmp_path / "map.png")
+    figure = maps.label_map(labelled_map(gamma=0.1).drop_vars("lyapunov"), tmp_path / "map.png")
     assert {"10 % 2:1/2T", "10 % 1:2/2T"} < set(legend(figure))
     assert len(figure.axes) == 1
     assert (tmp_path / "map.png").stat().st_size
@@ -337,23 +337,23 @@ def basin_table(**further) -> xr.Dataset:
 
 def test_basin_map_lists_its_attractors():
     found = basin_table()
-    figure = plot.basin_map(found)
+    figure = maps.basin_map(found)
     shown = legend(figure)
     chaos = "37.5 % aperiodic within 300 periods, $P$ = 2.00 µJ"
     assert list(shown) == ["50 % 1:2/2T, $P$ = 4.00 mJ", chaos, "12.5 % 1:1, $P$ = 1.00 µJ"]
     (mesh,) = figure.axes[0].collections
     colours = mesh.cmap(mesh.norm(mesh.get_array()))
     assert [tuple(colours[0, column]) for column in (0, 4, 7)] == list(shown.values())
-    assert shown[chaos] == to_rgba(plot._NO_ORBIT["aperiodic"])
+    assert shown[chaos] == to_rgba(maps._NO_ORBIT["aperiodic"])
     assert figure.axes[0].get_xlabel() == "$u0$"
 
 
 def test_more_attractors_than_colours_are_others():
-    many, most = 40, plot._MOST_NAMED
+    many, most = 40, maps._MOST_NAMED
     found = basin_table().isel(attractor=np.zeros(many, int))
     found["fraction"] = ("attractor", np.full(many, 1 / many))
     found["basin"] = (("u0", "v0"), np.arange(80).reshape(8, 10) % many)
-    shown = legend(plot.basin_map(found))
+    shown = legend(maps.basin_map(found))
     assert list(shown)[-1] == f"70 % {many - most} others"
 
 
@@ -361,17 +361,17 @@ def test_multistability_map_counts_attractors():
     number = np.tile([0, 1, 1, 3], (5, 1))
     place = coords(d=np.linspace(0.1, 0.3, 5), kappa=np.arange(3.0, 7.0))
     found = xr.Dataset({"attractors": (("d", "kappa"), number)}, place, {"wall": "soft"})
-    shown = legend(plot.multistability_map(found))
+    shown = legend(maps.multistability_map(found))
     assert list(shown) == ["25 % undecided", "50 % 1 attractor", "0 % 2 attractors", "25 % 3 attractors"]
 
 
 def test_a_map_of_kinds_wants_a_plane_and_its_variables():
     with pytest.raises(ValueError, match="two axes of more than one value; got d alone"):
-        plot.label_map(labelled_map().isel(kappa=[0]))
+        maps.label_map(labelled_map().isel(kappa=[0]))
     with pytest.raises(ValueError, match="without status"):
-        plot.label_map(labelled_map().drop_vars("status"))
+        maps.label_map(labelled_map().drop_vars("status"))
     with pytest.raises(ValueError, match="without P"):
-        plot.basin_map(basin_table().drop_vars("P"))
+        maps.basin_map(basin_table().drop_vars("P"))
 
 
 # --- any variable -----------------------------------------------------------------------------------------------------
@@ -403,7 +403,7 @@ def held_map() -> xr.Dataset:
 )
 def test_any_number_of_a_map_is_drawn(name, log, says):
     found = held_map()
-    figure = plot.variable_map(found, name)
+    figure = maps.variable_map(found, name)
     mesh = figure.axes[0].collections[0]
     assert isinstance(mesh.norm, LogNorm) == log
     assert figure.axes[1].get_ylabel() == says
@@ -415,20 +415,20 @@ def test_any_number_of_a_map_is_drawn(name, log, says):
 
 
 def test_a_variable_without_what_tells_of_the_others_is_drawn(tmp_path):
-    figure = plot.variable_map(held_map()[["max_penetration"]], "max_penetration", tmp_path / "map.png")
+    figure = maps.variable_map(held_map()[["max_penetration"]], "max_penetration", tmp_path / "map.png")
     assert "inadmissible" not in words(figure)
     assert (tmp_path / "map.png").exists()
 
 
 def test_kinds_have_a_colour_each():
     for name, share in (("status", "75 % ok\n25 % slow"), ("admissible", "25 % no\n75 % yes")):
-        figure = plot.variable_map(held_map(), name)
+        figure = maps.variable_map(held_map(), name)
         assert "\n".join(text.get_text() for text in figure.legends[0].get_texts()) == share
         assert figure.axes[0].get_yscale() == "log"  # the axes are still those of the map
 
 
 def test_a_variable_over_one_axis_is_a_curve():
-    figure = plot.variable_map(held_map().isel(kappa=3), "asymmetry")
+    figure = maps.variable_map(held_map().isel(kappa=3), "asymmetry")
     assert figure.axes[0].get_yscale() == "linear"
     np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), held_map()["asymmetry"][:, 3])
 
@@ -437,12 +437,12 @@ def test_few_admissible_cells_do_not_choose_the_colours():
     found = drawn_map(d=D, kappa=KAPPA)
     for trusted, span in ((4, (2e-6, 48e-6)), (5, (4e-6, 8e-6))):  # of 47 cells shown
         found["admissible"][:] = (found["P"] > 3.5e-6) & (found["P"] < (3.5 + trusted) * 1e-6)
-        norm = plot.power_map(found).axes[0].collections[0].norm
+        norm = maps.power_map(found).axes[0].collections[0].norm
         assert (norm.vmin, norm.vmax) == pytest.approx(span)
 
 
 def test_a_map_without_what_is_asked_for_says_what_draws_the_others():
     with pytest.raises(ValueError, match=r"dataset must hold P, .* without P; variable_map \(--show NAME\) draws any"):
-        plot.power_map(held_map().drop_vars("P"))
+        maps.power_map(held_map().drop_vars("P"))
     with pytest.raises(ValueError, match=r"name must be among P, .* got 'lyapunov'"):
-        plot.variable_map(held_map(), "lyapunov")
+        maps.variable_map(held_map(), "lyapunov")

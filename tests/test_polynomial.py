@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax import polynomial
+from vijax.engine import polynomial
 
 
 @pytest.fixture(params=[np.float64, np.float32], ids=["double", "single"])

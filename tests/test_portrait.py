@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from paper.portrait import Layer, Panel, _wrapped, phase_plane, small_multiples, time_series
 
-from vijax.curve import Curve
-from vijax.portrait import Layer, Panel, _wrapped, phase_plane, small_multiples, time_series
+from vijax.orbits.motion import Curve
 
 CIRCLE = np.linspace(0, 2 * np.pi, 50)
 PLANE = phase_plane("$d = 0.2$", [Layer(np.cos(CIRCLE), np.sin(CIRCLE), "black", "line", "first")], 0.2)

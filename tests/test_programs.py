@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax import branch, curve, orbit
+from vijax.orbits import continuation, motion, periodic
 
 DEVICE = vijax.Harvester()
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -37,9 +37,9 @@ def pair(i: int) -> vijax.ImpactPair:
 
 
 @pytest.fixture(scope="module")
-def known() -> orbit.Orbit:
+def known() -> periodic.Orbit:
     """One attracting orbit of the default device."""
-    found = orbit.search(DEVICE.pair(), "RL", guesses=64)
+    found = periodic.search(DEVICE.pair(), "RL", guesses=64)
     return found[np.abs(np.asarray(found.multipliers)).max(axis=1) < 1][:1]
 
 
@@ -56,9 +56,9 @@ def omega0(i: int) -> float:
     return DEVICE.omega0 * (1 + 1e-4 * i)
 
 
-def many(known, i: int) -> orbit.Orbit:
+def many(known, i: int) -> periodic.Orbit:
     """Five orbits and some more."""
-    return orbit.concatenate([known] * (5 + i))
+    return periodic.concatenate([known] * (5 + i))
 
 
 def impacts(count: int) -> tuple[np.ndarray, ...]:
@@ -80,17 +80,19 @@ CALLS = {
     "trajectory, starts": lambda i, known: vijax.trajectory(pair(i), np.full((2, 4 + i), 0.02), 0.3, periods=5),
     "trajectory, grad": lambda i, known: jax.grad(lambda v: vijax.trajectory(pair(i), 0.02, v, 5).states.u[-1])(0.3),
     "trajectory, rk4": lambda i, known: vijax.trajectory(pair(i), 0.02, 0.3, periods=5 + i, method="rk4", steps=100),
-    "orbit.search": lambda i, known: orbit.search(pair(i), "RL", guesses=60 + i),
-    "orbit.from_state": lambda i, known: orbit.from_state(pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + 40 * i),
-    "orbit.doubled": lambda i, known: orbit.doubled(many(known, i)),
-    "orbit.impacts": lambda i, known: orbit.impacts(many(known, i)),
-    "orbit.labels": lambda i, known: orbit.labels(many(known, i)),
-    "orbit.power": lambda i, known: orbit.power(many(known, i), tuned(omega0(i))),
-    "orbit.path": lambda i, known: orbit.path(many(known, i)),
-    "branch.follow": lambda i, known: branch.follow(many(known, i), "omega", (1.0 + 0.01 * i, 9.0), points=20 + i),
-    "branch.family": lambda i, known: branch.family(known, "d", (0.1 + 0.001 * i, 0.3), points=20 + i),
-    "curve": lambda i, known: curve.curve(pair(i), *impacts(5 + i)),
-    "curve.states": lambda i, known: curve.states(pair(i), *impacts(5 + i), when=np.linspace(1, 3, 9 + i)),
+    "periodic.search": lambda i, known: periodic.search(pair(i), "RL", guesses=60 + i),
+    "periodic.from_state": lambda i, known: periodic.from_state(pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + 40 * i),
+    "periodic.doubled": lambda i, known: periodic.doubled(many(known, i)),
+    "periodic.impacts": lambda i, known: periodic.impacts(many(known, i)),
+    "periodic.labels": lambda i, known: periodic.labels(many(known, i)),
+    "periodic.power": lambda i, known: periodic.power(many(known, i), tuned(omega0(i))),
+    "periodic.path": lambda i, known: periodic.path(many(known, i)),
+    "continuation.follow": lambda i, known: continuation.follow(
+        many(known, i), "omega", (1.0 + 0.01 * i, 9.0), points=20 + i
+    ),
+    "continuation.family": lambda i, known: continuation.family(known, "d", (0.1 + 0.001 * i, 0.3), points=20 + i),
+    "curve": lambda i, known: motion.curve(pair(i), *impacts(5 + i)),
+    "motion.states": lambda i, known: motion.states(pair(i), *impacts(5 + i), when=np.linspace(1, 3, 9 + i)),
     "sweep": lambda i, known: vijax.sweep(d=np.linspace(0.1, 0.2, 3 + i), kappa=40.0 + i, r=0.5),
     "sweep, rigid": lambda i, known: vijax.sweep(d=0.2, kappa=np.linspace(40, 50, 5 + i), r=0.5, wall="rigid"),
     "basins": lambda i, known: vijax.basins(d=0.2, kappa=40.0 + i, v0=np.linspace(-0.5, 0.5, 3 + i)),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import EPS, HORIZON, TILE, both_ways, march, pairs, start
 
-from vijax import exact, quick
+from vijax.engine import exact, quick
 
 COUNT = 16 * TILE
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax.model import State
-from vijax.record import record
+from vijax.batch.impact_log import record
+from vijax.model.records import State
 
 PERIODS = 8
 D = np.array([0.1, 0.12, 0.12, 0.2, 0.3, 0.3])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import TILE, both_ways, march, pairs, start
 
-from vijax import quick, sampled
+from vijax.engine import quick, sampled
 
 RESTITUTIONS, SLOPES = [0.05, 0.2, 0.5, 0.9, 0.99, 1.0], [0.0, 0.1, -0.5, 1.2]
 SURE = {"plane": 0.97, "wide": 0.65, "rigid": 0.65}  # least share of the impacts, a few per cent below the measured

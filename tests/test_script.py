@@ -14,8 +14,9 @@ import pytest
 import xarray as xr
 from helpers import SCRIPTS
 
-from vijax import dataset, grid, plot
-from vijax.model import Status
+from vijax.model.records import Status
+from vijax.planes import dataset, sweep
+from vijax.plots import maps
 
 TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
 
@@ -121,7 +122,7 @@ BAD = [
 
 @pytest.mark.parametrize(("arguments", "say"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
 def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, monkeypatch, arguments, say):
-    monkeypatch.setattr(grid, "run", None)  # nothing may run
+    monkeypatch.setattr(sweep, "run", None)  # nothing may run
     assert script.main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -133,7 +134,7 @@ def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, monkeypatch, argu
 
 @pytest.mark.parametrize(("option", "name"), [("--out", "map.zarr"), ("--plot", "map.png")])
 def test_what_exists_is_found_before_the_run(folder, capsys, monkeypatch, option, name):
-    monkeypatch.setattr(grid, "run", None)
+    monkeypatch.setattr(sweep, "run", None)
     (folder / name).write_text("precious")
     assert script.main([option, name]) == 2
     assert "must not exist yet" in capsys.readouterr().err
@@ -149,7 +150,7 @@ def planned(monkeypatch, folder):
         plans.append(plan)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(grid, "run", run)
+    monkeypatch.setattr(sweep, "run", run)
     monkeypatch.setattr(script, "keep_compiled", lambda: None)
     monkeypatch.setattr(os, "_exit", lambda code: None)
 
@@ -211,9 +212,9 @@ def test_labels_are_shown_with_exponents(folder, monkeypatch):
     plans, drawn = [], []
     ok = xr.Variable("d", [0, 0], {"flag_values": [0], "flag_meanings": "ok"})
     monkeypatch.setattr(
-        grid, "run", lambda plan, *args: plans.append(plan) or args[0](0, 1) or xr.Dataset({"status": ok})
+        sweep, "run", lambda plan, *args: plans.append(plan) or args[0](0, 1) or xr.Dataset({"status": ok})
     )
-    monkeypatch.setattr(plot, "label_map", lambda found, path: drawn.append(path.name))
+    monkeypatch.setattr(maps, "label_map", lambda found, path: drawn.append(path.name))
     monkeypatch.setattr(script, "keep_compiled", lambda: None)
     assert script.main(["--show", "label", "--plot", "labels.png"]) == 0
     assert {"lyapunov", "P", "period"} < set(plans[0].outputs)
@@ -234,8 +235,8 @@ def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
         tell(1, 1)
         return found
 
-    monkeypatch.setattr(grid, "run", run)
-    monkeypatch.setattr(plot, "power_map", lambda found, path: None)
+    monkeypatch.setattr(sweep, "run", run)
+    monkeypatch.setattr(maps, "power_map", lambda found, path: None)
     monkeypatch.setattr(script, "keep_compiled", lambda: None)
     assert script.main(["--refine", "3", "--plot", "map.png"]) == 0
     assert plans[0].refine == 3
@@ -256,7 +257,7 @@ def test_from_arguments_to_store_and_picture(folder, monkeypatch):
     process = started([*TINY, "--out", "map.zarr", "--plot", "map.png"], folder)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
-    found = grid.load(folder / "map.zarr")
+    found = sweep.load(folder / "map.zarr")
     assert dict(found.sizes) == {"d": 2, "kappa": 3}
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
     assert "6/6" in err.replace(".00", "")  # the progress bar has come to its end
@@ -288,7 +289,7 @@ def test_ctrl_c_leaves_what_is_done(folder):
     assert process.returncode == 130
     assert err.endswith("stopped; 0 of 262,144 cells are in map.zarr; the same command goes on from there\n")
     assert {path.name for path in folder.iterdir()} <= {"cache", "map.zarr"}
-    assert (grid.load(folder / "map.zarr")["status"] == Status.NOT_RUN).all()
+    assert (sweep.load(folder / "map.zarr")["status"] == Status.NOT_RUN).all()
 
 
 def test_the_bar_says_what_is_waited_for(folder, capsys):

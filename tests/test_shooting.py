@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers import reference_orbits
 
-from vijax import shooting
-from vijax.model import impact_pair
-from vijax.shooting import Sequence
+from vijax.model.pair import impact_pair
+from vijax.orbits import shooting
+from vijax.orbits.shooting import Sequence
 
 
 def sequence(*walls, span=2.0, mirrored=False, width=None):

@@ -9,10 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax import simulate, trajectory
-from vijax.energy import harvested_energy
-from vijax.grid import sweep
-from vijax.model import Harvester, ImpactPair, Status
+from vijax import trajectory
+from vijax.batch import simulate
+from vijax.model.device import Harvester
+from vijax.model.energy import harvested_energy
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Status
+from vijax.planes.sweep import sweep
 
 DATA = Path(__file__).parent / "data"
 PLANE = json.loads((DATA / "plane_cells.json").read_text())["cells"]

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vijax import design, starts
-from vijax.model import Harvester
-from vijax.starts import Effort
+from vijax.design import multistart, optimise
+from vijax.design.multistart import Effort
+from vijax.model.device import Harvester
 
 
 def device(d, r, A, omega):
@@ -24,8 +24,8 @@ BEYOND = device(0.123487, 0.510445, 2.045754, 4.755139)
 def found(given, low, high, steps, balls, periods=200):
     """What `find` finds between two kappa: the starts, their kinds (period, more and fewer impacts), their kappa."""
     bounds = {"kappa": (low, high)}
-    box = design.check([given], ("kappa",), bounds, "P", ())
-    met, looked = starts.find([given], ("kappa",), box, "P", Effort(steps, balls, 16, periods))
+    box = optimise.check([given], ("kappa",), bounds, "P", ())
+    met, looked = multistart.find([given], ("kappa",), box, "P", Effort(steps, balls, 16, periods))
     left, right = ((met.flown.side == side).sum(axis=1) for side in (-1, 1))
     kinds = np.column_stack([met.flown.span / 2, np.maximum(left, right), np.minimum(left, right)]).astype(int)
     assert looked[0].orbits >= len(kinds)
@@ -54,15 +54,15 @@ def test_a_long_orbit_just_beyond_a_limit_is_climbed_from():
 def test_only_the_best_of_a_kind_within_reach_climbs(reach, chosen):
     kind = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [0, 1], [0, 2], [1, 1]])
     step, score = np.array([0, 3, 4, 20, 20, 3, 3]), np.array([1.0, 3.0, 2.0, 5.0, 6.0, 0.0, 0.0])
-    np.testing.assert_array_equal(starts.highest(kind, step, score, reach), chosen)
+    np.testing.assert_array_equal(multistart.highest(kind, step, score, reach), chosen)
 
 
 def test_starts_of_one_device_do_not_depend_on_the_others():
     devices = [IN_CHAOS, BEYOND]
 
     def of(some):
-        box = design.check(some, ("kappa",), {"kappa": (2.0, 400.0)}, "P", ())
-        met, looked = starts.find(some, ("kappa",), box, "P", Effort(128, 2, 16, 200))
+        box = optimise.check(some, ("kappa",), {"kappa": (2.0, 400.0)}, "P", ())
+        met, looked = multistart.find(some, ("kappa",), box, "P", Effort(128, 2, 16, 200))
         return [
             (met.flown.pair.kappa[own], met.flown.knots[own], looked[i].orbits)
             for i in range(len(some))

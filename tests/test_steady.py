@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from helpers import reference_orbits, reference_rows
 
-from vijax import orbit as orbits
-from vijax.model import Harvester, ImpactPair, Status, impact_pair
-from vijax.shooting import Sequence
-from vijax.steady import steady
+from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.records import Status
+from vijax.orbits import periodic as orbits
+from vijax.orbits.shooting import Sequence
+from vijax.orbits.steady import steady
 
 DEVICE = Harvester()
 

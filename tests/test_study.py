@@ -17,9 +17,12 @@ import xarray as xr
 import zarr
 from helpers import SETTINGS, stand_in
 
-from vijax import dataset, grid, simulate, study
-from vijax.grid import load, sweep
-from vijax.model import Harvester, Status
+from vijax.batch import simulate
+from vijax.model.device import Harvester
+from vijax.model.records import Status
+from vijax.planes import dataset, tiled_store
+from vijax.planes import sweep as sweeps
+from vijax.planes.sweep import load, sweep
 
 AXES = {"d": np.linspace(0.1, 0.3, 5), "kappa": np.geomspace(3, 400, 4)}
 FEW = AXES | {"outputs": ["P"]}
@@ -36,8 +39,8 @@ def calls(monkeypatch):
         return stand_in(*args, count=count, **settings)
 
     monkeypatch.setattr(simulate, "summarise", summarise)
-    monkeypatch.setattr(study, "LARGEST_TILE", MOST)
-    monkeypatch.setattr("vijax.calls.places", lambda: jax.devices()[:1])
+    monkeypatch.setattr(tiled_store, "LARGEST_TILE", MOST)
+    monkeypatch.setattr("vijax.planes.dispatch.places", lambda: jax.devices()[:1])
     return made
 
 
@@ -97,7 +100,7 @@ def test_a_study_holds_what_the_sweep_in_memory_returns(calls, out, axes):
 
 
 def test_what_the_tiles_need_is_compiled_while_their_store_is_made(out, monkeypatch):
-    compiling, opened = threading.Event(), study.opened
+    compiling, opened = threading.Event(), tiled_store.opened
 
     def summarise(*args, count, **settings):
         if not count:
@@ -109,7 +112,7 @@ def test_what_the_tiles_need_is_compiled_while_their_store_is_made(out, monkeypa
         return opened(*args)
 
     monkeypatch.setattr(simulate, "summarise", summarise)
-    monkeypatch.setattr(study, "opened", opened_meanwhile)
+    monkeypatch.setattr(tiled_store, "opened", opened_meanwhile)
     sweep(**AXES, out=out)
     assert len(records(out)) == 1
 
@@ -206,7 +209,7 @@ def test_overwrite_begins_anew(calls, out):
 
 
 def test_a_store_that_was_saved_whole_does_not_go_on(calls, out):
-    grid.save(sweep(**AXES), out)
+    sweeps.save(sweep(**AXES), out)
     with pytest.raises(FileExistsError, match="saved whole"):
         sweep(**AXES, out=out)
     sweep(**AXES, out=out, overwrite=True)
@@ -233,14 +236,14 @@ STRANGERS = ["thesis.tex", "P/notes.txt", "P/c/0/x", "status/tiles/mine.json", "
 @pytest.mark.parametrize("name", STRANGERS)
 @pytest.mark.parametrize("whole", [False, True], ids=["study", "saved"])
 def test_a_foreign_file_within_a_store_keeps_it(calls, out, name, whole):
-    grid.save(sweep(**FEW), out) if whole else sweep(**FEW, out=out)
+    sweeps.save(sweep(**FEW), out) if whole else sweep(**FEW, out=out)
     (out / name).parent.mkdir(parents=True, exist_ok=True)
     (out / name).write_text("precious")
     with pytest.raises(FileExistsError, match=f"which holds {name}; move it elsewhere") as error:
         sweep(**AXES, out=out, overwrite=True)
     assert "\n" not in str(error.value)
     with pytest.raises(FileExistsError, match="path must not replace what vijax did not write"):
-        grid.save(sweep(**AXES), out, overwrite=True)
+        sweeps.save(sweep(**AXES), out, overwrite=True)
     assert (out / name).read_text() == "precious"
 
 
@@ -268,18 +271,18 @@ def test_a_store_ends_in_zarr(calls, tmp_path, name):
         with pytest.raises(ValueError, match=f"out must end in .zarr; got '.*{name}'"):
             sweep(**AXES, out=tmp_path / name, overwrite=overwrite)
     with pytest.raises(ValueError, match=f"path must end in .zarr; got '.*{name}'"):
-        grid.save(sweep(**AXES), tmp_path / name)
+        sweeps.save(sweep(**AXES), tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_second_writer_is_refused(calls, out, overwrite):
-    planned = grid.plan(AXES, **SETTINGS)
-    with study.opened(planned, out):
+    planned = sweeps.plan(AXES, **SETTINGS)
+    with tiled_store.opened(planned, out):
         with pytest.raises(BlockingIOError, match=r"out must not be in use; got .*map\.zarr, which another"):
             sweep(**AXES, out=out, overwrite=overwrite)
         with pytest.raises(BlockingIOError, match="in use"):
-            study.check(planned, out, overwrite)
+            tiled_store.check(planned, out, overwrite)
     sweep(**AXES, out=out, overwrite=overwrite)
 
 
@@ -294,27 +297,27 @@ def test_a_second_writer_is_refused(calls, out, overwrite):
     ],
 )
 def test_tiles_are_blocks_of_at_most_so_many_cells(sizes, most, expected):
-    assert study.extents(sizes, most) == expected
+    assert tiled_store.extents(sizes, most) == expected
 
 
 def test_a_small_plane_has_tiles_for_everyone(calls, out, monkeypatch):
-    monkeypatch.setattr(study, "LARGEST_TILE", 1000)
-    monkeypatch.setattr(study, "SMALLEST_TILE", 3)
-    monkeypatch.setattr(study, "places", lambda: jax.devices()[:1] * 2)
+    monkeypatch.setattr(tiled_store, "LARGEST_TILE", 1000)
+    monkeypatch.setattr(tiled_store, "SMALLEST_TILE", 3)
+    monkeypatch.setattr(tiled_store, "places", lambda: jax.devices()[:1] * 2)
     sweep(**AXES, out=out)
     assert len(calls) >= 4
     assert max(calls) <= 5
 
 
 def test_a_tile_of_many_variants_has_fewer_cells(calls, out, monkeypatch):
-    monkeypatch.setattr(study, "_LARGEST_CHUNK", 8)
+    monkeypatch.setattr(tiled_store, "_LARGEST_CHUNK", 8)
     sweep(**AXES, A=[1.0, 2.0, 3.0, 4.0], out=out)
     assert max(calls) == 2
 
 
 def test_tiles_stay_as_they_were_made(calls, out, monkeypatch):
     stopped_after(8, out, **AXES)
-    monkeypatch.setattr(study, "LARGEST_TILE", 20)
+    monkeypatch.setattr(tiled_store, "LARGEST_TILE", 20)
     calls.clear()
     xr.testing.assert_identical(sweep(**AXES, out=out).load(), sweep(**AXES))
     assert max(calls[:-1]) <= MOST  # the last call is that of the sweep in memory
@@ -495,7 +498,7 @@ def test_metadata_are_mended_by_whatever_version(calls, out, monkeypatch):
 
 
 def test_an_edit_of_a_saved_map_is_noticed(calls, out):
-    grid.save(sweep(**AXES), out)
+    sweeps.save(sweep(**AXES), out)
     (out / "P" / "c" / "0" / "0").unlink()
     with pytest.raises(ValueError, match="where P/c/0/0 is missing; make it anew"):
         load(out)
@@ -586,7 +589,7 @@ def test_a_store_opens_anywhere_without_a_warning(calls, out):
         assert (xr.open_zarr(out)["status"] == Status.NOT_RUN).any()
         sweep(**AXES, out=out)
         xr.testing.assert_identical(xr.open_zarr(out, chunks=None).load(), whole)
-        grid.save(whole, out.with_name("saved.zarr"))
+        sweeps.save(whole, out.with_name("saved.zarr"))
         xr.testing.assert_identical(xr.open_zarr(out.with_name("saved.zarr"), chunks=None).load(), whole)
 
 
@@ -598,10 +601,11 @@ import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
 import vijax
-from vijax import calls, lanes
-assert set(lanes.places()) == set(jax.devices())
-calls.SMALLEST_TILE = 128
-vijax.study.LARGEST_TILE = 128
+from vijax.planes import dispatch
+from vijax.runtime import tiles
+assert set(tiles.places()) == set(jax.devices())
+dispatch.SMALLEST_TILE = 128
+vijax.planes.tiled_store.LARGEST_TILE = 128
 axes = dict(d=np.linspace(0.2, 0.3, 17), r=np.linspace(0.3, 0.7, 21), wall="rigid", periods=12, until="window")
 vijax.sweep(**axes, outputs=["impacts_per_period", "restitution"], out=sys.argv[2])
 """

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax import clearance
-from vijax import orbit as orbits
-from vijax.model import ImpactPair, Status
-from vijax.survey import survey
+from vijax.design.survey import survey
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Status
+from vijax.orbits import grazing
+from vijax.orbits import periodic as orbits
 
 KAPPA = np.geomspace(3, 400, 64)
 
@@ -94,7 +95,7 @@ def test_unrest_is_one_motion_of_every_pair_that_has_some(found):
 def test_clearances_are_those_of_the_motion_in_between(orbit):
     some = orbit[np.arange(0, len(orbit), 61)]
     sequence, knots = some.sequence, jnp.nan_to_num(some.knots)
-    room = jax.jit(jax.vmap(clearance.between))(some.pair, sequence, knots).clearance
+    room = jax.jit(jax.vmap(grazing.between))(some.pair, sequence, knots).clearance
     assert (np.stack(room) > 0).all()
     _, u, _ = orbits.path(some, samples=2001)
     for index in range(len(some)):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vijax.tolerance import Tolerance, check_tolerances, nodes
+from vijax.design.tolerance import Tolerance, check_tolerances, nodes
 
 
 def mean(cloud, function):

@@ -1,7 +1,13 @@
 """A program is traced once: kept with what it depends on, read back bit for bit, traced anew where that fails."""
 
+import ast
+import re
+import shutil
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import requires
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +15,10 @@ import numpy as np
 import pytest
 from jax import monitoring
 
-from vijax import traced
+import vijax
+from vijax.runtime import export_cache
 
+PACKAGE = Path(vijax.__file__).parent
 X = jnp.linspace(0.1, 2.0, 7)
 
 
@@ -29,14 +37,14 @@ class Work:
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     place = tmp_path / "compiled"
-    monkeypatch.setattr(traced, "cache_folder", lambda: place)
+    monkeypatch.setattr(export_cache, "cache_folder", lambda: place)
     return place
 
 
 def called(name="wave", x=X):
     """The result of a fresh program, as a new process would make it, and how often that traced."""
     work = Work()
-    program = traced.Program(work, name)
+    program = export_cache.Program(work, name)
     given = {"x": x, "y": jnp.asarray(3.0, x.dtype)}
     first = np.asarray(program(given))
     np.testing.assert_array_equal(program(given), first)
@@ -62,8 +70,8 @@ def test_another_program_or_shape_is_another_one(folder, changed):
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
-    monkeypatch.setattr(traced, "cache_folder", lambda: tmp_path if kept else None)
-    program = traced.Program(lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop")
+    monkeypatch.setattr(export_cache, "cache_folder", lambda: tmp_path if kept else None)
+    program = export_cache.Program(lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop")
     compiled, ready = [], threading.Barrier(4)
 
     def count(event, *_, fun_name="", **__):
@@ -85,9 +93,44 @@ def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
         np.testing.assert_array_equal(one, found[0])
 
 
+def test_a_change_in_any_folder_changes_the_digest(tmp_path):
+    package = tmp_path / "vijax"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    digest = export_cache._sources.__wrapped__
+    digests = {digest(), digest(package)}
+    assert len(digests) == 1  # of the same sources elsewhere
+    folders = [package, *sorted(path.parent for path in package.glob("*/__init__.py"))]
+    assert len(folders) > 5
+    for folder in folders:
+        with (folder / "__init__.py").open("a", encoding="utf-8") as file:
+            file.write("# changed\n")
+        digests.add(digest(package))
+    assert len(digests) == len(folders) + 1
+
+
+def test_all_that_a_trace_goes_through_is_in_the_digest(monkeypatch):
+    asked = []
+    monkeypatch.setattr(export_cache, "version", lambda name: asked.append(name) or "1")
+    export_cache._sources.__wrapped__()
+    nodes = [node for path in PACKAGE.glob("[be]*/*.py") for node in ast.walk(ast.parse(path.read_text()))]
+    tops = {alias.name.split(".")[0] for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    tops |= {node.module.split(".")[0] for node in nodes if isinstance(node, ast.ImportFrom)}
+    # What the engines and the batch import, and what that stands on.
+    waiting, found = [top for top in tops - sys.stdlib_module_names - {"vijax"}], set()
+    assert {"jax", "diffrax"} <= set(waiting)
+    while waiting:
+        name = waiting.pop()
+        found.add(name)
+        needed = [
+            re.split(r"[^\w.-]", line)[0].replace("-", "_") for line in requires(name) or [] if "extra ==" not in line
+        ]
+        waiting += [one for one in needed if one not in found]
+    assert found - {"scipy", "typing_extensions", "wadler_lindig"} == set(asked)  # special functions, types and print
+
+
 def test_other_sources_are_other_programs(folder, monkeypatch):
     called()
-    monkeypatch.setattr(traced, "_sources", lambda: "other")
+    monkeypatch.setattr(export_cache, "_sources", lambda: "other")
     assert called()[1] == 1
 
 
@@ -106,7 +149,7 @@ def test_where_nothing_can_be_kept_it_is_traced_every_time(tmp_path, monkeypatch
     taken = tmp_path / "file"
     taken.touch()
     for place in (taken, None):
-        monkeypatch.setattr(traced, "cache_folder", lambda place=place: place)
+        monkeypatch.setattr(export_cache, "cache_folder", lambda place=place: place)
         assert called()[1] == called()[1] == 1
     assert taken.read_bytes() == b""
 
@@ -117,11 +160,11 @@ def test_the_folder_is_that_of_compiled_programs(tmp_path):
         for asked, kept, expected in ((str(tmp_path), True, tmp_path), (str(tmp_path), False, None)):
             jax.config.update("jax_compilation_cache_dir", asked)
             jax.config.update("jax_enable_compilation_cache", kept)
-            assert traced.cache_folder() == expected
+            assert export_cache.cache_folder() == expected
         jax.config.update("jax_enable_compilation_cache", True)
         for asked in (None, "gs://bucket/compiled"):
             jax.config.update("jax_compilation_cache_dir", asked)
-            assert traced.cache_folder() is None
+            assert export_cache.cache_folder() is None
     finally:
         for name, value in before.items():
             jax.config.update(name, value)

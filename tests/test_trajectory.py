@@ -11,8 +11,9 @@ import pytest
 from helpers import DIGITS, mp_march
 
 import vijax
-from vijax.model import ImpactPair, Status, impact_pair
-from vijax.xla import compiler_options
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.records import Status
+from vijax.runtime.xla import compiler_options
 
 IMPACTS, PERIODS = 3, 4
 H = "1e-9"

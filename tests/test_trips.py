@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax import simulate, trips, xla
-from vijax.cell import Plan, Settings
-from vijax.model import Harvester
+from vijax.batch import advance, simulate
+from vijax.batch.cell import Plan, Settings
+from vijax.model.device import Harvester
+from vijax.runtime import xla
 
 CELLS, TRIPS = 2048, 60
 PLAN = Plan(
@@ -44,9 +45,9 @@ def declined():
     @partial(jax.jit, compiler_options=xla.compiler_options())
     def work(rows):
         fresh = simulate._load(PLAN, SETTINGS, rows)
-        cell = jax.lax.fori_loop(0, TRIPS, lambda _, cell: trips.trip(PLAN, SETTINGS, cell), fresh)
-        request = trips.request(PLAN, SETTINGS, cell)
-        return cell, trips.sampled_answer(PLAN, request), trips.careful_answer(PLAN, request)
+        cell = jax.lax.fori_loop(0, TRIPS, lambda _, cell: advance.trip(PLAN, SETTINGS, cell), fresh)
+        request = advance.request(PLAN, SETTINGS, cell)
+        return cell, advance.sampled_answer(PLAN, request), advance.careful_answer(PLAN, request)
 
     cell, sampled, careful = jax.tree.map(np.asarray, work(rows))
     # Of some the flight is not certain; these are for the careful step.

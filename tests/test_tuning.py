@@ -6,40 +6,40 @@ import jax
 import numpy as np
 import pytest
 
-from vijax import tuning
-from vijax.model import Harvester
+from vijax.design import variables
+from vijax.model.device import Harvester
 
 DEVICE = Harvester(A=3.0, omega=10 * math.pi, s=0.006)
 
 
-@pytest.mark.parametrize("name", [name for name in tuning.NAMES if name not in ("beta", "gamma")])
+@pytest.mark.parametrize("name", [name for name in variables.NAMES if name not in ("beta", "gamma")])
 def test_a_device_has_what_was_tuned(name):
-    wanted = 1.1 * float(tuning.value_of(DEVICE, name))
-    device = tuning.tuned(DEVICE, (name,), np.array([math.log(wanted)]))
-    assert float(tuning.value_of(device, name)) == pytest.approx(wanted, rel=1e-14)
+    wanted = 1.1 * float(variables.value_of(DEVICE, name))
+    device = variables.tuned(DEVICE, (name,), np.array([math.log(wanted)]))
+    assert float(variables.value_of(device, name)) == pytest.approx(wanted, rel=1e-14)
     changed = [float(a) != float(b) for a, b in zip(jax.tree.leaves(device), jax.tree.leaves(DEVICE), strict=True)]
     assert sum(changed) == 1
 
 
 @pytest.mark.parametrize("name", ["beta", "gamma"])
 def test_inclinations_may_be_negative(name):
-    device = tuning.tuned(DEVICE, (name,), np.array([-0.02]))
-    assert float(tuning.value_of(device, name)) == pytest.approx(-0.02, rel=1e-13)
+    device = variables.tuned(DEVICE, (name,), np.array([-0.02]))
+    assert float(variables.value_of(device, name)) == pytest.approx(-0.02, rel=1e-13)
 
 
 def test_a_dimensionless_name_follows_what_is_tuned_beside_it():
     names = ("kappa", "omega")
-    device = tuning.tuned(DEVICE, names, np.log([5.0, 20.0]))
+    device = variables.tuned(DEVICE, names, np.log([5.0, 20.0]))
     assert float(device.omega0) == pytest.approx(5 * 20 / math.pi, rel=1e-14)
 
 
 def test_values_and_variables_are_inverse():
     names, x = ("omega0", "beta", "r"), np.array([[30.0, -0.05, 0.5], [40.0, 0.0, 0.9]])
-    np.testing.assert_allclose(tuning.values(names, tuning.variables(names, x)), x, rtol=1e-14)
+    np.testing.assert_allclose(variables.values(names, variables.variables(names, x)), x, rtol=1e-14)
 
 
 def test_bounds_stand_unless_given():
-    low, high = tuning.limits(("omega0", "r", "V"), {"r": (0.2, 0.4)}, DEVICE)
+    low, high = variables.limits(("omega0", "r", "V"), {"r": (0.2, 0.4)}, DEVICE)
     np.testing.assert_allclose([low, high], [[20.0, 0.2, 1000.0], [4000.0, 0.4, 4000.0]])
 
 
@@ -49,7 +49,7 @@ def test_bounds_stand_unless_given():
 )
 def test_names_that_cannot_be_are_told(names, words):
     with pytest.raises(ValueError, match=words):
-        tuning.check_names(names)
+        variables.check_names(names)
 
 
 @pytest.mark.parametrize(
@@ -63,4 +63,4 @@ def test_names_that_cannot_be_are_told(names, words):
 )
 def test_bounds_that_cannot_be_are_told(names, bounds, words):
     with pytest.raises(ValueError, match=words):
-        tuning.limits(names, bounds, DEVICE)
+        variables.limits(names, bounds, DEVICE)

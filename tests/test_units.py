@@ -8,8 +8,12 @@ import pint
 import pytest
 
 import vijax
-from vijax import axes, branch, dataset, diagram, grid, orbit, tuning, units
-from vijax.model import CONSTANTS, Harvester, impact_pair, with_constants
+from vijax.design import variables
+from vijax.model import quantities, units
+from vijax.model.device import CONSTANTS, Harvester, with_constants
+from vijax.model.pair import impact_pair
+from vijax.orbits import continuation, periodic
+from vijax.planes import axes, dataset, orbit_diagram, sweep
 
 U = pint.UnitRegistry()
 HZ = 2 * math.pi
@@ -79,7 +83,7 @@ def test_every_constant_of_the_device_takes_its_unit():
 
 
 def test_quantities_of_pint_at_the_doors():
-    swept = grid.plan(
+    swept = sweep.plan(
         {"omega": U.Quantity([2, 3], "Hz"), "s": [30 * U.cm, 0.4 * U.m]},
         ["P"],
         **{"periods": 400, "until": "attractor", "transient": 0, "wall": "soft", "method": "exact", "dtype": "float64"},
@@ -87,9 +91,9 @@ def test_quantities_of_pint_at_the_doors():
     np.testing.assert_allclose(swept.cells.given["omega"], [2 * HZ, 3 * HZ], rtol=1e-14)
     np.testing.assert_allclose(swept.cells.given["s"], [0.3, 0.4], rtol=1e-14)
     settings = {"direction": "up", "periods": 9, "keep": 3, "wall": "soft", "dtype": "float64"}
-    planned = diagram.plan("beta", U.Quantity([1, 2], "deg"), {}, **settings)
+    planned = orbit_diagram.plan("beta", U.Quantity([1, 2], "deg"), {}, **settings)
     np.testing.assert_allclose(planned.planned.cells.given["beta"], np.radians([1, 2]), rtol=1e-14)
-    bounds = tuning.limits(("omega0",), {"omega0": (2 * U.Hz, 3 * U.Hz)}, Harvester())
+    bounds = variables.limits(("omega0",), {"omega0": (2 * U.Hz, 3 * U.Hz)}, Harvester())
     np.testing.assert_allclose(bounds[:, 0], [2 * HZ, 3 * HZ], rtol=1e-14)
     harvested = vijax.harvested_energy(Harvester(), 2 * U.mm)
     assert float(harvested) == pytest.approx(float(vijax.harvested_energy(Harvester(), 0.002)), rel=1e-14)
@@ -101,15 +105,17 @@ def test_quantities_of_pint_at_the_doors():
 
 
 def test_a_branch_between_bounds_with_units():
-    found = orbit.search(Harvester(s=0.2).pair("rigid"), "RL", guesses=32)[:1]
+    found = periodic.search(Harvester(s=0.2).pair("rigid"), "RL", guesses=32)[:1]
     kept = {"direction": "up", "points": 4, "device": Harvester(s=0.2)}
-    own, plain = (branch.follow(found, "s", within, **kept)[0] for within in ((19 * U.cm, 210 * U.mm), (0.19, 0.21)))
+    own, plain = (
+        continuation.follow(found, "s", within, **kept)[0] for within in ((19 * U.cm, 210 * U.mm), (0.19, 0.21))
+    )
     np.testing.assert_allclose(own.values, plain.values, rtol=1e-12)
 
 
 def test_datasets_write_the_same_units():
-    written = {name: axis.units for name, axis in axes.AXES.items()}
-    assert written == dict.fromkeys(axes.AXES, "1") | {
+    written = {name: axis.units for name, axis in quantities.AXES.items()}
+    assert written == dict.fromkeys(quantities.AXES, "1") | {
         **{"omega": "rad s-1", "omega0": "rad s-1", "s": "m", "k": "N m-1", "A": "m s-2", "beta": "rad"}
     }
 

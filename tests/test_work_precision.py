@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from vijax.chart import work_precision
+from charts import work_precision
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 EXACT = 1e-14  # worst measured: 2e-16

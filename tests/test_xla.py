@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax import export, lax
 
-from vijax import xla
-from vijax.xla import in_blocks, kernel, put, share, whole_blocks
+from vijax.runtime import xla
+from vijax.runtime.xla import in_blocks, kernel, put, share, whole_blocks
 
 X = jnp.linspace(0.1, 2.0, 192)
 MARK = "xla_cpu_small_call"

@@ -7,18 +7,20 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from vijax.attractor import basin_fractions, basins
-from vijax.chaos import lyapunov, survival
-from vijax.compare import compare
-from vijax.design import optimise
-from vijax.diagram import orbit_diagram
-from vijax.energy import harvested_energy
-from vijax.grid import load, save, sweep
-from vijax.membrane import HuntCrossley
-from vijax.model import Harvester, Impact, ImpactPair, State, Status, impact_pair
-from vijax.simulate import summarise
-from vijax.steady import steady
-from vijax.trajectory import trajectory
+from vijax.batch.simulate import summarise
+from vijax.batch.trajectory import trajectory
+from vijax.design.optimise import optimise
+from vijax.model.device import Harvester
+from vijax.model.energy import harvested_energy
+from vijax.model.membrane import HuntCrossley
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.records import Impact, State, Status
+from vijax.orbits.steady import steady
+from vijax.planes.basins import basin_fractions, basins
+from vijax.planes.chaos import lyapunov, survival
+from vijax.planes.compare import compare
+from vijax.planes.orbit_diagram import orbit_diagram
+from vijax.planes.sweep import load, save, sweep
 
 __all__ = [
     "Harvester",

@@ -1,0 +1,65 @@
+"""Diagrams, orbits and branches of the paper's figures and claims, each computed once."""
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from paper.captions import GAP_IN_METRES, Run
+from vijax.model.device import Harvester
+from vijax.model.pair import impact_pair
+from vijax.orbits import continuation, periodic
+from vijax.planes.orbit_diagram import orbit_diagram
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_IMPACTS = 3  # orbits are padded to so many, so that one program follows the branches of several sequences
+
+
+@lru_cache(maxsize=16)
+def diagram(run: Run) -> "xr.Dataset":
+    """The orbit diagram of a run."""
+    axes: Any = {name: np.asarray(values) if isinstance(values, tuple) else values for name, values in run.axes}
+    return orbit_diagram(
+        along=run.along,
+        values=np.array(run.values),
+        direction=run.direction,
+        wall=run.wall,
+        periods=run.periods,
+        keep=run.keep,
+        **axes,
+    )
+
+
+@lru_cache(maxsize=64)
+def orbits(walls: str, d: float, kappa: float | None, r: float = 0.5, period: int = 1) -> periodic.Orbit:
+    """Every orbit found with these walls, stable or not; kappa is None of rigid walls."""
+    return periodic.search(impact_pair(d, kappa, r), walls, period)
+
+
+@lru_cache(maxsize=32)
+def branches(
+    walls: str, along: str, within: tuple[float, float], d: float, kappa: float | None, r: float = 0.5, period: int = 1
+) -> list[continuation.Branch]:
+    """The branches of all orbits with these walls; along omega those of the device of Figs. 12-16."""
+    found = orbits(walls, d, kappa, r, period)
+    if not len(found):
+        return []
+    device = Harvester(s=GAP_IN_METRES) if along == "omega" else None
+    return continuation.follow(_padded(found), along, within, device=device)
+
+
+def _padded(found: periodic.Orbit) -> periodic.Orbit:
+    width = found.knots.shape[1]
+
+    def pad(leaf: jax.Array) -> jax.Array:
+        if leaf.ndim < 2 or leaf.shape[1] != width or leaf is found.multipliers:
+            return leaf
+        blank = 0 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.nan
+        widths = [(0, 0), (0, max(_IMPACTS - width, 0)), *[(0, 0)] * (leaf.ndim - 2)]
+        return jnp.pad(leaf, widths, constant_values=blank)
+
+    return jax.tree.map(pad, found)

@@ -1,0 +1,354 @@
+"""The paper's figures 3 to 16 as data: the runs behind them and what each panel shows.
+
+Where captions are silent or cannot be meant, a figure's `chosen` says what is drawn here. `paper.figures` draws them.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+PERIODS, KEEP = 400, 25  # of every point of a diagram: run, and drawn
+SECTION_PERIODS = 3000  # of a Poincare section of chaos, which 25 points do not show
+
+STIFFNESSES = (400.0, 126.5, 40.0, 12.65, 4.0)  # kappa of Figs. 8-11
+SPRINGS = (560.0, 56.0, 5.6, 0.56, 0.056)  # k [N/m] of Figs. 12-16: omega0 = 400, 126.5, 40, 12.65, 4 rad/s
+COLOURS = ("black", "tab:blue", "tab:green", "tab:orange", "tab:purple")  # of either, the stiffest first
+RESTITUTIONS = (0.5, 0.1, 0.95)
+
+GAP_IN_METRES = 0.2  # of Figs. 12-16
+
+GAPS = tuple(np.round(np.arange(0.3, 0.0499, -0.002), 3).tolist())
+PHASE_PLANES = (0.16, 0.18, 0.2)  # d of Figs. 3 and 5
+UNSTABLE_AT = 0.18  # d of the 1:2 orbit in red
+# Rigid branches over d: where 1:1 and 1:2 coexist, and how far they are followed (to the end of 1:1 in Fig. 12).
+BRANCHES_FROM, BRANCHES_WITHIN = 0.19, (0.05, 1.1)
+STIFFNESS_SWEEP = tuple((400 / np.arange(1, 134)).tolist())  # kappa = 400/n
+# The frequencies whose phase planes are drawn are points of the sweep too.
+SHOWN_FREQUENCIES = (np.pi / 3, np.pi, 7.79, 10.0, 10.5, 10.99)
+FREQUENCIES = tuple(np.union1d(np.round(np.arange(0.5, 15.0, 0.03), 2), SHOWN_FREQUENCIES).tolist())
+
+
+class Run(NamedTuple):
+    """One orbit diagram of the paper; hashable, so that figures and claims share its dataset.
+
+    Attributes:
+        along: The axis that is swept.
+        values: Its values.
+        axes: The other axes: name and value or values.
+        direction: "down" or "up".
+        wall: "soft" or "rigid".
+        periods, keep: Of every point, as in `orbit_diagram`.
+    """
+
+    along: str
+    values: tuple[float, ...]
+    axes: tuple[tuple[str, Any], ...]
+    direction: str = "down"
+    wall: str = "soft"
+    periods: int = PERIODS
+    keep: int = KEEP
+
+
+class Source(NamedTuple):
+    """What a panel draws of a run, in one colour.
+
+    Attributes:
+        run: The run.
+        where: Values of the axes that have several, the swept one among them where a single one of it is drawn.
+        colour: As matplotlib names it.
+        text: In the legend, if anything.
+        mirror: Whether the mirror image (u, t) -> (-u, t + 1) is drawn.
+    """
+
+    run: Run
+    where: dict[str, float]
+    colour: str
+    text: str = ""
+    mirror: bool = False
+
+
+class View(NamedTuple):
+    """A panel.
+
+    Attributes:
+        letter: In the layout.
+        shows: A quantity over the swept axis, or what is drawn at one value of it.
+        sources: Of what, the first below the others.
+        title: Above it.
+        levels: Whose impact velocities are dashed red lines.
+        unstable: Impact sequences whose unstable orbits, of the last source's parameters, are red.
+    """
+
+    letter: str
+    shows: str
+    sources: tuple[Source, ...]
+    title: str = ""
+    levels: tuple[Source, ...] = ()
+    unstable: tuple[str, ...] = ()
+
+
+class PaperFigure(NamedTuple):
+    """A figure of the paper.
+
+    Attributes:
+        title: What it is about.
+        layout: Rows of letters; a capital continues the panel of the small letter.
+        views: Its panels.
+        chosen: What the paper leaves open or prints wrongly, and what is drawn here.
+        marks: Values of the swept axis marked by dashed red lines.
+    """
+
+    title: str
+    layout: tuple[str, ...]
+    views: tuple[View, ...]
+    chosen: str = ""
+    marks: tuple[float, ...] = ()
+
+
+def run(along: str, *values: float, **told: Any) -> Run:
+    """A `Run`: its settings by their names, everything else an axis."""
+    settings = {name: told.pop(name) for name in ("direction", "wall", "periods", "keep") if name in told}
+    return Run(along, values, tuple(told.items()), **settings)
+
+
+def _chaos(along: str, value: float, **told: Any) -> Run:
+    """A long run at one point, for a Poincare section."""
+    return run(along, value, periods=SECTION_PERIODS + PERIODS, keep=SECTION_PERIODS, **told)
+
+
+# --- the runs -------------------------------------------------------------------------------------
+
+# Unless a start is given it is 0.05853, -0.47898, the only one that the paper names for soft walls.
+RIGID = run("d", *GAPS, r=0.5, wall="rigid", u0=0.13746, v0=0.61685)
+STIFF = run("d", *GAPS, r=0.5, kappa=400.0)
+BY_GAP = {r: run("d", *GAPS, r=r, kappa=STIFFNESSES) for r in RESTITUTIONS}
+SOFTENED = run("kappa", *STIFFNESS_SWEEP, r=0.5, d=(0.2, 0.18, 0.16, 0.12))
+STIFFENED = run("kappa", *STIFFNESS_SWEEP, r=0.5, d=(0.2, 0.18, 0.16, 0.12), direction="up")
+BY_FREQUENCY = {r: run("omega", *FREQUENCIES, s=GAP_IN_METRES, r=r, k=SPRINGS, direction="up") for r in RESTITUTIONS}
+RIGID_BY_FREQUENCY = run("omega", *FREQUENCIES, s=GAP_IN_METRES, r=0.5, direction="up", wall="rigid")
+
+RIGID_SECTION = _chaos("d", 0.12, r=0.5, wall="rigid")
+STIFF_SECTION = _chaos("d", 0.12, r=0.5, kappa=400.0)
+SOFT_SECTION = _chaos("d", 0.25, r=0.5, kappa=4.0)
+FREQUENCY_SECTION = _chaos("omega", 7.79, s=GAP_IN_METRES, r=0.5, k=560.0)
+
+# --- the captions ---------------------------------------------------------------------------------
+
+_SLOW = r"Slow impacts may have $\rho_j$ above the frame of (b)."
+_ENERGY = "Energies are microjoules, as Eq. (34) with Tables I and II gives them; the paper's mJ cannot be meant."
+
+
+def _each(letters: str, shows: tuple[str, ...], sources: tuple[Source, ...]) -> list[View]:
+    """Panels of the same sources."""
+    return [View(letter, what, sources) for letter, what in zip(letters, shows, strict=True)]
+
+
+def _planes(letters: str, *sources: Source) -> list[View]:
+    """Phase planes of the same sources at the three gaps of Figs. 3 and 5."""
+    return [
+        View(
+            letter,
+            "phase plane",
+            tuple(source._replace(where={"d": d}) for source in sources),
+            f"$d = {d}$",
+            unstable=("RLL",) if d == UNSTABLE_AT else (),
+        )
+        for letter, d in zip(letters, PHASE_PLANES, strict=True)
+    ]
+
+
+def _by_stiffness(r: float, **where: float) -> tuple[Source, ...]:
+    """Five kappa of Figs. 8-11 in their colours."""
+    return tuple(
+        Source(BY_GAP[r], {"kappa": kappa, **where}, colour, rf"$\kappa = {kappa:g}$")
+        for kappa, colour in zip(STIFFNESSES, COLOURS, strict=True)
+    )
+
+
+def _by_spring(r: float, **where: float) -> tuple[Source, ...]:
+    """Five k of Figs. 12-16 in their colours."""
+    return tuple(
+        Source(BY_FREQUENCY[r], {"k": k, **where}, colour, f"$k = {k:g}$ N/m")
+        for k, colour in zip(SPRINGS, COLOURS, strict=True)
+    )
+
+
+def _at_gaps(r: float) -> PaperFigure:
+    shows = ("speed", "restitution", "phase", "duration")
+    return PaperFigure(
+        f"Soft walls over $d$, $r = {r}$",
+        ("aabb", "aabb", "ccdd", "ccdd"),
+        tuple(_each("abcd", shows, _by_stiffness(r))),
+    )
+
+
+def _at_frequencies(r: float) -> PaperFigure:
+    shows = ("speed in m/s", "restitution", "phase", "duration in s", "energy", "power")
+    return PaperFigure(
+        rf"Soft walls over $\omega$, $r = {r}$, $s = 0.2$ m",
+        ("aabb", "aabb", "ccdd", "ccdd", "eeff", "eeff"),
+        tuple(_each("abcdef", shows, _by_spring(r))),
+        r"$\omega$ rises from 0.5 to 15 rad/s by 0.03, as the captions name no range. " + _SLOW + " " + _ENERGY + " On "
+        "the softer membranes the formula gives more than the ball puts in.",
+    )
+
+
+_FIRST, _IMAGE = Source(RIGID, {}, "black", "the sweep"), Source(RIGID, {}, "purple", "its mirror image", mirror=True)
+_HARD, _SOFT = Source(RIGID, {}, "magenta", "rigid"), Source(STIFF, {}, "black", r"soft, $\kappa = 400$")
+_HARD_W = Source(RIGID_BY_FREQUENCY, {}, "magenta", "rigid")
+_SOFT_W = Source(BY_FREQUENCY[0.5], {"k": 560.0}, "black", "soft, $k = 560$ N/m")
+
+
+def _series(letter: str, d: float) -> View:
+    return View(letter, "time series", (Source(RIGID, {"d": d}, "black"),), f"$d = {d}$")
+
+
+def _sweep_of_stiffness(letter: str, d: float) -> View:
+    down = Source(SOFTENED, {"d": d}, "black", r"$\kappa$ falling")
+    up = Source(STIFFENED, {"d": d}, "tab:blue", r"$\kappa$ rising")
+    levels = (Source(RIGID, {"d": d}, "red"),) if d in PHASE_PLANES else ()
+    # The paper shows the way up at d = 0.2 alone.
+    return View(letter, "speed", (up, down) if d == 0.2 else (down,), f"$d = {d}$", levels)
+
+
+def _softening(letter: str, d: float, *kappas: float) -> View:
+    sources = tuple(
+        Source(SOFTENED, {"d": d, "kappa": kappa}, colour, rf"$\kappa = {kappa:.4g}$")
+        for kappa, colour in zip(kappas, COLOURS, strict=False)
+    )
+    return View(letter, "phase plane", sources, f"$d = {d}$")
+
+
+def _at_frequency(letter: str, omega: float, title: str) -> View:
+    both = tuple(source._replace(where=source.where | {"omega": omega}) for source in (_HARD_W, _SOFT_W))
+    return View(letter, "phase plane", both, title)
+
+
+_FAST_ORBIT = Source(SOFTENED, {"d": 0.2, "kappa": 4.0}, COLOURS[-1], r"$\kappa = 4$")
+
+
+def _fast(r: float) -> tuple[Source, ...]:
+    """The three stiffest membranes at the frequencies of Fig. 16(b)."""
+    stiff, medium, soft = _by_spring(r)[:3]
+    return tuple(
+        source._replace(where=source.where | {"omega": omega})
+        for source, omega in ((stiff, 10.0), (medium, 10.0), (soft, 10.5))
+    )
+
+
+FIGURES: dict[int, PaperFigure] = {
+    3: PaperFigure(
+        "Rigid walls over $d$, $r = 0.5$",
+        ("aabb", "aabb", "cdef", "cDEF", "gghh", "gghh"),
+        (
+            View("a", "speed", (_IMAGE, _FIRST), unstable=("RL", "RLL")),
+            View("b", "strobe", (_IMAGE, _FIRST)),
+            View("c", "section", (Source(RIGID_SECTION, {"d": 0.12}, "black"),), "$d = 0.12$"),
+            *_planes("def", _FIRST),
+            *_planes("DEF", _IMAGE),
+            View("g", "energies", (_FIRST,)),
+            View("h", "phase", (_IMAGE, _FIRST)),
+        ),
+        "From both starts of the paper the sweep settles on the same image: purple is its mirror image. Red: "
+        "unstable 1:1 and 1:2 orbits. " + _ENERGY,
+        marks=(0.12, *PHASE_PLANES),
+    ),
+    4: PaperFigure(
+        "Rigid walls: time series in the frame of the ground, $r = 0.5$",
+        ("aaaaaa", "bbbbbb"),
+        (_series("a", 0.2), _series("b", 0.18)),
+        "Blue: where the walls are when the capsule is fastest. Rings: impacts that follow one on the same wall.",
+    ),
+    5: PaperFigure(
+        r"Soft walls of $\kappa = 400$ against rigid walls over $d$, $r = 0.5$",
+        ("aabb", "aabb", "cdef", "gghh", "gghh", "iijj", "iijj"),
+        (
+            *_each("ab", ("speed", "strobe"), (_HARD, _SOFT)),
+            View(
+                "c",
+                "section",
+                (Source(RIGID_SECTION, {"d": 0.12}, "magenta"), Source(STIFF_SECTION, {"d": 0.12}, "black")),
+                "$d = 0.12$",
+            ),
+            *_planes("def", _HARD, _SOFT),
+            *_each("ghij", ("restitution", "duration", "energies", "phase"), (_SOFT,)),
+        ),
+        "The rigid walls start as in Fig. 3 and may settle on mirror images; (d) to (f) show like ones. Red: an "
+        "unstable 1:2 orbit. " + _ENERGY,
+        marks=(0.12, *PHASE_PLANES),
+    ),
+    6: PaperFigure(
+        r"Soft walls over $\kappa = 400/n$, $r = 0.5$",
+        ("aabb", "aabb", "ccdd", "ccdd"),
+        tuple(_sweep_of_stiffness(letter, d) for letter, d in zip("abcd", (0.2, 0.18, 0.16, 0.12), strict=True)),
+        "Dashed red: rigid walls, by the sweep of Fig. 3; none at $d = 0.12$, where they are chaotic.",
+    ),
+    7: PaperFigure(
+        r"Phase planes of the sweeps over $\kappa$, $r = 0.5$",
+        ("aabbcc", "aabbcc"),
+        (
+            View(
+                "a",
+                "phase plane",
+                (
+                    Source(run("kappa", 3.0, d=0.2, r=0.5), {"kappa": 3.0}, "tab:blue", "2:2/3T"),
+                    Source(run("kappa", 3.0, d=0.2, r=0.5, u0=-0.1, v0=0.0), {"kappa": 3.0}, "black", "1:1"),
+                ),
+                r"$d = 0.2$, $\kappa = 3$",
+            ),
+            _softening("b", 0.18, 400.0, 400 / 5, 400 / 10, 400 / 20, 400 / 40),
+            _softening("c", 0.16, 400 / 60, 400 / 80, 400 / 104, 400 / 112, 400 / 130),
+        ),
+        "Text and caption of the paper swap the colours of (a) and name no stiffness in (b) and (c): chosen here.",
+    ),
+    8: _at_gaps(0.5),
+    9: _at_gaps(0.1),
+    10: _at_gaps(0.95),
+    11: PaperFigure(
+        "Phase planes of the sweeps over $d$",
+        ("aabb", "aabb", "ccdd", "ccdd"),
+        (
+            View("a", "chaos", (Source(SOFT_SECTION, {"d": 0.25}, "black"),), r"$\kappa = 4$, $r = 0.5$, $d = 0.25$"),
+            View(
+                "b",
+                "phase plane",
+                (Source(BY_GAP[0.5], {"d": 0.12, "kappa": 12.65}, "tab:orange"),),
+                r"$\kappa = 12.65$, $r = 0.5$, $d = 0.12$",
+            ),
+            View("c", "phase plane", _by_stiffness(0.1, d=0.16), "$r = 0.1$, $d = 0.16$"),
+            View("d", "phase plane", (*_by_stiffness(0.5, d=0.2)[:-1], _FAST_ORBIT), "$r = 0.5$, $d = 0.2$"),
+        ),
+        f"Gray: the orbit; dots: its Poincare section over {SECTION_PERIODS} periods. The chaos of (a) is a long "
+        "transient: see the table of claims. It may end within the sweep of Fig. 8, so that $\\kappa = 4$ "
+        "of (d) is from the sweep of Fig. 6.",
+    ),
+    12: PaperFigure(
+        r"Soft against rigid walls over $\omega$: $\omega_0 = 400$ rad/s, $s = 0.2$ m, $r = 0.5$",
+        ("aabb", "aabb", "cdef", "gghh", "gghh", "iijj", "iijj"),
+        (
+            *_each("ab", ("speed in m/s", "strobe in m"), (_HARD_W, _SOFT_W)),
+            _at_frequency("c", np.pi / 3, r"$\omega = \pi/3$"),
+            _at_frequency("d", np.pi, r"$\omega = \pi$"),
+            View("e", "chaos", (Source(FREQUENCY_SECTION, {"omega": 7.79}, "black"),), r"$\omega = 7.79$"),
+            _at_frequency("f", 10.99, r"$\omega = 10.99$"),
+            *_each("ghij", ("energies", "phase", "restitution", "duration"), (_SOFT_W,)),
+        ),
+        r"$\omega$ rises from 0.5 to 15 rad/s by 0.03, as the caption names no range. " + _ENERGY,
+        marks=(np.pi / 3, np.pi, 7.79, 10.99),
+    ),
+    13: _at_frequencies(0.5),
+    14: _at_frequencies(0.1),
+    15: _at_frequencies(0.95),
+    16: PaperFigure(
+        r"Phase planes of the sweeps over $\omega$",
+        ("aabb", "aabb", "ccdd", "ccdd"),
+        (
+            View("a", "phase plane", _by_spring(0.5, omega=np.pi), r"$r = 0.5$, $\omega = \pi$"),
+            View("b", "phase plane", _fast(0.5), r"$r = 0.5$, $\omega = 10$ and 10.5"),
+            View("c", "phase plane", _by_spring(0.1, omega=np.pi), r"$r = 0.1$, $\omega = \pi$"),
+            View("d", "phase plane", _fast(0.95), r"$r = 0.95$, $\omega = 10$ and 10.5"),
+        ),
+        r"The caption of (c, d) is corrupt. Drawn: (c) $r = 0.1$, $\omega = \pi$, all five $k$; (d) $r = 0.95$ "
+        "at the frequencies of (b).",
+    ),
+}

@@ -1,0 +1,205 @@
+"""One trip of every lane: the quick or the sampled step, with a service for what they decline; or a solver step."""
+
+from functools import partial
+from importlib import import_module
+from types import ModuleType
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from vijax.batch.attractor_search import review
+from vijax.batch.cell import Cell, Course, Event, Lane, Mask, Plan, Settings, last_period
+from vijax.batch.lanes import choose
+from vijax.batch.tally import fold
+from vijax.engine import exact, quick, sampled
+from vijax.engine.quick import Arrival, Hit, Lanes
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.model.records import State, Status
+from vijax.runtime.xla import share
+
+_QUIET = 64  # periods beyond the last one in which the end of a flight is still looked for
+_FOR_EVER = 1e7  # half periods
+_STEPS = 20_000  # steps per period before a cell of a stepping engine is stopped
+
+
+def trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """One impact of every lane: by the quick step on level cells, by certified sampling with gravity."""
+    pair, ball = cell.pair, cell.ball
+    arrival = None
+    if plan.level:
+        hit, arrival, sure, never = quick.quick_step(cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
+    else:
+        hit, sure = sampled.sampled_step(pair, ball, deep=plan.deep, tangent=plan.tangent)
+        never = jnp.zeros_like(sure)
+    active = cell.running & ~cell.declined
+    free = active & (cell.held == 0)
+    no = jnp.zeros_like(active)
+    event = Event(hit, free & sure, free & never, no, no)
+    declined = active & ~(free & (sure | never))
+    hard = cell.hard | declined if not plan.level else cell.hard  # sampling will not do better a second time
+    cell = eqx.tree_at(lambda c: (c.declined, c.hard), cell, (cell.declined | declined, hard))
+    if knows_arrival(plan):
+        # A lane that is declined stays where it is: until it is served every trip finds the same arrival.
+        cell = eqx.tree_at(lambda c: c.arrival, cell, arrival)
+    return fold(plan, settings, cell, event)
+
+
+def knows_arrival(plan: Plan) -> bool:
+    """Whether a declined lane's flight is known: it is nearly always the contact, of soft walls, that is declined."""
+    return plan.level and not plan.rigid and plan.stepping is None
+
+
+class Request(eqx.Module):
+    """What a lane that the quick step declined hands over to be served."""
+
+    pair: ImpactPair
+    ball: Lanes
+    held: Lane
+    end: Lane  # last period
+    arrival: Arrival | None = None  # where the flight ends, if that is known
+
+
+class Answer(eqx.Module):
+    """What became of a request; a lane whose answer is not sure asks again, for the careful step."""
+
+    event: Event
+    left: Mask  # a contact that had no onset: the ball moves and nothing is counted
+    sure: Mask
+
+
+def request(plan: Plan, settings: Settings, cell: Cell) -> Request:
+    """What serving each lane would need."""
+    return Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell.since), cell.arrival)
+
+
+def sampled_answer(plan: Plan, request: Request) -> Answer:
+    """By certified sampling."""
+    hit, sure = sampled.sampled_step(request.pair, request.ball, request.arrival, deep=plan.deep, tangent=plan.tangent)
+    no = jnp.zeros_like(sure)
+    sure = sure & (request.held == 0)
+    return Answer(Event(hit, sure, no, no, no), no, sure)
+
+
+def careful_answer(plan: Plan, request: Request) -> Answer:
+    """`exact.step` on every lane."""
+    pair, ball, held = request.pair, request.ball, request.held
+    horizon = 2 * (jnp.maximum(request.end - ball.n, 0.0) + _QUIET)
+    state = State(ball.u, ball.v, ball.t, jnp.zeros(ball.n.shape, jnp.int32), held.astype(jnp.int32))
+    out = jax.vmap(partial(exact.step, deep=plan.deep))(pair, state, horizon)
+    matrix = None
+    if plan.tangent:
+        rows = jax.vmap(exact.tangent)(pair, out)
+        matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
+    after = out.state
+    # A flight that drifts comes to a wall after the horizon.
+    late = out.quiet & ~_neutral(pair, ball)
+    hit = Hit(
+        onset_t=out.impact.t,
+        onset_n=jnp.where(late, jnp.inf, ball.n + out.impact.n.astype(ball.n.dtype)),
+        side=jnp.where(out.impact.side < 0, -1.0, 1.0).astype(ball.u.dtype),
+        v_in=out.impact.v_in,
+        v_out=out.impact.v_out,
+        flight=out.flight,
+        duration=out.stay,
+        after=Lanes(after.u, after.v, after.t, ball.n + after.n.astype(ball.n.dtype)),
+        depth=out.impact.depth if plan.deep else None,
+        work=out.impact.work if plan.deep else None,
+        tangent=matrix,
+    )
+    event = Event(hit, (out.impact.side != 0) | late, out.quiet & ~late, out.permanent, out.stuck)
+    return Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
+
+
+def _neutral(pair: ImpactPair, ball: Lanes) -> Mask:
+    """Whether a flight that nothing stops stays within the gap for as good as ever."""
+    drift = ball.v - jnp.sin(flow.PI * ball.t) / flow.PI
+    return jnp.abs(drift) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
+
+
+def settle(plan: Plan, settings: Settings, cell: Cell, answer: Answer, served: Mask) -> Cell:
+    """The cells with the answers of those that were served."""
+    event, left = answer.event, answer.left & served
+    ours = served & answer.sure
+    event = Event(event.hit, event.real & ours, event.quiet & ours, event.permanent & ours, event.stuck & ours)
+    cell = eqx.tree_at(
+        lambda c: (c.declined, c.hard, c.ball, c.held),
+        cell,
+        (
+            cell.declined & ~ours,
+            (cell.hard | served) & ~ours,
+            choose(left, event.hit.after, cell.ball),
+            jnp.where(left, 0.0, cell.held),
+        ),
+    )
+    return fold(plan, settings, cell, event)
+
+
+def _stepping(plan: Plan) -> ModuleType:
+    """The room of the stepping engine, loaded when it is first asked for: diffrax takes a second."""
+    return import_module(f"vijax.engine.{plan.stepping}")
+
+
+def set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Lanes, held: Lane) -> Course:
+    """Lanes of a stepping engine at the start of a run or of a round."""
+    engine, method = _stepping(plan), settings.method
+    whole = ball.n.astype(jnp.int32)
+    state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
+    carry = jax.vmap(partial(engine.start, method, deep=plan.deep, tangent=plan.tangent))(pair, state)
+    wall = jax.vmap(method.law.wall)(pair)
+    _, passage, _ = jax.eval_shape(jax.vmap(partial(engine.step, method)), pair, wall, carry)
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), passage)
+    return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
+
+
+def stepping_trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """One solver step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
+    old = cell.course
+    step = partial(_stepping(plan).step, settings.method)
+    carry, passage, finished = share(jax.vmap(step)(cell.pair, old.wall, old.carry))
+    blocked = old.waits & finished
+    new = Course(
+        old.wall,
+        choose(blocked, old.carry, carry),
+        old.waits | finished,
+        choose(finished & ~blocked, passage, old.passage),
+    )
+    return eqx.tree_at(lambda c: c.course, cell, new)
+
+
+def stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """Fold the impacts that wait, end flights and contacts that outlast the run, and review what has stopped."""
+    course, carry, passage = cell.course, cell.course.carry, cell.course.passage
+    impact, after = passage.impact, passage.after
+    waits = course.waits & cell.running
+    # A round of a candidate orbit may begin close to the end and go on beyond it.
+    end = last_period(plan, settings, cell.since)
+    late = carry.n.astype(cell.count.dtype) - jnp.maximum(end, cell.ball.n)
+    idle = cell.running & ~course.waits
+    out = idle & (carry.mode == 0) & (late >= (_QUIET if cell.candidate is not None else 0))
+    quiet = out & _neutral(cell.pair, cell.ball)
+    permanent = idle & (carry.mode != 0) & (late >= _QUIET)
+    hit = Hit(
+        onset_t=impact.t,
+        onset_n=jnp.where(out, jnp.inf, impact.n.astype(impact.t.dtype)),
+        side=impact.side.astype(impact.t.dtype),
+        v_in=impact.v_in,
+        v_out=impact.v_out,
+        flight=passage.flight,
+        duration=impact.duration,
+        after=Lanes(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
+        depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
+        work=impact.work if plan.deep else None,
+        tangent=passage.tangent,
+    )
+    cell = fold(plan, settings, cell, Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
+    if plan.stepping == "ode":  # the steps of the other are counted by its clock
+        spent = cell.running & (carry.steps.astype(cell.count.dtype) > _STEPS * (end + 1))
+        status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
+        cell = eqx.tree_at(lambda c: (c.running, c.status), cell, (cell.running & ~spent, status))
+    stopped = ~cell.running
+    cell = review(plan, settings, cell)
+    again = set_off(plan, settings, cell.pair, cell.ball, jnp.zeros_like(cell.count))
+    course = eqx.tree_at(lambda c: c.waits, course, jnp.zeros_like(waits))
+    return eqx.tree_at(lambda c: c.course, cell, choose(stopped & cell.running, again, course))

@@ -1,0 +1,221 @@
+"""The attractor of a cell: an impact that recurs, then rounds of Newton on the tangent map that confirm it or not."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally
+from vijax.batch.chain import depart
+from vijax.batch.lanes import choose
+from vijax.engine.method import Ode
+from vijax.engine.quick import Hit, Lanes
+from vijax.model import flow
+from vijax.model.records import Status
+from vijax.runtime.xla import share
+
+MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
+_ROUNDS = 8  # Newton rounds on one candidate
+_SHORT = 8  # longest period, in forcing periods, of an orbit whose surroundings are taken to be wide
+_GAIN = 1e3  # at most is what rounding gains in solving for Newton's step
+_WITHIN = 0.3  # of Newton's first step is left for the second where the first one was within the orbit's reach
+
+
+def grain(settings: Settings) -> Float[Array, ""] | float:
+    """How far a round started from one point may end apart: nothing but where a solver chooses its steps."""
+    return settings.method.rtol if isinstance(settings.method, Ode) else 0.0
+
+
+def recurrence(dtype, grain=0.0):
+    """How closely an impact must recur to start a Newton round: 1e-6 in float64, and more as the method is coarse."""
+    return (1e-6 if dtype == jnp.float64 else 3e-3) + 100 * grain
+
+
+def settled(dtype, grain=0.0):
+    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64, 4e-6 in float32.
+
+    In float32 that is nearer to rounding: an orbit accepted at the first look would keep the decay of a flip, which
+    recurs sooner after two turns than after one, and have twice its period.
+    """
+    return (1e4 if dtype == jnp.float64 else 30.0) * float(jnp.finfo(dtype).eps) + grain
+
+
+def blank_candidate(settings: Settings, like: Lane, ball: Lanes) -> Candidate:
+    """A search that has seen no impact yet."""
+    zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
+    inf = jnp.full_like(like, jnp.inf)
+    near = jnp.full_like(like, recurrence(like.dtype, grain(settings)))
+    return Candidate(zero, zero, inf, zero, zero, near, no, no, zero, zero, zero, zero, ball, ball, zero, inf, zero)
+
+
+def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
+    """Compare the impact with the anchor, an earlier one moved on by a quarter of the count; end rounds."""
+    c = cell.candidate
+    if c is None:
+        return None, jnp.zeros_like(kept)
+    lag = (hit.onset_n - c.anchor_n) + 0.5 * (hit.onset_t - c.anchor_t)  # in periods
+    period = jnp.round(lag)
+    near = (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < c.tolerance) & (period >= 1)
+    found = kept & ~c.tracing & near & (period <= MAX_PERIOD)
+    fresh = kept & ~c.tracing & ~found & (count >= c.next_anchor)
+    left = c.left - (kept & c.tracing).astype(c.left.dtype)
+    finished = kept & c.tracing & (left <= 0)
+    # On a round the anchor is the round's first impact.
+    opening = kept & c.tracing & (c.left == c.length)
+    again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
+    same = 1e-2 * recurrence(lag.dtype, 100 * grain(settings))
+    again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < same)
+    fresh, again, found = share((fresh | opening, again, found))
+    return (
+        Candidate(
+            anchor_t=jnp.where(fresh, hit.onset_t, c.anchor_t),
+            anchor_n=jnp.where(fresh, hit.onset_n, c.anchor_n),
+            anchor_v=jnp.where(fresh, hit.v_in, c.anchor_v),
+            anchor_count=jnp.where(fresh, count, c.anchor_count),
+            next_anchor=jnp.where(fresh, count + 8 + jnp.floor(0.25 * count), c.next_anchor),
+            tolerance=c.tolerance,
+            found=c.found | found,
+            tracing=c.tracing,
+            left=left,
+            length=jnp.where(found, count - c.anchor_count, c.length),
+            period=jnp.where(found, period, c.period),
+            prime=jnp.where(again, period, c.prime),
+            base=c.base,
+            origin=c.origin,
+            moved=c.moved,
+            last=c.last,
+            rounds=c.rounds,
+        ),
+        found | finished,
+    )
+
+
+def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """Decide about the cells that have stopped: start a round, judge one, or end."""
+    stopped = ~cell.running & ~cell.done
+    failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
+    if cell.candidate is None:
+        return eqx.tree_at(lambda c: c.done, cell, cell.done | stopped)
+    c = cell.candidate
+    start = stopped & c.found & ~failed
+    judged = stopped & c.tracing & (c.left <= 0) & ~failed
+    size, nudge_u, nudge_v, largest, gain = _newton(plan, cell)
+    least = grain(settings)
+    close, far = settled(size.dtype, least), 1e3 * recurrence(size.dtype, least)
+    # Rounding leaves of a step what it gains in solving. A step that shrinks slowly for any other reason is not there
+    # yet: near a flip, where the motion after two turns is nearly what it was, Newton gains but a third a round.
+    arrived = (size < close) | ((size < close * jnp.clip(gain, 1.0, _GAIN)) & (size > 0.25 * c.last))
+    # A long orbit attracts from so near that chaos may pass it within the recurrence and go on. There Newton's second
+    # step is no shorter than the first: the orbit is a real one, but the ball is not on its way to it.
+    astray = judged & (c.period > _SHORT) & (c.rounds == 1) & (size > jnp.maximum(_WITHIN * c.last, close))
+    good = judged & arrived & (largest < 1 + 1e-6) & ~astray
+    # Where a bounded, contracting Newton step leads nowhere near, the recurrence was a coincidence.
+    bad = judged & ~good & (arrived | astray | ~(size + c.moved < far) | (c.rounds >= _ROUNDS))
+    again = judged & ~good & ~bad
+    cell = _begin_round(plan, cell, start | again, start, nudge_u, nudge_v, size)
+    cell = _back_to_search(plan, cell, bad, 10 * least)
+    done = cell.done | (stopped & ~start & ~again & ~bad)
+    return eqx.tree_at(lambda x: (x.done, x.multiplier), cell, (done, jnp.where(good, largest, cell.multiplier)))
+
+
+def _newton(plan: Plan, cell: Cell):
+    """Size and components of Newton's correction of the round's start, the largest multiplier, what rounding gains."""
+    c = cell.candidate
+    grown = jnp.exp(cell.exponent * jnp.log(TANGENT_SCALE))
+    m = jnp.stack([jnp.stack(cell.tangent[:2], -1), jnp.stack(cell.tangent[2:], -1)], -2) * grown[:, None, None]
+    # The round ended at an exit; fly on (or back) to the phase at which it began.
+    rest = 2 * (c.base.n + c.period - cell.ball.n) + (c.base.t - cell.ball.t)
+    rise, v = jax.vmap(flow.flight)(cell.pair.gamma, cell.ball.t, cell.ball.v, rest)
+    m = jax.vmap(flow.flight_matrix)(rest) @ m
+    miss_u, miss_v = cell.ball.u + rise - c.base.u, v - c.base.v
+    a, b, e, d = 1 - m[:, 0, 0], -m[:, 0, 1], -m[:, 1, 0], 1 - m[:, 1, 1]
+    determinant = a * d - b * e
+    safe = jnp.where(determinant == 0, jnp.nan, determinant)
+    nudge_u, nudge_v = (d * miss_u - b * miss_v) / safe, (a * miss_v - e * miss_u) / safe
+    gain = (jnp.abs(a) + jnp.abs(b) + jnp.abs(e) + jnp.abs(d)) / jnp.abs(safe)
+    half_trace = 0.5 * (m[:, 0, 0] + m[:, 1, 1])
+    product = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+    spread = half_trace * half_trace - product
+    largest = jnp.where(
+        spread > 0, jnp.abs(half_trace) + jnp.sqrt(jnp.maximum(spread, 0.0)), jnp.sqrt(jnp.maximum(product, 0.0))
+    )
+    size = jnp.abs(nudge_u) + jnp.abs(nudge_v) + jnp.where(jnp.abs(rest) < 0.05, 0.0, jnp.inf)
+    return jnp.where(jnp.isfinite(size), size, jnp.inf), nudge_u, nudge_v, largest, gain
+
+
+def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane, nudge_v: Lane, size: Lane) -> Cell:
+    """Set lanes off on a round: from where they are, or from the last round's start, corrected."""
+    c = cell.candidate
+    corrected = Lanes(c.base.u + nudge_u, c.base.v + nudge_v, c.base.t, c.base.n)
+    base = choose(begin, choose(first, cell.ball, corrected), c.base)
+    new = Candidate(
+        anchor_t=c.anchor_t,
+        anchor_n=c.anchor_n,
+        anchor_v=c.anchor_v,
+        anchor_count=c.anchor_count,
+        next_anchor=c.next_anchor,
+        tolerance=c.tolerance,
+        found=c.found & ~begin,
+        tracing=c.tracing | begin,
+        left=jnp.where(begin, c.length, c.left),
+        length=c.length,
+        period=c.period,
+        prime=jnp.where(begin, c.period, c.prime),
+        base=base,
+        origin=choose(first, cell.ball, c.origin),
+        moved=jnp.where(begin, jnp.where(first, 0.0, c.moved + size), c.moved),
+        last=jnp.where(begin, jnp.where(first, jnp.inf, size), c.last),
+        rounds=jnp.where(begin, jnp.where(first, 0.0, c.rounds + 1), c.rounds),
+    )
+    one, zero = jnp.ones_like(size), jnp.zeros_like(size)
+    return eqx.tree_at(
+        lambda x: (x.candidate, x.ball, x.tally, x.tangent, x.exponent, x.running, x.relay),
+        cell,
+        (
+            new,
+            choose(begin, base, cell.ball),
+            choose(begin, blank_tally(plan, size), cell.tally),
+            choose(begin, (one, zero, zero, one), cell.tangent),
+            choose(begin, zero, cell.exponent),
+            cell.running | begin,
+            depart(cell, begin),
+        ),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] | float) -> Cell:
+    """A candidate that is no attractor: go on from where the search stood, with a tolerance a hundred times tighter.
+
+    Newton may have taken the ball onto an orbit that repels, which it would leave only after hundreds of periods.
+    What recurs to rounding and is none will not become one: the search is over, or it would hold the cell for
+    thousands of periods, each failed round beginning its window anew.
+    """
+    c = cell.candidate
+    zero = jnp.zeros_like(cell.since)
+    ball = choose(bad, c.origin, cell.ball)
+    rounding = jnp.finfo(zero.dtype).eps
+    tighter = jnp.where(c.tolerance > rounding, jnp.maximum(1e-2 * c.tolerance, jnp.maximum(least, rounding)), 0.0)
+    new = eqx.tree_at(
+        lambda x: (x.tracing, x.tolerance, x.anchor_v, x.next_anchor),
+        c,
+        (
+            c.tracing & ~bad,
+            jnp.where(bad, tighter, c.tolerance),
+            jnp.where(bad, jnp.inf, c.anchor_v),
+            jnp.where(bad, cell.count, c.next_anchor),
+        ),
+    )
+    return eqx.tree_at(
+        lambda x: (x.candidate, x.ball, x.tally, x.since, x.batch, x.running),
+        cell,
+        (
+            new,
+            ball,
+            choose(bad, blank_tally(plan, zero), cell.tally),
+            # The round spoiled the window's sums: it starts again here.
+            jnp.where(bad, jnp.maximum(cell.since, ball.n + 1), cell.since),
+            jnp.where(bad, -1.0, cell.batch),
+            cell.running | bad,
+        ),
+    )

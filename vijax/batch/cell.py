@@ -1,0 +1,172 @@
+"""A cell on its lane: what the run is asked for, where the ball is, what has been seen; and a fresh one.
+
+Every cell is a small state machine. It searches until an impact recurs (`attractor_search`), then follows the candidate
+orbit from one impact around to the next, adding up its measures and its tangent map (`tally`); Newton's step on that
+map either confirms the orbit (the sums of the last round are the answer, `summary`) or sends the cell back to search,
+more sceptical. A cell that reaches its last period without an orbit reports averages over the window since its
+transient.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vijax.engine.method import Method, Passage
+from vijax.engine.quick import Arrival, Hit, Lanes, Wall
+from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
+
+Lane = Float[Array, "lane"]
+Mask = Bool[Array, "lane"]
+
+TRANSIENT_SHARE = 0.25  # of the periods that a cell without an orbit leaves out of its averages
+BATCHES = 24  # batch means behind a standard error
+TANGENT_SCALE = 2.0**40  # the tangent map is kept between 1/TANGENT_SCALE and this, the rest in an exponent
+
+
+class Plan(eqx.Module):
+    """What a run is asked for: the static choices that select a compiled program."""
+
+    until: str = eqx.field(static=True)
+    stepping: str | None = eqx.field(static=True)  # the room of the stepping engine, None for the exact one
+    rigid: bool = eqx.field(static=True)
+    level: bool = eqx.field(static=True)  # gamma = 0 everywhere
+    deep: bool = eqx.field(static=True)
+    energies: bool = eqx.field(static=True)
+    asymmetry: bool = eqx.field(static=True)
+    tangent: bool = eqx.field(static=True)
+    variants: int = eqx.field(static=True)
+    chained: bool = eqx.field(static=True, default=False)  # a cell starts in the last one's state (`chain`)
+
+
+class Settings(eqx.Module):
+    """What a run is asked for: the traced numbers."""
+
+    periods: Float[Array, ""]
+    transient: Float[Array, ""]
+    device: Harvester
+    method: Method | None
+    length_variant: Float[Array, "variant"]
+    speed_variant: Float[Array, "variant"]
+    keep: Float[Array, ""] | None = None  # chained: periods at the end whose impacts are wanted
+
+
+class Tally(eqx.Module):
+    """Sums over the impacts of a window or of one round of a candidate orbit."""
+
+    left: Lane
+    right: Lane
+    rebound_left: Lane  # sum of -v_out/v_in
+    rebound_right: Lane
+    contact: Lane
+    fastest: Lane
+    momentum: Lane | None  # sum of v_in, signed
+    deepest: Lane | None
+    energy: Float[Array, "lane variant"] | None  # of the running batch
+    energy_past: Float[Array, "lane variant"] | None  # of the full batches
+    energy_square: Float[Array, "lane variant"] | None  # of their sums, squared
+    ratio: Float[Array, "lane variant"] | None
+    stuck: Mask | None
+
+
+class Candidate(eqx.Module):
+    """The recurrence test and the Newton rounds of an attractor search."""
+
+    anchor_t: Lane
+    anchor_n: Lane
+    anchor_v: Lane
+    anchor_count: Lane
+    next_anchor: Lane
+    tolerance: Lane
+    found: Mask  # a recurrence waits for review
+    tracing: Mask  # on a round of a candidate orbit
+    left: Lane  # impacts still to come in this round, or that a round will have
+    length: Lane  # impacts of a round
+    period: Lane
+    prime: Lane  # smallest recurrence seen on this round: a flip's slow decay recurs sooner after two turns than one
+    base: Lanes
+    origin: Lanes  # where the search stood when the first round began
+    moved: Lane
+    last: Lane
+    rounds: Lane
+
+
+class Course(eqx.Module):
+    """A lane of a stepping engine: its wall, the engine's carry, and the last impact if it waits to be folded."""
+
+    wall: Any
+    carry: Any
+    waits: Mask
+    passage: Passage
+
+
+class Relay(eqx.Module):
+    """What a chained cell needs to be handed on."""
+
+    start: Lanes
+    mark: Lanes  # the last exit before the kept periods
+    held: Lane  # mode at the mark
+    last: Lanes  # exit of the latest impact before the end, if the round were repeated until then
+    latest: Lane  # the onset of that impact, in periods
+
+
+class Cell(eqx.Module):
+    """A lane's cell: parameters, where the ball is, and what has been seen."""
+
+    pair: ImpactPair
+    wall: Wall | None
+    course: Course | None
+    length: Lane
+    speed: Lane
+    ball: Lanes
+    held: Lane  # mode of a start in contact
+    running: Mask
+    declined: Mask
+    hard: Mask  # declined by sampling too
+    arrival: Arrival | None  # the end of the flight as the last trip found it
+    done: Mask
+    status: Int[Array, "lane"]
+    count: Lane  # impacts so far
+    since: Lane  # first period of the window
+    batch: Lane  # running batch of the window, -1 before it
+    tally: Tally
+    candidate: Candidate | None
+    tangent: tuple[Lane, Lane, Lane, Lane] | None
+    exponent: Lane | None
+    multiplier: Lane | None
+    relay: Relay | None = None
+
+
+class Event(eqx.Module):
+    """A hit with what only the careful step can meet: nothing within the horizon, a contact for ever, sticking."""
+
+    hit: Hit
+    real: Mask  # an onset was seen
+    quiet: Mask
+    permanent: Mask
+    stuck: Mask
+
+
+def blank_tally(plan: Plan, like: Lane) -> Tally:
+    """Sums of nothing yet."""
+    zero = jnp.zeros_like(like)
+    wide = jnp.zeros((*like.shape, plan.variants), like.dtype) if plan.energies else None
+    stuck = jnp.zeros(like.shape, bool) if plan.rigid else None
+    deepest = zero if plan.deep else None
+    momentum = zero if plan.asymmetry else None
+    return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, wide, wide, wide, wide, stuck)
+
+
+def last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:
+    """Where the window of a cell ends; one that a failed round made begin late is a share of the periods long too."""
+    if plan.until == "window":
+        return settings.periods + settings.transient + jnp.zeros_like(since)
+    return jnp.maximum(settings.periods, since + jnp.ceil(TRANSIENT_SHARE * settings.periods))
+
+
+def batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
+    """Periods of a batch behind the standard error."""
+    window = settings.periods * (1.0 if plan.until == "window" else 1 - TRANSIENT_SHARE)
+    return jnp.maximum(jnp.floor(window / BATCHES), 1.0)

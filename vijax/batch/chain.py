@@ -1,0 +1,113 @@
+"""A cell in a chain: where it starts, what it hands on, where the impacts that are wanted of it begin.
+
+A cell on a certified orbit ends there, in the state in which the orbit would be after all of its periods.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from vijax.batch.cell import Cell, Lane, Mask, Relay, Settings
+from vijax.batch.lanes import choose
+from vijax.engine.quick import Hit, Lanes
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Status
+
+_START_REACH = 0.49  # a start outside a rigid gap is put at this part of it
+
+
+class Handover(eqx.Module):
+    """How a cell ended, and where its kept periods are to be flown again from.
+
+    Attributes:
+        u, v, t: The ball at the end of the periods, at phase 0; where a contact spans that moment, at its exit.
+        mark: The ball at an exit before the kept periods, its periods counted from their first (so n < 0), or at the
+            start; of a cell at rest in flight or contact, at their beginning.
+        held: Mode at the mark.
+    """
+
+    u: Lane
+    v: Lane
+    t: Lane
+    mark: Lanes
+    held: Lane
+
+
+def begin(ball: Lanes, held: Lane) -> Relay:
+    """The record of a cell that has just started."""
+    return Relay(ball, ball, held, ball, jnp.full_like(held, -jnp.inf))
+
+
+def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Relay | None:
+    """The record with one impact more; None of a cell that is not chained."""
+    old = cell.relay
+    if old is None:
+        return None
+    tracing, period = cell.candidate.tracing, jnp.maximum(cell.candidate.period, 1.0)
+    early = kept & ~tracing & (hit.after.n < end - settings.keep)
+    ahead = _ahead(hit.onset_n, end, period)
+    onset = hit.onset_n + ahead + 0.5 * hit.onset_t
+    later = kept & tracing & (onset > old.latest)
+    return Relay(
+        start=old.start,
+        mark=choose(early, hit.after, old.mark),
+        held=jnp.where(early, 0.0, old.held),
+        last=choose(later, _moved(hit.after, ahead), old.last),
+        latest=jnp.where(later, onset, old.latest),
+    )
+
+
+def _ahead(n: Lane, end: Lane, period: Lane) -> Lane:
+    """Whole rounds, in periods, that take period n to the last such period before `end`."""
+    return period * (jnp.ceil((end - n) / period) - 1)
+
+
+def _moved(ball: Lanes, periods: Lane) -> Lanes:
+    return Lanes(ball.u, ball.v, ball.t, ball.n + periods)
+
+
+def depart(cell: Cell, begins: Mask) -> Relay | None:
+    """The record as a round begins."""
+    old = cell.relay
+    if old is None:
+        return None
+    latest = jnp.where(begins, -jnp.inf, old.latest)
+    return Relay(old.start, old.mark, old.held, old.last, latest)
+
+
+def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end: Lane) -> Handover:
+    """What is handed on of cells that are done; of one that failed, its start."""
+    old, pair = cell.relay, cell.pair
+    quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
+    last = choose(periodic, old.last, cell.ball)
+    aloft = last.n < end
+    left = jnp.where(aloft, 2 * (end - last.n) - last.t, 0.0)
+    rise, v = jax.vmap(flow.flight)(pair.gamma, last.t, last.v, left)
+    ball = Lanes(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
+    ball = choose(permanent, _resting(pair, end), ball)
+    first = end - settings.keep
+    mark = choose(periodic, _moved(last, _ahead(last.n, first, cell.candidate.period)), old.mark)
+    mark = choose(quiet | permanent, Lanes(ball.u, ball.v, ball.t, first), mark)
+    held = jnp.where(permanent, jnp.sign(ball.u), jnp.where(periodic | quiet, 0.0, old.held))
+    ball = choose(failed, old.start, ball)
+    return Handover(ball.u, ball.v, ball.t, _moved(mark, -first), held)
+
+
+def _resting(pair: ImpactPair, end: Lane) -> Lanes:
+    """A ball that never leaves the wall on which it lies, at phase 0, when all but its steady motion has decayed."""
+    side, zero = -jnp.sign(pair.gamma), jnp.zeros_like(end)
+    if pair.kappa is None:
+        return Lanes(0.5 * side * pair.d, zero, zero, end)
+
+    def steady(pair, side):
+        response = flow.steady_response(flow.membrane(pair), flow.contact_force(pair.gamma, side, jnp.zeros_like(side)))
+        return response.at(jnp.zeros_like(side)), response.slope().at(jnp.zeros_like(side))
+
+    w, z = jax.vmap(steady)(pair, side)
+    return Lanes(side * (0.5 * pair.d + w), side * z, zero, end)
+
+
+def within(kappa: Lane | float | None, d: Lane, u: Lane) -> Lane:
+    """Displacement of a start; one that the gap of a rigid wall does not hold is put back into it."""
+    return jnp.clip(u, -_START_REACH * d, _START_REACH * d) if kappa is None else u

@@ -1,0 +1,119 @@
+"""The impact map applied once to any number of balls: quick, sampled or careful, as each needs."""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from vijax.batch import advance
+from vijax.batch.cell import Event, Plan
+from vijax.engine import quick
+from vijax.engine.quick import Lanes
+from vijax.model.pair import ImpactPair
+from vijax.runtime import tiles, xla
+
+_HORIZON = 64.0  # periods in which an impact must come
+_TILES = (64, 512, 4096)  # balls of one compiled call: a few sizes, so that few programs are compiled
+
+
+class Next(eqx.Module):
+    """The next impact of every ball; `real` is false where none comes or the contact never ends."""
+
+    t: Float[Array, "ball"]  # onset, since phase 0 of the period in which the ball set out
+    side: Float[Array, "ball"]
+    v_in: Float[Array, "ball"]
+    v_out: Float[Array, "ball"]
+    duration: Float[Array, "ball"]
+    depth: Float[Array, "ball"]
+    work: Float[Array, "ball"]
+    real: Bool[Array, "ball"]
+
+
+def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
+    """By the quick step, of level cells."""
+    hit, _, sure, never = quick.quick_step(quick.prepare(request.pair), request.pair.gamma, request.ball, deep=True)
+    no = jnp.zeros_like(sure)
+    return advance.Answer(Event(hit, sure, never, no, no), no, sure | never)
+
+
+def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
+    """By certified sampling; of a contact alone where the quick step knows the flight."""
+    if advance.knows_arrival(plan):
+        known = quick.quick_step(quick.prepare(request.pair), request.pair.gamma, request.ball).arrival
+        request = eqx.tree_at(lambda r: r.arrival, request, known, is_leaf=lambda x: x is None)
+    return advance.sampled_answer(plan, request)
+
+
+@lru_cache(maxsize=16)
+def _compiled(answer: Callable, plan: Plan):
+    def work(request: advance.Request) -> tuple[Next, Bool[Array, "ball"]]:
+        given = answer(plan, request)
+        hit, real = given.event.hit, given.event.real & ~given.event.permanent
+        onset = 2 * hit.onset_n + hit.onset_t
+        return Next(onset, hit.side, hit.v_in, hit.v_out, hit.duration, hit.depth, hit.work, real), given.sure
+
+    return jax.jit(work, compiler_options=xla.compiler_options())
+
+
+def _answered(work: Callable, requests: advance.Request) -> tuple[Next, np.ndarray]:
+    """What the work says of every request, in padded tiles."""
+    parts = []
+    for tile in tiles.tiles(requests.held.size, _TILES):
+        part = work(jax.tree.map(lambda leaf, rows=tile.rows: leaf[rows], requests))
+        parts.append(jax.tree.map(lambda leaf, real=tile.real: np.asarray(leaf)[:real], part))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def next_impacts(
+    pair: ImpactPair,
+    side: Float[Array, "ball"],
+    speed: Float[Array, "ball"],
+    t: Float[Array, "ball"],
+    *,
+    level: bool,
+) -> Next:
+    """Fly every ball from the end of a contact to and through the next one.
+
+    Args:
+        pair: Cells, one a ball.
+        side: Wall that the ball leaves, -1 or +1.
+        speed: Its speed away from there.
+        t: Phase, in [0, 2).
+        level: Whether gamma is 0 everywhere.
+    """
+    plan = Plan(
+        until="window",
+        stepping=None,
+        rigid=pair.kappa is None,
+        level=level,
+        deep=True,
+        energies=False,
+        asymmetry=False,
+        tangent=False,
+        variants=1,
+    )
+    pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
+    zero: Any = np.zeros_like(t)
+    ball = Lanes(0.5 * side * pair.d, -side * speed, t, zero)
+    requests = advance.Request(pair, ball, zero, zero + _HORIZON)
+    # What one step is not sure of is left to the next, which costs several times as much.
+    steps = [_sampled_answer, advance.careful_answer]
+    found, sure = _answered(_compiled(_quick_answer if level else steps.pop(0), plan), requests)
+    for step in steps:
+        rest = np.flatnonzero(~sure)
+        if rest.size:
+            again, certain = _answered(_compiled(step, plan), jax.tree.map(partial(np.take, indices=rest), requests))
+            found = jax.tree.map(partial(_put, rest), found, again)
+            sure = _put(rest, sure, certain)
+    return found
+
+
+def _put(rows: np.ndarray, table: np.ndarray, values: np.ndarray) -> np.ndarray:
+    table = table.copy()
+    table[rows] = values
+    return table

@@ -1,0 +1,374 @@
+"""Cells from start to summary: one compiled program for every kind of run, a tile of cells a call."""
+
+import dataclasses
+from functools import lru_cache, partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vijax.batch import advance, chain, lanes
+from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence, review, settled
+from vijax.batch.cell import TRANSIENT_SHARE, Cell, Plan, Settings, blank_tally
+from vijax.batch.summary import Summary, columns, pack, unload, unpack
+from vijax.engine import exact, quick
+from vijax.engine.method import Method, Ode
+from vijax.engine.quick import Lanes
+from vijax.model.device import Harvester, check_device
+from vijax.model.membrane import HuntCrossley
+from vijax.model.pair import ImpactPair, check_pair
+from vijax.runtime import checks, export_cache
+from vijax.runtime.context import door
+
+_FIELDS = tuple(field.name for field in dataclasses.fields(Summary))
+ENERGY = frozenset({"P", "P_stderr", "energy_ratio"})
+DEEP = ENERGY | {"deepest"}
+
+
+class Scale(eqx.Module):
+    """SI size of the units of every cell, times the variants that share its dynamics.
+
+    Metres per unit of depth of variant m of cell i: length[i] length_variant[m]; a rigid wall's depth is that of
+    kappa = 1, so its length is divided by kappa. Metres per second per unit of speed: likewise.
+    """
+
+    length: Float[Array, "cell"]
+    speed: Float[Array, "cell"]
+    length_variant: Float[Array, "variant"]
+    speed_variant: Float[Array, "variant"]
+
+
+def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell:
+    """Fresh cells from rows (d, kappa, r, gamma, length, speed, u0, v0) and, of chained cells, the phase t0."""
+    d, kappa, r, gamma, length, speed, u, v, *phase = rows.T
+    pair = ImpactPair(d, None if plan.rigid else kappa, r, gamma)
+    zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
+    ball = Lanes(u, v, phase[0] if phase else zero, zero)
+    held = exact.start_mode(pair, u, v, ball.t)
+    start = settings.transient + zero
+    eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None
+    attractor = plan.until == "attractor"
+    return Cell(
+        pair=pair,
+        wall=quick.prepare(pair) if plan.level and plan.stepping is None else None,
+        course=advance.set_off(plan, settings, pair, ball, held) if plan.stepping else None,
+        length=length,
+        speed=speed,
+        ball=ball,
+        held=held,
+        running=~no,
+        declined=no,
+        hard=no,
+        arrival=quick.Arrival(zero, zero, zero, no) if advance.knows_arrival(plan) else None,
+        done=no,
+        status=jnp.zeros(d.shape, jnp.int32),
+        count=zero,
+        since=start,
+        batch=zero - 1,
+        tally=blank_tally(plan, d),
+        candidate=blank_candidate(settings, d, ball) if attractor else None,
+        tangent=eye,
+        exponent=zero if plan.tangent else None,
+        multiplier=zero if plan.tangent else None,
+        relay=chain.begin(ball, held) if plan.chained else None,
+    )
+
+
+def _program(plan: Plan, settings: Settings) -> lanes.Program:
+    program = lanes.Program(
+        load=partial(_load, plan, settings),
+        trip=partial(advance.stepping_trip if plan.stepping else advance.trip, plan, settings),
+        review=partial(advance.stepping_review if plan.stepping else review, plan, settings),
+        stopped=lambda cell: ~cell.running,
+        done=lambda cell: cell.done,
+        unload=lambda cell: pack(unload(plan, settings, cell)),
+        arithmetic=settings.method is None or settings.method.arithmetic,
+    )
+    if plan.stepping:
+        return program
+    return program._replace(
+        service=lanes.Service(
+            declined=lambda cell: cell.declined,
+            hard=lambda cell: cell.hard,
+            request=partial(advance.request, plan, settings),
+            second=partial(advance.sampled_answer, plan) if plan.level else None,
+            careful=partial(advance.careful_answer, plan),
+            settle=partial(advance.settle, plan, settings),
+        )
+    )
+
+
+@lru_cache(maxsize=32)
+def _compiled(plan: Plan, width: int) -> export_cache.Program:
+    """The program of a plan: a whole tile of cells in one call."""
+
+    def tile(cells, count, settings):
+        return lanes.run(_program(plan, settings), cells, count, columns(plan), width)
+
+    return export_cache.Program(tile, f"{tile.__qualname__} {plan} {width}")
+
+
+def _width(cells: int, level: bool) -> int:
+    """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill.
+
+    A sampled step holds some dozens of samples a lane.
+    """
+    return max(min(cells // 8, 512 if level else 256), 128)
+
+
+def tolerances(dtype: str) -> dict[str, float]:
+    """The tolerances that a run in the given precision uses, by name."""
+    kind = jnp.dtype(dtype)
+    return {
+        "recurrence": recurrence(kind),
+        "orbit": settled(kind),
+        "stick_speed": exact.stick_speed(kind),
+        "max_period": float(MAX_PERIOD),
+    }
+
+
+def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, Any], method: Method | None) -> None:
+    """Raise ValueError unless a tile of cells can be run: one-dimensional arrays of one length."""
+    if not isinstance(method, Method | None):
+        raise ValueError(f"method must be a record of vijax.engine.method.choose, or None; got {checks.shown(method)}")
+    # Whoever carries cells of a Hunt-Crossley membrane has NaN for r.
+    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    checks.known("pair", check_pair(pair if lossy else dataclasses.replace(pair, r=None)))
+    check_device(device)
+    checks.instance("scale", scale, Scale, "vijax.batch.simulate.Scale(...)")
+    cells = np.shape(pair.d)
+    if len(cells) != 1 or any(np.shape(field) != cells for field in jax.tree.leaves(pair)):
+        raise ValueError(f"pair must hold 1-D arrays of one length; got shape {cells}; impact_pair broadcasts them")
+    for name, start in starts.items():
+        if checks.finite(name, start).shape != cells:
+            raise ValueError(f"{name} must hold a number a cell, shape {cells}; got shape {np.shape(start)}")
+
+
+@door
+def summarise(
+    pair: ImpactPair,
+    u0: Float[Array, "cell"],
+    v0: Float[Array, "cell"],
+    scale: Scale,
+    device: Harvester,
+    *,
+    periods: int = 400,
+    until: str = "attractor",
+    transient: int = 0,
+    outputs: frozenset[str] = frozenset({"P"}),
+    method: Method | None = None,
+    count: int | None = None,
+    on: jax.Device | None = None,
+) -> Summary:
+    """Run a tile of cells from phase 0, each until its attractor is certain or its window is over, in one jitted call.
+
+    Args:
+        pair: Cells; `kappa=None` for rigid walls.
+        u0, v0: Starts.
+        scale: SI sizes; see `Scale`.
+        device: Electrical constants, mass and penetration limit.
+        periods: Length of the window, or the most that the search for an attractor may take.
+        until: "attractor" or "window".
+        transient: Periods before the window ("window" only).
+        outputs: Names of `Summary` fields that must be there; what only others need is not computed.
+        method: The stepping method (`method.choose` makes it); None for the exact engine.
+        count: How many cells are real, the rest being padding; all unless given.
+        on: The device that runs them; JAX's default unless given.
+
+    Returns:
+        The summary; a cell that fails says so in `status` and holds NaN.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
+    """
+    _check(pair, device, scale, {"u0": u0, "v0": v0}, method)
+    periods, transient = checks.whole("periods", periods, 1), checks.whole("transient", transient, 0)
+    checks.choice("until", until, ("attractor", "window"))
+    outputs = frozenset(checks.words("outputs", outputs, _FIELDS))
+    if on is not None:
+        checks.instance("on", on, jax.Device, "jax.devices()[0]")
+    count = pair.d.shape[0] if count is None else checks.whole("count", count, 0, pair.d.shape[0])
+    dtype = pair.d.dtype
+    plan = Plan(
+        until=until,
+        stepping=None if method is None else "ode" if isinstance(method, Ode) else "rk4",
+        rigid=pair.kappa is None,
+        level=bool((np.asarray(pair.gamma) == 0).all()),
+        deep=bool(outputs & DEEP),
+        energies=bool(outputs & ENERGY),
+        asymmetry="asymmetry" in outputs,
+        tangent=until == "attractor" or "lyapunov" in outputs,
+        variants=scale.length_variant.shape[0],
+    )
+    kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
+    cells = jnp.stack([pair.d, kappa, pair.r, pair.gamma, scale.length, scale.speed, u0, v0], axis=1)
+    settings = Settings(
+        periods=jnp.asarray(periods, dtype),
+        transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
+        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
+        length_variant=scale.length_variant.astype(dtype),
+        speed_variant=scale.speed_variant.astype(dtype),
+    )
+    given = cells, jnp.asarray(count, jnp.int32), settings
+    given = given if on is None else jax.device_put(given, on)
+    return unpack(plan, np.asarray(_compiled(plan, _width(pair.d.shape[0], plan.level))(*given)))
+
+
+def blank(count: int, variants: int, dtype: str) -> Summary:
+    """A summary without content of so many cells: which shape and kind of number each field has."""
+    plan = Plan(
+        until="attractor",
+        stepping=None,
+        rigid=False,
+        level=True,
+        deep=True,
+        energies=True,
+        asymmetry=True,
+        tangent=True,
+        variants=variants,
+    )
+    return unpack(plan, np.zeros((count, columns(plan)), dtype))
+
+
+@door
+def attractors(
+    pair: ImpactPair,
+    u0: Float[Array, "cell"],
+    v0: Float[Array, "cell"],
+    *,
+    periods: int,
+    keep: int,
+    count: int | None = None,
+) -> Summary:
+    """Run a tile of soft cells from phase 0, each until its attractor is certain, in one jitted call; with their ends.
+
+    Args:
+        pair: Cells.
+        u0, v0: Starts.
+        periods: The most that the search for an attractor may take.
+        keep: Periods at the end whose impacts will be wanted.
+        count: How many cells are real, the rest being padding; all unless given.
+
+    Returns:
+        The summary, in the units of `pair`, with its `handover`.
+    """
+    one, zero = jnp.ones_like(pair.d), jnp.zeros_like(pair.d)
+    cells = jnp.stack([pair.d, pair.kappa, pair.r, pair.gamma, one, one, u0, v0, zero], axis=1)
+    plan = _chained(pair)
+    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
+    settings = _chained_settings(pair, Harvester(), periods, keep)
+    return unpack(plan, np.asarray(_compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)))
+
+
+def _chained(pair: ImpactPair) -> Plan:
+    """The plan of cells whose ends are wanted."""
+    return Plan(
+        until="attractor",
+        stepping=None,
+        rigid=pair.kappa is None,
+        level=bool((np.asarray(pair.gamma) == 0).all()),
+        deep=True,
+        energies=True,
+        asymmetry=False,
+        tangent=True,
+        variants=1,
+        chained=True,
+    )
+
+
+def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, keep: int) -> Settings:
+    dtype = pair.d.dtype
+    one = jnp.ones(1, dtype)
+    return Settings(
+        periods=jnp.asarray(periods, dtype),
+        transient=jnp.asarray(jnp.floor(TRANSIENT_SHARE * periods), dtype),
+        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        method=None,
+        length_variant=one,
+        speed_variant=one,
+        keep=jnp.asarray(keep, dtype),
+    )
+
+
+class Starts(eqx.Module):
+    """Where chains start: displacement, velocity and phase."""
+
+    u: Float[Array, "chain"]
+    v: Float[Array, "chain"]
+    t: Float[Array, "chain"]
+
+
+class Growth(eqx.Module):
+    """Units of displacement and of velocity of the cell before, in those of each cell."""
+
+    u: Float[Array, "chain link"]
+    v: Float[Array, "chain link"]
+
+
+def _succeed(plan: Plan, settings: Settings, cell: Cell, rows: Float[Array, "lane in"]) -> Float[Array, "lane in"]:
+    """Rows of the next cells, with the start that the last ones hand on in the place of their growth."""
+    end = unload(plan, settings, cell).handover
+    return _start(plan, rows, end.u, end.v, end.t)
+
+
+def _start(plan: Plan, rows: Float[Array, "lane in"], u, v, t) -> Float[Array, "lane in"]:
+    """Rows that hold a growth, with the start that it makes of a state."""
+    u = chain.within(None if plan.rigid else 1.0, rows[:, 0], u * rows[:, -3])
+    return jnp.concatenate([rows[:, :-3], jnp.stack([u, v * rows[:, -2], t], axis=1)], axis=1)
+
+
+@lru_cache(maxsize=32)
+def _compiled_chains(plan: Plan) -> export_cache.Program:
+    """The program of chains: all their links in one call."""
+
+    def follow(links, starts, count, length, settings):
+        first = _start(plan, links[:, 0], starts.u, starts.v, starts.t)
+        links = links.at[:, 0].set(first)
+        succeed = partial(_succeed, plan, settings)
+        return lanes.chain(_program(plan, settings), succeed, links, count, length, columns(plan))
+
+    return export_cache.Program(follow, f"{follow.__qualname__} {plan}")
+
+
+@door
+def follow(
+    pair: ImpactPair,
+    starts: Starts,
+    growth: Growth,
+    length: Float[Array, "chain link"],
+    speed: Float[Array, "chain link"],
+    device: Harvester,
+    *,
+    periods: int = 400,
+    keep: int = 25,
+    count: int | None = None,
+    links: int | None = None,
+) -> Summary:
+    """Run chains of cells, each cell starting in the state in which the last one ended, in one jitted call.
+
+    Args:
+        pair: Cells [chain, link]; `kappa=None` for rigid walls.
+        starts: Starts of the first cells, at any phase, in contact too, in the units of the cells before them.
+        growth: How the handed-on state grows as its units change; of the first cells too.
+        length, speed: SI sizes of the units of every cell; see `Scale`.
+        device: Electrical constants, mass and penetration limit.
+        periods: Forcing periods of a cell; one whose attractor is certain ends there, as if it had run them all.
+        keep: Periods at the end whose impacts will be wanted.
+        count, links: How many chains and links are real, the rest being padding; all unless given.
+
+    Returns:
+        The summary of every cell, with its `handover`.
+    """
+    kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
+    zero = jnp.zeros_like(pair.d)
+    rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, length, speed, growth.u, growth.v, zero], axis=2)
+    chains, most = pair.d.shape
+    number, long = (jnp.asarray(x, jnp.int32) for x in (count or chains, links or most))
+    settings, plan = _chained_settings(pair, device, periods, keep), _chained(pair)
+    table = np.asarray(_compiled_chains(plan)(rows, starts, number, long, settings))
+    flat = unpack(plan, table.reshape(-1, table.shape[-1]))
+    return jax.tree.map(lambda x: x.reshape(table.shape[:2] + x.shape[1:]), flat)

@@ -1,0 +1,183 @@
+"""What is kept of a cell that has ended, and its row in the table of results."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vijax.batch.cell import TANGENT_SCALE, Cell, Lane, Mask, Plan, Settings, batch_length, last_period
+from vijax.batch.chain import Handover, hand_over
+from vijax.engine.quick import Lanes
+from vijax.model.records import Status
+
+_HANDOVER = 8  # numbers of a Handover
+_CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
+
+
+class Summary(eqx.Module):
+    """What is kept of every cell; nondimensional unless said. Fields not asked for are None."""
+
+    P: Float[Array, "cell variant"] | None  # J per half period
+    P_stderr: Float[Array, "cell variant"] | None
+    energy_ratio: Float[Array, "cell variant"] | None  # largest E_j/W_j
+    deepest: Float[Array, "cell"] | None
+    fastest: Float[Array, "cell"]
+    asymmetry: Float[Array, "cell"] | None  # mean of v_in over the greatest speed
+    period: Int[Array, "cell"]
+    impacts_left: Int[Array, "cell"]
+    impacts_right: Int[Array, "cell"]
+    impacts_per_period: Float[Array, "cell"]
+    restitution: Float[Array, "cell"]
+    restitution_left: Float[Array, "cell"]
+    restitution_right: Float[Array, "cell"]
+    contact_time: Float[Array, "cell"]
+    contact_fraction: Float[Array, "cell"]
+    lyapunov: Float[Array, "cell"] | None
+    periods_run: Float[Array, "cell"]
+    status: Int[Array, "cell"]
+    handover: Handover | None = None  # of chained cells
+
+
+def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
+    """What is kept of cells that are done."""
+    t = cell.tally
+    attractor = cell.candidate is not None
+    periodic = cell.candidate.tracing if attractor else jnp.zeros_like(cell.running)
+    failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
+    periodic = periodic & ~failed
+    quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
+    end = last_period(plan, settings, cell.since)
+    window = end - cell.since
+    span = jnp.where(periodic, cell.candidate.period if attractor else 1.0, window)
+    hits = t.left + t.right
+    silent = ~periodic & ~failed & ~permanent & ((hits == 0) | (quiet if attractor else False))
+    still = silent | permanent
+    status = jnp.where(silent, Status.NO_IMPACT, jnp.where(permanent | failed, cell.status, Status.OK))
+    prime = cell.candidate.prime if attractor else span
+    period = jnp.where(periodic, prime, -1.0)
+    lyapunov = None
+    if plan.tangent:
+        size = sum(jnp.abs(x) for x in cell.tangent)
+        growth = jnp.log(size) + cell.exponent * jnp.log(TANGENT_SCALE)
+        chaotic = growth > _CHAOS
+        lyapunov = jnp.where(periodic, jnp.log(cell.multiplier) / span, growth / window)
+        lyapunov = jnp.where(still | failed, jnp.nan, lyapunov)
+        if attractor:
+            period = jnp.where(periodic, prime, jnp.where(chaotic, 0.0, -1.0))
+            status = jnp.where(~periodic & ~chaotic & ~still & ~failed, Status.SLOW, status)
+    if attractor:
+        period = jnp.where(still, 1.0, jnp.where(failed, -1.0, period))
+    if plan.rigid:
+        status = jnp.where(t.stuck & (status == Status.OK), Status.STICKING, status)
+
+    def per(total, number):
+        return jnp.where((number > 0) & ~still, total / jnp.where(number > 0, number, 1.0), jnp.nan)
+
+    def measured(value):
+        value = jnp.where(still, 0.0, value)
+        return jnp.where(failed, jnp.nan, value)
+
+    power = error = ratio = None
+    if plan.energies:
+        power, error = _power(plan, settings, cell, periodic, still, window, span)
+        power, error = jnp.where(failed[:, None], jnp.nan, power), jnp.where(failed[:, None], jnp.nan, error)
+        ratio = jnp.where(failed[:, None], jnp.nan, jnp.where(still[:, None], 0.0, t.ratio))
+    ran = cell.ball.n + 0.5 * cell.ball.t
+    labelled = periodic | (still & attractor)
+    return Summary(
+        P=power,
+        P_stderr=error,
+        energy_ratio=ratio,
+        deepest=jnp.where(failed, jnp.nan, jnp.where(silent, 0.0, t.deepest)) if plan.deep else None,
+        fastest=measured(t.fastest),
+        asymmetry=per(t.momentum, hits * t.fastest) if plan.asymmetry else None,
+        period=period,
+        impacts_left=jnp.where(labelled, jnp.where(still, 0.0, jnp.round(t.left * prime / span)), -1.0),
+        impacts_right=jnp.where(labelled, jnp.where(still, 0.0, jnp.round(t.right * prime / span)), -1.0),
+        impacts_per_period=measured(hits / span),
+        restitution=per(t.rebound_left + t.rebound_right, hits),
+        restitution_left=per(t.rebound_left, t.left),
+        restitution_right=per(t.rebound_right, t.right),
+        contact_time=per(t.contact, hits),
+        contact_fraction=jnp.where(permanent, 1.0, measured(t.contact / (2 * span))),
+        lyapunov=lyapunov,
+        periods_run=jnp.where(periodic, ran, jnp.where(failed | still, jnp.minimum(ran, end), end)),
+        status=status,
+        handover=hand_over(settings, cell, periodic, failed, end) if plan.chained else None,
+    )
+
+
+def _power(plan, settings, cell: Cell, periodic: Mask, still: Mask, window: Lane, span: Lane):
+    """Energy per half period, and its standard error by batch means (0 on an orbit)."""
+    t = cell.tally
+    length = batch_length(plan, settings)
+    batches = jnp.floor(window / length)
+    last = (cell.batch < batches)[:, None]  # the running batch is a whole one: nothing came after it
+    past = t.energy_past + jnp.where(last, t.energy, 0.0)
+    square = t.energy_square + jnp.where(last, t.energy * t.energy, 0.0)
+    number = jnp.maximum(batches, 1.0)[:, None]
+    mean = past / number
+    spread = jnp.maximum(square / number - mean * mean, 0.0) * number / jnp.maximum(number - 1, 1.0)
+    error = jnp.sqrt(spread / number) / (2 * length)
+    error = jnp.where((batches >= 2)[:, None], error, jnp.nan)
+    power = (t.energy_past + t.energy) / (2 * span)[:, None]
+    none = still[:, None]
+    return jnp.where(none, 0.0, power), jnp.where(none | periodic[:, None], 0.0, error)
+
+
+def pack(summary: Summary) -> Float[Array, "row out"]:
+    """A summary as rows of one table: one write a cell."""
+    leaves = jax.tree.leaves(summary)
+    dtype = summary.impacts_per_period.dtype
+    return jnp.concatenate([(x if x.ndim == 2 else x[:, None]).astype(dtype) for x in leaves], axis=1)
+
+
+def unpack(plan: Plan, table: Float[np.ndarray, "cell out"]) -> Summary:
+    """The table of `pack` as a summary again, of numpy arrays; counts and codes as integers."""
+    column = 0
+
+    def take(width: int | None) -> Any:
+        nonlocal column
+        column += width or 1
+        return table[:, column - 1] if width is None else table[:, column - width : column]
+
+    def whole() -> Any:
+        return take(None).astype(np.int32)
+
+    wide = plan.variants
+    return Summary(
+        P=take(wide) if plan.energies else None,
+        P_stderr=take(wide) if plan.energies else None,
+        energy_ratio=take(wide) if plan.energies else None,
+        deepest=take(None) if plan.deep else None,
+        fastest=take(None),
+        asymmetry=take(None) if plan.asymmetry else None,
+        period=whole(),
+        impacts_left=whole(),
+        impacts_right=whole(),
+        impacts_per_period=take(None),
+        restitution=take(None),
+        restitution_left=take(None),
+        restitution_right=take(None),
+        contact_time=take(None),
+        contact_fraction=take(None),
+        lyapunov=take(None) if plan.tangent else None,
+        periods_run=take(None),
+        status=whole(),
+        handover=_unpack_handover(take) if plan.chained else None,
+    )
+
+
+def _unpack_handover(take: Callable[[None], Lane]) -> Handover:
+    u, v, t, *mark, held = (take(None) for _ in range(_HANDOVER))
+    return Handover(u, v, t, Lanes(*mark), held)
+
+
+def columns(plan: Plan) -> int:
+    """Length of a row of `pack`."""
+    wide = 3 * plan.variants * plan.energies
+    return 12 + wide + plan.deep + plan.asymmetry + plan.tangent + _HANDOVER * plan.chained

@@ -1,0 +1,128 @@
+"""Adding an impact to a cell: its sums, its tangent map, its recurrence, and whether the cell stops there."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from vijax.batch.attractor_search import recur
+from vijax.batch.cell import TANGENT_SCALE, Cell, Event, Lane, Mask, Plan, Settings, Tally, batch_length, last_period
+from vijax.batch.chain import note
+from vijax.batch.lanes import choose
+from vijax.engine.quick import Hit
+from vijax.model import energy
+from vijax.model.records import Status
+from vijax.runtime.xla import share
+
+_BUDGET = 512  # impacts per period before a cell is stopped
+
+
+def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
+    """Add one event to a cell."""
+    hit = event.hit
+    ended = event.quiet | event.permanent
+    end = last_period(plan, settings, cell.since)
+    over = event.real & (hit.onset_n >= end)
+    tracing = jnp.zeros_like(over) if cell.candidate is None else cell.candidate.tracing
+    over = over & ~tracing
+    kept = event.real & ~over & ~event.permanent
+    status = jnp.where(event.quiet, Status.NO_IMPACT, cell.status)
+    status = jnp.where(event.permanent, Status.PERMANENT_CONTACT, status).astype(cell.status.dtype)
+    counted = kept & (tracing | (hit.onset_n >= cell.since))
+    over, kept, counted = share((over, kept, counted))
+    count = cell.count + kept.astype(cell.count.dtype)
+    spent = count > _BUDGET * (end + 1)
+    broken = event.real & ~jnp.isfinite(hit.v_out + hit.after.t)
+    status = jnp.where(spent, Status.EVENT_BUDGET, jnp.where(broken, Status.NONFINITE, status))
+    tangent, exponent = _extend_tangent(cell, hit, kept, counted)
+    batch = jnp.where(counted & ~tracing, _batch_of(plan, settings, cell, hit), cell.batch)
+    tally = _add(plan, settings, cell, hit, counted, batch, tracing, event.stuck)
+    if plan.deep:
+        # A contact for ever has a depth although no impact ends it.
+        held = event.permanent & (hit.depth > tally.deepest)
+        tally = eqx.tree_at(lambda t: t.deepest, tally, jnp.where(held, hit.depth, tally.deepest))
+    candidate, found = recur(settings, cell, hit, kept, count)
+    stop = over | ended | spent | broken | found
+    return eqx.tree_at(
+        lambda c: (
+            c.ball,
+            c.running,
+            c.status,
+            c.count,
+            c.batch,
+            c.tally,
+            c.candidate,
+            c.tangent,
+            c.exponent,
+            c.relay,
+        ),
+        cell,
+        (
+            choose(kept, hit.after, cell.ball),
+            cell.running & ~stop,
+            status.astype(cell.status.dtype),
+            count,
+            batch,
+            tally,
+            candidate,
+            tangent,
+            exponent,
+            note(settings, cell, hit, kept, end),
+        ),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def _batch_of(plan: Plan, settings: Settings, cell: Cell, hit: Hit) -> Lane:
+    return jnp.floor((hit.onset_n - cell.since) / batch_length(plan, settings))
+
+
+def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
+    """Tangent map with the new step on the left; started afresh by the first impact of the window."""
+    if cell.tangent is None:
+        return None, None
+    fresh = counted & (cell.batch < 0)
+    if cell.candidate is not None:
+        fresh = fresh & ~cell.candidate.tracing
+    a, b, c, d = (jnp.where(fresh, unit, old) for unit, old in zip((1.0, 0.0, 0.0, 1.0), cell.tangent, strict=True))
+    p, q, r, s = hit.tangent
+    a, b, c, d = p * a + q * c, p * b + q * d, r * a + s * c, r * b + s * d
+    size = jnp.abs(a) + jnp.abs(b) + jnp.abs(c) + jnp.abs(d)
+    shrink = jnp.where(size > TANGENT_SCALE, 1 / TANGENT_SCALE, jnp.where(size < 1 / TANGENT_SCALE, TANGENT_SCALE, 1.0))
+    carried = jnp.where(size > TANGENT_SCALE, 1.0, jnp.where(size < 1 / TANGENT_SCALE, -1.0, 0.0))
+    exponent = jnp.where(fresh, 0.0, cell.exponent)
+    new = tuple(jnp.where(kept, x * shrink, old) for x, old in zip((a, b, c, d), cell.tangent, strict=True))
+    return new, jnp.where(kept, exponent + carried, cell.exponent)
+
+
+def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, tracing: Mask, stuck: Mask) -> Tally:
+    """The tally with one impact more; a batch that has ended is squared away first."""
+    old = cell.tally
+    left, right = counted & (hit.side < 0), counted & (hit.side > 0)
+    rebound = -hit.v_out / jnp.where(hit.v_in == 0, 1.0, hit.v_in)
+    speed = jnp.where(counted, jnp.abs(hit.v_in), 0.0)
+    ratio = gain = past = square = None
+    if plan.energies:
+        metres = (hit.depth * cell.length)[:, None] * settings.length_variant
+        speeds = cell.speed[:, None] * settings.speed_variant
+        got = energy.harvested_energy(settings.device, metres)
+        given = settings.device.m_b * speeds * speeds * hit.work[:, None]
+        wide = counted[:, None]
+        ratio = jnp.where(wide, jnp.maximum(old.ratio, energy.energy_ratio(got, given)), old.ratio)
+        turned = (counted & ~tracing & (batch != cell.batch) & (cell.batch >= 0))[:, None]
+        past = jnp.where(turned, old.energy_past + old.energy, old.energy_past)
+        square = jnp.where(turned, old.energy_square + old.energy * old.energy, old.energy_square)
+        gain = jnp.where(turned, 0.0, old.energy) + jnp.where(wide, got, 0.0)
+    return Tally(
+        left=old.left + left.astype(speed.dtype),
+        right=old.right + right.astype(speed.dtype),
+        rebound_left=old.rebound_left + jnp.where(left, rebound, 0.0),
+        rebound_right=old.rebound_right + jnp.where(right, rebound, 0.0),
+        contact=old.contact + jnp.where(counted, hit.duration, 0.0),
+        fastest=jnp.maximum(old.fastest, speed),
+        momentum=old.momentum + jnp.where(counted, hit.v_in, 0.0) if plan.asymmetry else None,
+        deepest=jnp.where(counted, jnp.maximum(old.deepest, hit.depth), old.deepest) if plan.deep else None,
+        energy=gain,
+        energy_past=past,
+        energy_square=square,
+        ratio=ratio,
+        stuck=old.stuck | (counted & stuck) if plan.rigid else None,
+    )

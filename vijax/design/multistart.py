@@ -1,0 +1,301 @@
+"""Where designs set out from: attractors of a survey, of every kind the most promising.
+
+`find` is the line: a coarse survey -> a closer one where chaos, or what has not settled, promises more than any orbit
+found, for narrow windows of periodic motion lie there -> the best of every kind.
+"""
+
+import itertools
+import math
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vijax.design.survey import Flown, Survey, survey
+from vijax.design.variables import moving, tuned, values
+from vijax.model.device import Harvester
+from vijax.model.energy import harvested_energy
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Status
+from vijax.runtime import tiles
+
+_TILES = (512, 4096, 32768)  # cells of one compiled call
+_LONGEST = 8  # forcing periods of an orbit
+_REACH = 0.49, 0.6  # of the gap that the ball's displacement may take, and its velocity
+_LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities, in parts of their bounds
+_BESIDE = 256  # parts of the first quantity's bounds: of attractors of a kind the best climbs as far as one away
+_MANY = 8  # impacts: orbits of more live in narrow windows, where no climb leads far
+_NARROW = 0.8  # of the best: an orbit of many impacts that promises less is not climbed, nor chaos looked at closer
+_DENSE = 8  # times as many cells as before about a step that is looked at closer
+_HOPELESS = -1e3  # score of what breaks a constraint, before what it lacks
+
+
+class Effort(NamedTuple):
+    """Of a survey: values of the first quantity, starts at each, most impacts of an orbit, periods of a start."""
+
+    steps: int
+    balls: int
+    impacts: int
+    periods: int
+
+
+class Looked(NamedTuple):
+    """What a survey of a device met.
+
+    Attributes:
+        orbits, admissible: Periodic attractors that can be climbed from; those that break no constraint.
+        restless: How many values of the tuned quantities have other motion: aperiodic, not settled, or too long.
+        P: Most that such motion harvests per half forcing period without breaking a constraint [J]; 0 if none does.
+        values: Of the tuned quantities where it does; none if none does.
+        held, silent: Shares of the starts that end on one wall for ever, and without a wall.
+    """
+
+    orbits: int
+    admissible: int
+    restless: int
+    P: float
+    values: dict[str, float]
+    held: float
+    silent: float
+
+
+class Met(NamedTuple):
+    """Motions that were met: as flown, the device with what was tuned there, the variables; where they were met.
+
+    Attributes:
+        owner: Which of the devices given.
+        level, step: Of the survey's values of the other quantities together, and of the first one.
+        device: Leaves [motion].
+    """
+
+    flown: Flown
+    device: Harvester
+    z: np.ndarray
+    owner: np.ndarray
+    level: np.ndarray
+    step: np.ndarray
+
+    def some(self, index: np.ndarray) -> "Met":
+        """Those with the given indices."""
+        return jax.tree.map(lambda x: x[index], self)
+
+
+class _Places(NamedTuple):
+    """Where a survey looks, [cell].
+
+    Attributes:
+        owner, level: See `Met`.
+        part: Of the first quantity's bounds.
+        number: Of the cell among those of its device.
+    """
+
+    owner: np.ndarray
+    level: np.ndarray
+    part: np.ndarray
+    number: np.ndarray
+
+
+def find(
+    devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, objective: str, effort: Effort
+) -> tuple[Met, list[Looked]]:
+    """The attractors to climb from, and what else was met of every device.
+
+    Args:
+        devices: Where quantities that are not tuned are taken from.
+        tune: Names of the others.
+        box: Bounds of these, [device, 2, variable].
+        objective: Of `OBJECTIVES`; starts for tolerances are those for P.
+        effort: How far to look.
+    """
+    first, levels = _first(tune), _levels(tune)
+    steps = 1 if first is None else effort.steps
+    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
+    scene = _Scene(devices, tune, box, effort)
+    cells = owner.size // len(devices)  # of a device
+    # The same for every device, whatever the others are: designs of one do not depend on them.
+    draws = np.random.default_rng(0).uniform(-1, 1, (2, cells)), np.random.default_rng(1).uniform(-1, 1, (2, cells))
+    places = _Places(owner, level, step / max(steps - 1, 1), np.arange(owner.size) % cells)
+    seen = _look(scene, places, draws[0])
+    met, unrest = seen.met(seen.found.orbits(effort.impacts)), seen.met(seen.found.unrest(effort.impacts))
+    if first is not None:
+        most = _most(_promise(met, objective), met.owner, len(devices))
+        again = _closer(unrest, most, objective, effort, cells)
+        if again.owner.size:
+            closer = _look(scene, again, draws[1])
+            more = closer.met(closer.found.orbits(effort.impacts))
+            met = jax.tree.map(lambda *x: np.concatenate(x), met, more)
+    chosen = _promising(met, objective, len(devices), max(1, steps // _BESIDE))
+    return met.some(chosen), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
+
+
+def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
+    """What was met of a device, the closer survey's orbits among it."""
+    met, unrest = met.some(met.owner == one), unrest.some(unrest.owner == one)
+    broken, rest = _promise(met, "P").lacks < 0, _promise(unrest, "P")
+    power = np.where(rest.lacks < 0, 0.0, np.nan_to_num(np.exp(rest.value)))
+    best = float(power.max(initial=0.0))
+    where = np.asarray(values(tune, unrest.z[power.argmax()])).tolist() if best else []
+    status = seen.found.ended.status[seen.places.owner == one]
+    return Looked(
+        orbits=broken.size,
+        admissible=int((~broken).sum()),
+        restless=power.size,
+        P=best,
+        values=dict(zip(tune, where, strict=bool(best))),
+        held=float((status == Status.PERMANENT_CONTACT).mean()),
+        silent=float((status == Status.NO_IMPACT).mean()),
+    )
+
+
+class _Scene(NamedTuple):
+    """What `find` is told."""
+
+    devices: list[Harvester]
+    tune: tuple[str, ...]
+    box: np.ndarray
+    effort: Effort
+
+
+def _first(tune: tuple[str, ...]) -> int | None:
+    """Index of the first quantity that moves the ball, along which surveys look."""
+    return next((i for i, name in enumerate(tune) if moving(name)), None)
+
+
+def _levels(tune: tuple[str, ...]) -> np.ndarray:
+    """Values [level, quantity] of the others, in parts of their bounds."""
+    first = _first(tune)
+    return np.array(
+        list(itertools.product(*((0.5,) if i == first or not moving(x) else _LEVELS for i, x in enumerate(tune))))
+    )
+
+
+class _Seen(NamedTuple):
+    """A survey at some places: the device and the variables of every cell."""
+
+    found: Survey
+    device: Harvester
+    z: np.ndarray
+    places: _Places
+    step: np.ndarray
+
+    def met(self, flown: Flown) -> Met:
+        """Some motions of the survey, with where they were met."""
+        device, z, places, step = jax.tree.map(lambda x: x[flown.cell], self[1:])
+        return Met(flown, device, z, places.owner, places.level, step)
+
+
+def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
+    """Survey some places, the ball of each starting where its number's draw says."""
+    devices, tune, box, effort = scene
+    first, parts = _first(tune), _levels(tune)[places.level]
+    if first is not None:
+        parts[:, first] = places.part
+    low, high = box[places.owner].swapaxes(0, 1)
+    z = low + parts * (high - low)
+    given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
+    every, pair = tiles.map_tiles(lambda rows: _cells(*rows, tune), (given, z), _TILES)
+    u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
+    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, periods=effort.periods)
+    step = np.round(places.part * (effort.steps - 1)).astype(int)
+    return _Seen(found, every, z, places, step)
+
+
+@partial(jax.jit, static_argnames="tune")
+def _cells(devices: Harvester, z: Float[Array, "cell variable"], tune: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
+    """Devices [cell] with tuned quantities, and their pairs."""
+    every = jax.vmap(lambda device, z: tuned(device, tune, z))(devices, z)
+    return every, jax.vmap(lambda device: device.pair())(every)
+
+
+def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, cells: int) -> _Places:
+    """About the steps where what is no orbit promises about as much as the best orbit, or more.
+
+    Cells of a device, so many at most, are spread evenly over these steps, and over each of them.
+    """
+    good = _promise(unrest, objective).total > most[unrest.owner] + math.log(_NARROW)
+    owner, level, step = np.unique(np.column_stack([unrest.owner, unrest.level, unrest.step])[good], axis=0).T
+    places = [_Places(*np.zeros((4, 0), int))]
+    for one in np.unique(owner):
+        here = np.flatnonzero(owner == one)
+        number = np.arange(min(here.size * _DENSE * effort.balls, cells))
+        index, turn = here[number % here.size], number // here.size
+        part = (step[index] + (turn + 0.5) / (turn.max() + 1) - 0.5) / (effort.steps - 1)
+        places.append(_Places(owner[index], level[index], np.clip(part, 0.0, 1.0), number))
+    return jax.tree.map(lambda *x: np.concatenate(x), *places)
+
+
+def _promising(met: Met, objective: str, devices: int, reach: int) -> np.ndarray:
+    """Indices of the attractors to climb from: the best of their kind as far as so many steps away.
+
+    A kind is given by span and impacts; the walls may change places where the tube is level.
+    """
+    promise = _promise(met, objective)
+    score = np.where(promise.lacks < 0, _HOPELESS + promise.lacks, promise.value)
+    left, right = _impacts(met.flown)
+    kind = np.column_stack([met.owner, met.level, met.flown.span, left, right])
+    found = highest(kind, met.step, score, reach)
+    enough = promise.total > _most(promise, met.owner, devices)[met.owner] + math.log(_NARROW)
+    return found[(enough | (left + right <= _MANY))[found]]
+
+
+def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) -> np.ndarray:
+    """Indices of the rows that none of their group beats within so many steps; of one step's rows the first best.
+
+    Args:
+        group: What rows of one group have in common, [row, ...].
+        step, score: Where and how high each stands.
+        reach: How many steps away a higher row beats it.
+    """
+    order = np.lexsort((-score, step, *group.T[::-1]))
+    place = np.column_stack([group, step])[order]
+    new = np.append(True, (np.diff(place, axis=0) != 0).any(axis=1))[: order.size]
+    best, place = order[new], place[new]
+    height, top = score[best], np.ones(best.size, bool)
+    for ahead in range(1, reach + 1):
+        apart = place[ahead:] - place[:-ahead]
+        near = (apart[:, :-1] == 0).all(axis=1) & (apart[:, -1] <= reach)
+        top[:-ahead] &= ~near | (height[:-ahead] >= height[ahead:])
+        top[ahead:] &= ~near | (height[ahead:] >= height[:-ahead])
+    return np.sort(best[top])
+
+
+def _impacts(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right impacts of motions; in a level tube the more and the fewer."""
+    left, right = ((flown.side == side).sum(axis=1) for side in (-1, 1))
+    swap = (flown.pair.gamma == 0) & (right > left)
+    return np.where(swap, right, left), np.where(swap, left, right)
+
+
+class _Promise(NamedTuple):
+    """Of every motion the logarithm of the objective, and what is lacking to the worst constraint: 0 if nothing."""
+
+    value: np.ndarray
+    lacks: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """What may be left where no constraint is broken any more."""
+        return self.value + self.lacks
+
+
+def _promise(met: Met, objective: str) -> _Promise:
+    device, flown = met.device, met.flown
+    deep = flown.depth * np.asarray(device.length_unit)[:, None]
+    gained = np.asarray(jax.vmap(harvested_energy)(device, jnp.asarray(deep)))
+    given = flown.work * np.asarray(device.m_b * device.speed_unit**2)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lacks = np.minimum(np.log(given / gained), np.log(np.asarray(device.depth_limit)[:, None] / deep))
+        value = np.log(np.nansum(gained, axis=1) / flown.span)
+    if objective == "speed":
+        value = np.log(flown.knots[..., 1].max(axis=1, initial=0.0))
+    return _Promise(value, np.nanmin(lacks, axis=1, initial=0.0))
+
+
+def _most(promise: _Promise, owner: np.ndarray, devices: int) -> np.ndarray:
+    """What the best admissible attractor of every device promises; -inf where there is none."""
+    most = np.full(devices, -np.inf)
+    np.maximum.at(most, owner, np.where(promise.lacks < 0, -np.inf, promise.value))
+    return most

@@ -1,0 +1,406 @@
+"""The best membrane: designs climb, by exact gradients, from the attractors of a coarse survey to admissible optima.
+
+`optimise` is the line: starts -> one jitted ascent of all of them -> distinct optima, verified.
+Where a trial leaves its branch, loses stability or breaks a constraint, it is cut back (`ascent`).
+"""
+
+import itertools
+import logging
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vijax.design import objective as aims
+from vijax.design.ascent import Box, Climb, ascend, converged
+from vijax.design.multistart import Effort, Looked, Met, find
+from vijax.design.objective import OBJECTIVES, Batch, Scene
+from vijax.design.tolerance import Tolerance, check_tolerances, nodes
+from vijax.design.variables import NAMES, check_names, limits, tuned, values, variables
+from vijax.model.device import Harvester, one_device
+from vijax.model.records import Status
+from vijax.orbits import periodic as orbits
+from vijax.orbits.periodic import Orbit
+from vijax.orbits.steady import Steady, steady
+from vijax.planes import estimate
+from vijax.planes.estimate import Estimate
+from vijax.runtime import checks, context, tiles, xla
+from vijax.runtime.context import door
+
+_LOG = logging.getLogger(__name__)
+_RADIUS = 0.2  # of a step, in the logarithm of a quantity
+_WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
+_TILE = 16  # starts of one compiled call: those that end soon wait for the others
+_FEW = (16, 256)  # optima of one
+_SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
+_MOST_LOOKS, _MOST_STEPS, _MOST_IMPACTS = 10**5, 10**7, 256
+_BALL = 1000  # bytes that a survey keeps of a ball
+_ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """A design at which an ascent ended, verified.
+
+    Attributes:
+        values: The tuned quantities by name.
+        device: The device that has them.
+        orbit: Its orbit, along a leading axis of one; multipliers are its own.
+        label: n:m/pT of the orbit.
+        height: The objective.
+        state: Energies, depths, margins' parts, condition and clearance of the nominal device; see `Steady`.
+        gradient: Derivative of the objective's logarithm in the logarithm of each quantity (in an inclination itself).
+        active: What holds it there: constraints at which impact, bounds of which quantity.
+        stopped: "maximum"; "supremum", where the objective rises up to the end of the orbit, which no orbit attains;
+            "looks", when these were spent; "stalled", where no step is higher though the gradient is not zero: at a
+            kink, such as a worst case has where two devices are alike; "weighted", of `robustness.weighted`.
+        looks: Evaluations of objective with gradient that it took.
+        path: Accepted points [look, quantity], the start first, and the objective there.
+        heights: See `path`.
+    """
+
+    values: dict[str, float]
+    device: Harvester
+    orbit: Orbit
+    label: str
+    height: float
+    state: Steady
+    gradient: dict[str, float]
+    active: tuple[str, ...]
+    stopped: str
+    looks: int
+    path: np.ndarray
+    heights: np.ndarray
+
+
+@dataclass(frozen=True)
+class Design:
+    """What was found for one device: the distinct optima, the best first (none if no admissible orbit was found).
+
+    Attributes:
+        optima: See there.
+        tune, bounds: What was tuned, between which values.
+        objective: Of `OBJECTIVES`.
+        tolerances: Of the objective.
+        looked: What the survey met, periodic and not.
+        starts: How many of them climbed.
+    """
+
+    optima: tuple[Optimum, ...]
+    tune: tuple[str, ...]
+    bounds: dict[str, tuple[float, float]]
+    objective: str
+    tolerances: tuple[Tolerance, ...]
+    looked: Looked
+    starts: int
+
+    @property
+    def best(self) -> Optimum | None:
+        """The highest optimum."""
+        return self.optima[0] if self.optima else None
+
+
+@door
+def optimise(device: Harvester | None = None, **settings: Any) -> Design:
+    """The admissible design that harvests most; see `optimise_all`, which takes many devices at once."""
+    return optimise_all([one_device(device)], **settings)[0]
+
+
+@door
+def optimise_all(
+    devices: Iterable[Harvester],
+    *,
+    tune: Iterable[str] = ("omega0",),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    objective: str = "P",
+    tolerances: Iterable[Tolerance] = (),
+    samples: int | None = None,
+    looks: int = 60,
+    steps: int = 256,
+    balls: int = 8,
+    impacts: int = 16,
+    periods: int = 200,
+) -> list[Design]:
+    """The admissible designs that harvest most, each device's tuned quantities between bounds.
+
+    Attractors of a coarse survey along the first quantity, from many starts of the ball, are where the ascents begin.
+    All of them climb in one jitted call along exact gradients; an optimum is admissible in every impact (E_j <= W_j,
+    penetration within the device's limit), attracting, and verified by the exact impact map.
+
+    Args:
+        devices: Where quantities that are not tuned are taken from; scalars.
+        tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's.
+        bounds: Of tuned quantities; see `variables.limits` for the others.
+        objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P.
+        tolerances: How constants scatter, for "mean" and "worst".
+        samples: Random devices for these, in place of a quadrature.
+        looks: Evaluations of objective with gradient that a start may take.
+        steps: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself, where
+            chaos promises more than the best orbit so far: there the best orbit may live in a narrow window.
+        balls: Starts from which it looks at each of them; more meet attractors with small basins.
+        impacts: Of an orbit, at most: longer ones are not looked for. Fewer are compiled and climb faster.
+        periods: Forcing periods that each of them may take.
+
+    Returns:
+        One `Design` a device.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
+    """
+    devices = checks.sequence("devices", devices, Harvester, "vijax.Harvester records")
+    tune, bounds = checks.words("tune", tune, NAMES), {} if bounds is None else bounds
+    scatter = check_tolerances(tolerances)
+    looks, far = checks.whole("looks", looks, 2, _MOST_LOOKS), effort(steps, balls, impacts, periods)
+    box = check(devices, tune, bounds, objective, scatter)
+    if (asked := expected(len(devices), far)).long:
+        _LOG.warning("a long run begins: %s", asked)
+    cloud = nodes(scatter, samples)
+    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
+    starts, looked = find(devices, tune, box, objective, far)
+    ends = _climbed(scene, starts, box, looks)
+    optima = _optima(scene, starts, ends, devices, looks)
+    return [
+        Design(
+            optima=tuple(optima[owner]),
+            tune=tune,
+            bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, box[owner])).T.tolist()), strict=True)),
+            objective=objective,
+            tolerances=scatter,
+            looked=looked[owner],
+            starts=int((starts.owner == owner).sum()),
+        )
+        for owner in range(len(devices))
+    ]
+
+
+class Spread(NamedTuple):
+    """P of a design over tolerances, each device on its own orbit, followed from the nominal one.
+
+    Attributes:
+        mean: A device whose orbit is lost, or inadmissible, counting nothing [J].
+        worst: The least; 0 if the orbit of one is lost [J].
+        lost, inadmissible: Shares of devices.
+    """
+
+    mean: float
+    worst: float
+    lost: float
+    inadmissible: float
+
+
+@door
+def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None = None) -> Spread:
+    """What becomes of a design when constants scatter.
+
+    Args:
+        tolerances: How they do.
+        samples: Random devices, in place of a quadrature.
+
+    Raises:
+        ValueError: A tolerance that cannot be.
+    """
+    checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best")
+    scatter = check_tolerances(tolerances)
+    cloud, none = nodes(scatter, samples), jnp.zeros((1, 0))
+    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), (), cloud.names, "P")
+    device = jax.tree.map(lambda x: jnp.array([x], float), optimum.device)
+    orbit = optimum.orbit
+    batch = Batch(device, orbit.sequence, jnp.nan_to_num(orbit.knots), none, none, none)
+    return Spread(*(float(x[0]) for x in aims.spread(scene, batch)))
+
+
+def effort(steps: int, balls: int, impacts: int, periods: int = 200) -> Effort:
+    """How far a survey looks; raises ValueError as `optimise_all` does."""
+    steps, balls = checks.whole("steps", steps, 2, _MOST_STEPS), checks.whole("balls", balls, 1, _MOST_STEPS)
+    longest = checks.whole("impacts", impacts, 1, _MOST_IMPACTS)
+    return Effort(steps, balls, longest, checks.whole("periods", periods, 1))
+
+
+def expected(devices: int, far: Effort) -> Estimate:
+    """What the survey of so many devices asks of the machine; ascents take less.
+
+    Raises:
+        ValueError: If its balls do not fit in memory.
+    """
+    count = devices * far.steps * far.balls
+    checks.fits(("devices", "steps", "balls"), count * _BALL, f"{count:,} balls")
+    return estimate.of_recorded(count, far.periods, count * _BALL)
+
+
+@door
+def check(
+    devices: list[Harvester],
+    tune: tuple[str, ...],
+    bounds: Mapping[str, tuple[float, float]],
+    objective: str,
+    tolerances: tuple[Tolerance, ...],
+) -> np.ndarray:
+    """Bounds [device, 2, variable] of what `optimise_all` is asked for; raises ValueError as it does, runs nothing."""
+    check_names(tune)
+    if not devices:
+        raise ValueError("devices must hold at least one; got none")
+    checks.choice("objective", objective, OBJECTIVES)
+    for device in devices:
+        if not float(one_device(device).V):
+            raise ValueError("V must not be zero for a design to harvest; got 0")
+    over = objective in ("mean", "worst")
+    if over != bool(tolerances):
+        need = "come with objective mean or worst" if tolerances else "be given with objective mean or worst"
+        raise ValueError(f"tolerances must {need}; got {len(tolerances)} with objective {objective!r}")
+    check_tolerances(tolerances, bounded=objective == "worst")
+    return np.array([variables(tune, limits(tune, bounds, device)) for device in devices])
+
+
+@lru_cache(maxsize=8)
+def _compiled(looks: int):
+    def climb(scene: Scene, batch: Batch) -> Climb:
+        box = Box(batch.low, batch.high, _RADIUS)
+        return ascend(partial(aims.look, scene, batch), batch.z, aims.begin(scene, batch), box, looks)
+
+    return jax.jit(climb, compiler_options=xla.compiler_options())
+
+
+class _End(NamedTuple):
+    """Where a start ended; arrays without the leading axis of starts."""
+
+    z: np.ndarray
+    height: float
+    gradient: np.ndarray
+    margins: np.ndarray  # of the nominal device and all nodes, [node, two an impact]; then lower and upper bounds
+    knots: np.ndarray
+    lost: bool
+    settled: bool
+    looks: int
+    path: np.ndarray
+    heights: np.ndarray
+
+
+def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[_End]:
+    """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
+    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(looks)
+    ends: list[_End | None] = [None] * count.size
+
+    def part(some: np.ndarray, width: int, tile: tiles.Tile) -> None:
+        rows = some[tile.rows]
+        own, bounds = starts.some(rows), box[starts.owner[rows]].swapaxes(0, 1)
+        begun = (jnp.asarray(x) for x in (own.flown.knots[:, :width], own.z, *bounds))
+        end = work(scene, Batch(jax.tree.map(jnp.asarray, own.device), own.flown.sequence(width), *begun))
+        seen, lost, settled, taken = (
+            jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, converged(end), end.looks)
+        )
+        path, heights, z = np.asarray(end.path), np.asarray(end.heights), np.asarray(end.z)
+        for row, index in enumerate(rows[: tile.real]):
+            ends[index] = _End(
+                z[row],
+                float(np.exp(seen.value[row])) if seen.there[row] else np.nan,
+                seen.gradient[row],
+                seen.margins[row],
+                seen.memory.knots[row, 0],
+                bool(lost[row]),
+                bool(settled[row]),
+                int(taken[row]),
+                path[:, row],
+                heights[:, row],
+            )
+
+    jobs = []
+    most = starts.flown.side.shape[1]
+    widths = [0, *(width for width in _WIDTHS if width < most), most]
+    # The widest first, for they take longest: no core is left with one of them at the end.
+    for width, few in itertools.pairwise(reversed(widths)):
+        some = np.flatnonzero((count > few) & (count <= width))
+        jobs += [(some, width, tile) for tile in tiles.tiles(some.size, (_TILE,))]
+    with context.pool(tiles.workers()) as pool:
+        list(pool.map(lambda job: part(*job), jobs))
+    return [end for end in ends if end is not None]
+
+
+def _optima(scene: Scene, starts: Met, ends: list[_End], devices: list[Harvester], looks: int) -> list[list[Optimum]]:
+    """What was reached for every device: admissible, verified, each optimum once, the best first."""
+    owner = starts.owner
+    good = [i for i, end in enumerate(ends) if end.margins.min() >= 0 and np.isfinite(end.height)]
+    good = [i for rows in _apart(good, ends, owner) for i in rows]
+    if not good:
+        return [[] for _ in devices]
+    own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
+    many = jax.tree.map(lambda *x: jnp.array(x), *own)
+    width = starts.flown.side.shape[1]
+    wide = [np.pad(ends[i].knots, ((0, width - len(ends[i].knots)), (0, 0))) for i in good]
+    sequence = starts.some(np.array(good)).flown.sequence(width)
+    found = orbits.solve(jax.vmap(lambda d: d.pair())(many), sequence, jnp.array(wide))
+    seen = states(own, found)
+    attracts = np.array([found.status[row] == Status.OK == seen[row].status for row in range(len(own))])
+    names = orbits.labels(found)
+    optima: list[list[Optimum]] = [[] for _ in devices]
+    for row in np.flatnonzero(attracts):
+        end = ends[good[row]]
+        there = np.isfinite(end.heights)
+        optima[owner[good[row]]].append(
+            Optimum(
+                values=dict(zip(scene.names, np.asarray(values(scene.names, end.z)).tolist(), strict=True)),
+                device=own[row],
+                orbit=found[row : row + 1],
+                label=str(names[row]),
+                height=end.height,
+                state=seen[row],
+                gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
+                active=_active(scene, end, found.sequence.side[row]),
+                stopped=_reason(end, looks),
+                looks=end.looks,
+                path=np.asarray(values(scene.names, end.path[there])),
+                heights=np.exp(end.heights[there]),
+            )
+        )
+    return optima
+
+
+def _reason(end: _End, looks: int) -> str:
+    if end.lost:
+        return "supremum"
+    if end.settled:
+        return "maximum"
+    return "looks" if end.looks >= looks else "stalled"
+
+
+def _apart(good: list[int], ends: list[_End], owner: np.ndarray) -> Iterator[list[int]]:
+    """Ends that differ, of every owner, the highest first."""
+    for own in np.unique(owner[good]):
+        kept: list[int] = []
+        for i in sorted((i for i in good if owner[i] == own), key=lambda i: -ends[i].height):
+            if all(np.abs(ends[i].z - ends[k].z).max() > _SAME for k in kept):
+                kept.append(i)
+        yield kept
+
+
+@lru_cache(maxsize=1)
+def _compiled_states():
+    return jax.jit(jax.vmap(steady), compiler_options=xla.compiler_options())
+
+
+@door
+def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
+    """The steady state of every device on its known orbit, in padded tiles."""
+    given, found = jax.tree.map(lambda *x: np.array(x), *devices), []
+    for tile in tiles.tiles(len(orbit), _FEW):
+        some = _compiled_states()(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
+        some = jax.tree.map(np.asarray, some)
+        found += [jax.tree.map(lambda x, row=row: x[row], some) for row in range(tile.real)]
+    return found
+
+
+def _active(scene: Scene, end: _End, side: Any) -> tuple[str, ...]:
+    """What holds an end where it is."""
+    count, width = len(scene.names), end.knots.shape[0]
+    margins, low, high = np.split(end.margins, [end.margins.size - 2 * count, end.margins.size - count])
+    words = []
+    for node, kind, impact in np.argwhere(margins.reshape(-1, 2, width) < _ACTIVE):
+        what = ("penetration limit", "energy given to the membrane")[kind]
+        wall = "left" if side[impact] < 0 else "right"
+        words.append(f"{what} at the {wall} wall" + (" at an end of the tolerance" if node else ""))
+    words += [f"lower bound of {name}" for name, room in zip(scene.names, low, strict=True) if room < _ACTIVE]
+    words += [f"upper bound of {name}" for name, room in zip(scene.names, high, strict=True) if room < _ACTIVE]
+    return tuple(dict.fromkeys(words))

@@ -1,0 +1,300 @@
+"""What a design is worth: everything known of it as plain numbers and words, and the lines that a builder reads."""
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vijax.design.objective import OBJECTIVES
+from vijax.design.optimise import Design, Optimum, Spread
+from vijax.design.robustness import Surroundings
+from vijax.design.tolerance import Tolerance
+from vijax.design.variables import LINEAR, constant, value_of
+from vijax.model.device import CONSTANTS
+from vijax.model.energy import energy_ratio
+from vijax.model.units import UNITS
+from vijax.runtime import checks
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15}
+_TIE = 1e-6  # optima whose objectives differ by less, relative, are a tie
+_MOST_ROWS = 12
+_LOSSES = {"lost": "lose the orbit", "inadmissible": "are inadmissible"}
+
+
+def describe(
+    design: Design,
+    *,
+    surroundings: Surroundings | None = None,
+    diagram: "xr.Dataset | None" = None,
+    tolerances: Sequence[Tolerance] = (),
+    spread: Spread | None = None,
+) -> dict[str, Any]:
+    """All of a design as nested dicts and lists of numbers and words.
+
+    Args:
+        design: What `vijax.optimise` returned.
+        surroundings: Of its best optimum.
+        diagram: P up and down along an axis at the best optimum, `vijax.orbit_diagram` in both directions.
+        tolerances, spread: Over which tolerances the best optimum was judged, and a `vijax.design.optimise.under`
+            of them.
+
+    Returns:
+        `best` (None if no admissible orbit was found), `others`, and what was asked. With `diagram`, `highest`: the
+        largest P it holds, admissible or not, which is what an optimiser without constraints would report.
+    """
+    checks.instance("design", design, Design, "vijax.optimise(...)")
+    if surroundings is not None:
+        checks.instance("surroundings", surroundings, Surroundings, "vijax.design.robustness.surroundings(...)")
+    if spread is not None:
+        checks.instance("spread", spread, Spread, "vijax.design.optimise.under(...)")
+    if diagram is not None:
+        checks.variables("diagram", diagram, ("P", "max_penetration", "energy_ratio", "admissible"), "orbit_diagram")
+    checks.sequence("tolerances", tolerances, Tolerance, "vijax.design.tolerance.Tolerance records")
+    return {
+        "tune": list(design.tune),
+        "bounds": {name: list(pair) for name, pair in design.bounds.items()},
+        "objective": design.objective,
+        "objective_means": OBJECTIVES[design.objective],
+        "survey": design.looked._asdict(),
+        "starts": design.starts,
+        "best": optimum(design.best) if design.best else None,
+        "others": [optimum(one) for one in design.optima[1:]],
+        "surroundings": _surroundings(surroundings) if surroundings else None,
+        "tolerances": [one._asdict() for one in tolerances],
+        "spread": spread._asdict() if spread else None,
+        "highest": _highest(diagram) if diagram is not None else None,
+    }
+
+
+def optimum(one: Optimum) -> dict[str, Any]:
+    """An optimum as plain data; per impact: penetration, energy, energy given to the membrane, their ratio."""
+    checks.instance("one", one, Optimum, "vijax.optimise(...).best")
+    state, device = one.state, one.device
+    count = int(np.asarray(one.orbit.count)[0])
+    energy, work = state.energy[:count], state.work[:count]
+    kappa = float(value_of(device, "kappa"))
+    return {
+        "values": one.values,
+        "label": one.label,
+        "height": one.height,
+        "P": float(state.P),
+        "power": float(state.power),
+        "speed": float(state.speed),
+        "omega0": float(device.omega0),
+        "pair": {"d": float(value_of(device, "d")), "kappa": kappa, "r": float(device.r)}
+        | {"gamma": float(value_of(device, "gamma"))},
+        "device": {name: float(getattr(device, name)) for name in CONSTANTS},
+        "penetration": state.depth[:count],
+        "penetration_limit": float(device.depth_limit),
+        "energy": energy,
+        "work": work,
+        "energy_ratio": np.asarray(energy_ratio(energy, work)),
+        "multipliers": [[x.real, x.imag] for x in np.asarray(one.orbit.multipliers)[0].tolist()],
+        "largest_multiplier": float(state.multiplier),
+        "condition": float(state.condition),
+        "clearance": {name: float(x) for name, x in state.clearance._asdict().items()},
+        "residual": float(state.residual),
+        "gradient": one.gradient,
+        "active": list(one.active),
+        "stopped": one.stopped,
+        "looks": one.looks,
+        "path": one.path,
+        "heights": one.heights,
+    }
+
+
+def _surroundings(found: Surroundings) -> dict[str, Any]:
+    return {
+        "share": found.share,
+        "attractors": [one._asdict() for one in found.attractors],
+        "below": found.below._asdict(),
+        "above": found.above._asdict(),
+    }
+
+
+def _highest(diagram: "xr.Dataset") -> dict[str, Any]:
+    """The point of a diagram with the largest P."""
+    along = str(diagram.attrs["along"])
+    peak = diagram.isel({dim: int(i) for dim, i in diagram["P"].fillna(0.0).argmax(("direction", along)).items()})
+    names = ("P", "max_penetration", "energy_ratio", "admissible")
+    return {"along": along, "value": float(peak[along])} | {name: peak[name].item() for name in names}
+
+
+def factors(name: str, tolerances: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
+    """By how much a quantity may be off by the tolerance of the constant that decides it; None if it has none."""
+    for one in tolerances:
+        if one["name"] == constant(name) and name not in LINEAR:
+            x = one["spread"]
+            low, high = (1 - x, 1 + x) if one["kind"] == "uniform" else (np.exp(-x), np.exp(x))
+            return (low**2, high**2) if name == "k" else (low, high)
+    return None
+
+
+# --- in words -------------------------------------------------------------------------------------
+
+
+def amount(value: float, unit: str, digits: int = 7) -> str:
+    """A value with a prefix of its unit: 57.75761 uJ."""
+    if not np.isfinite(value) or not value:
+        return f"{value:g} {unit}"
+    size = abs(value) * (1 + 0.5 * 10.0**-digits)
+    prefix = next((name for name, factor in _PREFIXES.items() if size >= factor), "f")
+    return f"{value / _PREFIXES[prefix]:.{digits}g} {prefix}{unit}"
+
+
+def quantity(name: str, value: float) -> str:
+    """A tuned quantity: omega0 = 40.07126 rad/s."""
+    return f"{name} = {value:.7g} {UNITS.get(name, '')}".rstrip()
+
+
+def lines(report: dict[str, Any]) -> Iterator[str]:
+    """What a builder needs to know before trusting a design, from what `describe` returned."""
+    checks.record("report", report, ("bounds", "objective", "best"), "vijax.design.report.describe")
+    ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in report["bounds"].items())
+    yield f"tuned: {ranges}; objective {report['objective']}, {report['objective_means']}"
+    yield f"survey: {report['survey']['orbits']:,} periodic attractors met, {report['starts']:,} climbed"
+    best = report["best"]
+    if best is None:
+        yield "no admissible attracting orbit was found; what the survey met instead:"
+        yield from (f"  {what}" for what in _instead(report["survey"]))
+    else:
+        yield from _best(best, report["objective"])
+        yield from _around(best, report["surroundings"])
+        yield from _others(best, report["others"], report["objective"])
+        yield from _off(report)
+    yield from _unconstrained(report)
+
+
+def _instead(survey: dict[str, Any]) -> Iterator[str]:
+    """What a survey met where no design came of it, and what to do about each."""
+    broken = survey["orbits"] - survey["admissible"]
+    if broken:
+        yield f"{broken:,} periodic orbits that break a constraint: widen the bounds or the penetration limit"
+    if survey["admissible"]:
+        yield f"{survey['admissible']:,} admissible orbits that led to no optimum: take more steps and balls"
+    if survey["restless"]:
+        where = ", ".join(quantity(*item) for item in survey["values"].items())
+        harvest = f"P up to {amount(survey['P'], 'J', 4)} admissibly, at {where}" if where else "none of it admissible"
+        yield (
+            f"aperiodic or long motion at {survey['restless']:,} of the values looked at, {harvest}: it has no "
+            "gradient; move the bounds, or look for narrow windows with more steps and balls"
+        )
+    if survey["held"]:
+        yield f"{100 * survey['held']:.3g} % of the starts on one wall for ever: raise A or lower beta"
+    if survey["silent"]:
+        yield f"{100 * survey['silent']:.3g} % of the starts without impacts: narrow the gap"
+    if not any(survey[name] for name in ("orbits", "restless", "held", "silent")):
+        yield "nothing that settles: look at more values, from more starts"
+
+
+def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
+    tuned = ", ".join(quantity(name, value) for name, value in best["values"].items())
+    pair = best["pair"]
+    yield f"best: {tuned}   ({', '.join(f'{name} {value:.6g}' for name, value in pair.items())})"
+    yield (
+        f"  orbit {best['label']}: P {amount(best['P'], 'J')} per half period, {amount(best['power'], 'W')}, "
+        f"largest speed into a wall {best['speed']:.6g} m/s"
+    )
+    if objective in ("mean", "worst"):
+        yield f"  objective: {_height(best, objective)}"
+    deepest, limit = 1e3 * max(best["penetration"]), 1e3 * best["penetration_limit"]
+    yield (
+        f"  penetration {deepest:.6g} mm of {limit:.6g} allowed; "
+        f"harvested at most {100 * max(best['energy_ratio']):.4g} % of the energy that an impact gives"
+    )
+    modulus = ", ".join(f"{np.hypot(*one):.4g}" for one in best["multipliers"])
+    yield f"  |multipliers| {modulus}; condition of I - DP {best['condition']:.4g}; residual {best['residual']:.1e}"
+    room = best["clearance"]
+    yield (
+        f"  clear of grazing: slowest impact {room['speed']:.4g}, room in flight {room['flight']:.4g}, "
+        f"in contact {room['contact']:.4g}, slowest exit over its entry {room['exit']:.4g}"
+    )
+    gradient = ", ".join(f"{name} {slope:.3g}" for name, slope in best["gradient"].items())
+    interior = best["stopped"] == "maximum"
+    held = ", ".join(best["active"]) or ("nothing, an interior optimum" if interior else "nothing")
+    why = {
+        "supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains",
+        "stalled": "no step is higher though the gradient is not zero: a kink",
+    }
+    yield f"  stopped after {best['looks']} evaluations: {why.get(best['stopped'], best['stopped'])}"
+    yield f"  held by: {held}"
+    smooth = ", of a smoothed minimum" if objective == "worst" else ""
+    yield f"  log-gradient at the end{smooth}: {gradient}"
+
+
+def _around(best: dict[str, Any], around: dict[str, Any] | None) -> Iterator[str]:
+    if around is None:
+        return
+    yield f"  nearest bifurcation along omega0: below, {_edge(around['below'])}; above, {_edge(around['above'])}"
+    yield f"  basin of the orbit: {100 * around['share']:.4g} % of the starts; all attractors there:"
+    shown = around["attractors"][:_MOST_ROWS]
+    for one in shown:
+        flaw = "" if one["admissible"] else "  inadmissible"
+        yield f"    {one['label']:<18}{100 * one['share']:>8.3g} %   P {amount(one['P'], 'J', 5)}{flaw}"
+    if len(around["attractors"]) > len(shown):
+        yield f"    and {len(around['attractors']) - len(shown)} more"
+
+
+def _edge(edge: dict[str, Any]) -> str:
+    if edge["kind"] == "none":
+        return f"none within {abs(edge['percent']):.3g} %"
+    return f"{edge['kind']} {abs(edge['percent']):.3g} % off at {edge['omega0']:.6g} rad/s"
+
+
+def _height(one: dict[str, Any], objective: str) -> str:
+    """The objective there: worst 51.78932 uJ."""
+    return f"{objective} {amount(one['height'], {'power': 'W', 'speed': 'm/s'}.get(objective, 'J'))}"
+
+
+def _others(best: dict[str, Any], others: list[dict[str, Any]], objective: str) -> Iterator[str]:
+    yield f"other local optima: {len(others) or 'none'}"
+    for one in others[:_MOST_ROWS]:
+        tuned = ", ".join(quantity(name, value) for name, value in one["values"].items())
+        tie = "  an exact tie" if abs(one["height"] / best["height"] - 1) < _TIE else ""
+        yield f"  {tuned}: {one['label']}, {_height(one, objective)}, {_held(one)}{tie}"
+
+
+def _off(report: dict[str, Any]) -> Iterator[str]:
+    spread = report["spread"]
+    if spread is None:
+        return
+    said = ", ".join(f"{one['name']} +-{100 * one['spread']:g} % {one['kind']}" for one in report["tolerances"])
+    yield f"under tolerances ({said}):"
+    nominal = report["best"]["P"]
+    for name in ("mean", "worst"):
+        yield f"  {name} P {amount(spread[name], 'J')}, {100 * spread[name] / nominal:.4g} % of nominal"
+    shares = ", ".join(f"{100 * spread[name]:.3g} % {text}" for name, text in _LOSSES.items())
+    yield f"  of the devices, {shares}"
+
+
+def _unconstrained(report: dict[str, Any]) -> Iterator[str]:
+    peak, best = report["highest"], report["best"]
+    if peak is None or peak["admissible"] or (best is not None and peak["P"] <= best["P"]):
+        return
+    more = f"{peak['P'] / best['P']:.4g} times as much, " if best else ""
+    yield (
+        f"not physical: P alone would choose {quantity(peak['along'], peak['value'])} with {amount(peak['P'], 'J')}, "
+        f"{more}{1e3 * peak['max_penetration']:.4g} mm deep, "
+        f"{peak['energy_ratio']:.4g} times the energy that an impact gives"
+    )
+
+
+def table(report: dict[str, Any]) -> Iterator[str]:
+    """The best designs along an axis, a line each: `over`, its name and values, and `designs`, of `describe` each."""
+    checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
+    name, values = report["over"]["name"], report["over"]["values"]
+    for value, one in zip(values, report["designs"], strict=True):
+        best = one["best"]
+        if best is None:
+            yield f"{name} {value:.5g}: no admissible attracting orbit; {next(_instead(one['survey']))}"
+            continue
+        tuned = ", ".join(quantity(*item) for item in best["values"].items())
+        spread = f", at worst {amount(one['spread']['worst'], 'J', 5)}" if one["spread"] else ""
+        yield f"{name} {value:.5g}: {tuned}, {best['label']}, P {amount(best['P'], 'J', 5)}{spread}, {_held(best)}"
+
+
+def _held(best: dict[str, Any]) -> str:
+    return ", ".join(best["active"]) or ("interior" if best["stopped"] == "maximum" else best["stopped"])

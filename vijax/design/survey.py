@@ -1,0 +1,172 @@
+"""Which attractors many cells meet, impact by impact."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vijax.batch import simulate
+from vijax.batch.impact_log import record
+from vijax.model.pair import ImpactPair
+from vijax.model.records import State, Status
+from vijax.orbits.shooting import Sequence
+from vijax.runtime import context
+from vijax.runtime.tiles import padded, workers
+
+_SMALLEST_TILE, _LARGEST_TILE = 512, 8192  # cells of a call
+_SETTLED = Status.OK, Status.STICKING
+_SAME = 1e-6  # relative difference within which attractors of one pair are the same; see `basins`
+
+
+class Flown(NamedTuple):
+    """Motions as they were flown, in the order of the cells that met them first.
+
+    Attributes:
+        pair: Parameters of each [motion].
+        side, knots: Its impacts, [motion, impact], padded with side 0 and zeros; see `Orbit`.
+        span: Time after which an orbit closes; how long another motion was looked at.
+        depth, work: Largest penetration and energy given to the membrane (per unit mass) of each impact; NaN beyond.
+        cell: Which one met it first.
+    """
+
+    pair: ImpactPair
+    side: np.ndarray
+    knots: np.ndarray
+    span: np.ndarray
+    depth: np.ndarray
+    work: np.ndarray
+    cell: np.ndarray
+
+    def sequence(self, width: int) -> Sequence:
+        """Walls and closing of all orbits, of so many impacts: with the knots what `periodic.solve` takes."""
+        return Sequence(jnp.asarray(self.side[:, :width]), jnp.asarray(self.span), jnp.zeros(self.span.size, bool))
+
+
+class Survey(NamedTuple):
+    """How cells ended.
+
+    Attributes:
+        pair: The cells.
+        ended: A `Summary` of each.
+        longest: Most forcing periods of an orbit that is wanted.
+    """
+
+    pair: ImpactPair
+    ended: Any
+    longest: int
+
+    def orbits(self, impacts: int) -> Flown:
+        """The periodic attractors of at most so many impacts, of mirror images on level ground one.
+
+        Of cells that differ in their starts alone each one once.
+        """
+        some = np.flatnonzero(self._closing(impacts))
+        own, ended = jax.tree.map(lambda x: x[some], (self.pair, self.ended))
+        once = _distinct(own, ended)
+        own, ended = jax.tree.map(lambda x: x[once], (own, ended))
+        # A period more, lest rounding moves an impact at phase 0 out of it.
+        table = _recorded(own, ended.handover, ended.period + 1, impacts)
+        count = ended.impacts_left + ended.impacts_right
+        return _flown(own, 2.0 * ended.period, table, np.arange(impacts) < count[:, None], some[once])
+
+    def unrest(self, impacts: int) -> Flown:
+        """What is no such orbit: chaos, and what is not settled or too long; one motion of every pair."""
+        going = np.isin(self.ended.status, (*_SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
+        some = np.flatnonzero(going & ~self._closing(impacts))
+        _, first = np.unique(np.column_stack(jax.tree.leaves(self.pair))[some], axis=0, return_index=True)
+        some = some[np.sort(first)]
+        own, handover = jax.tree.map(lambda x: x[some], (self.pair, self.ended.handover))
+        table = _recorded(own, handover, np.full(some.size, self.longest), None)
+        return _flown(own, np.full(some.size, 2.0 * self.longest), table, np.isfinite(table["n"]), some)
+
+    def _closing(self, impacts: int) -> np.ndarray:
+        """Which cells ended on an orbit that is wanted."""
+        ended, count = self.ended, self.ended.impacts_left + self.ended.impacts_right
+        some = (ended.period > 0) & (ended.period <= self.longest) & (count > 0) & (count <= impacts)
+        return np.isin(ended.status, _SETTLED) & some
+
+
+def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, periods: int) -> Survey:
+    """Run soft cells until their attractors are certain.
+
+    Args:
+        pair: Cells [cell].
+        u0, v0: Where each starts, at phase 0.
+        longest: Most forcing periods of an orbit that will be wanted.
+        periods: Forcing periods that the search for an attractor may take.
+    """
+    pair = jax.tree.map(np.asarray, pair)
+    return Survey(pair, _ended(pair, (u0, v0), longest, periods), longest)
+
+
+def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int, periods: int) -> Any:
+    """How every cell ended, a `Summary`, in tiles on every core."""
+    cells = pair.d.size
+    share = math.ceil(cells / workers())
+    size = min(max(padded(share), _SMALLEST_TILE), _LARGEST_TILE)
+    number = math.ceil(cells / size)
+    # Strided tiles cost the same.
+    tiles = [np.arange(first, cells, number) for first in range(number)]
+
+    def part(rows: np.ndarray) -> Any:
+        own, u0, v0 = jax.tree.map(lambda x: jnp.asarray(x[np.resize(rows, size)]), (pair, *starts))
+        summary = simulate.attractors(own, u0, v0, periods=periods, keep=longest, count=rows.size)
+        return jax.tree.map(lambda x: x[: rows.size], summary)
+
+    with context.pool(workers()) as pool:
+        parts = list(pool.map(part, tiles))
+    order = np.argsort(np.concatenate(tiles))
+    return jax.tree.map(lambda *x: np.concatenate(x)[order], *parts)
+
+
+def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
+    """Indices of the cells that met an attractor of their pair first; by impacts, greatest speed and depth."""
+    left, right = ended.impacts_left, ended.impacts_right
+    swap = (pair.gamma == 0) & (right > left)
+    measures = [np.round(np.log(x) / _SAME) for x in (ended.fastest, ended.deepest)]
+    counts = ended.period, np.where(swap, right, left), np.where(swap, left, right)
+    _, first = np.unique(np.column_stack([*jax.tree.leaves(pair), *counts, *measures]), axis=0, return_index=True)
+    return np.sort(first)
+
+
+_COLUMNS = "n", "t", "side", "v_in", "duration", "depth", "work"
+
+
+def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int | None) -> dict[str, np.ndarray]:
+    """The first impacts of the last periods of cells by name, [cell, impact], NaN beyond; all unless so many."""
+    u, v, t, n, held = jax.tree.leaves((handover.mark, handover.held))
+    mark = State(u, v, t, n.astype(np.int32), held.astype(np.int32))
+
+    def part(rows: np.ndarray) -> dict[str, np.ndarray]:
+        own, at = jax.tree.map(lambda x: x[rows], (pair, mark))
+        return record(own, at, int(periods[rows[0]]), np.ones(rows.size, bool)).impacts
+
+    alike = [np.flatnonzero(periods == number) for number in np.unique(periods)]
+    parts = [rows for some in alike for rows in np.array_split(some, min(workers(), some.size))]
+    with context.pool(workers()) as pool:
+        found = list(pool.map(part, parts))
+    width = max((one["n"].shape[1] for one in found), default=0) if impacts is None else impacts
+    table = {name: np.full((u.size, width), np.nan) for name in _COLUMNS}
+    for rows, one in zip(parts, found, strict=True):
+        for name, column in table.items():
+            some = one[name][:, :width]
+            column[rows, : some.shape[1]] = some
+    return table
+
+
+def _flown(
+    pair: ImpactPair, span: np.ndarray, table: dict[str, np.ndarray], real: np.ndarray, cell: np.ndarray
+) -> Flown:
+    """Motions from the table of their impacts, of which some are meant."""
+    knots = np.stack([2 * table["n"] + table["t"], np.abs(table["v_in"]), table["duration"]], axis=-1)
+    return Flown(
+        pair=pair,
+        side=np.where(real, table["side"], 0).astype(np.int32),
+        knots=np.where(real[..., None], knots, 0.0),
+        span=span,
+        depth=np.where(real, table["depth"], np.nan),
+        work=np.where(real, table["work"], np.nan),
+        cell=cell,
+    )

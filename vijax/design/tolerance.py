@@ -1,0 +1,109 @@
+"""Tolerances of a device's constants as quadrature nodes: factors on the constants, and their weights."""
+
+import itertools
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from vijax.model.device import CONSTANTS
+from vijax.runtime import checks
+
+_MOST_SAMPLES = 10**5
+_NODES = {1: 17, 2: 9, 3: 5}  # of each constant, by the number of them
+
+
+# beta, often zero, has no relative tolerance.
+SCATTERED = tuple(name for name in CONSTANTS if name != "beta")
+
+
+class Tolerance(NamedTuple):
+    """How a constant of the device scatters about its nominal value.
+
+    Attributes:
+        name: A field of `Harvester`.
+        spread: Relative: half width of a uniform distribution, standard deviation of the logarithm of a log-normal one.
+        kind: "uniform" or "lognormal".
+    """
+
+    name: str
+    spread: float
+    kind: str = "uniform"
+
+
+def check_tolerances(tolerances: Iterable[Tolerance], bounded: bool = False) -> tuple[Tolerance, ...]:
+    """The tolerances, if they can be.
+
+    Args:
+        tolerances: Of several constants.
+        bounded: Whether the distribution must end: that of a worst case.
+    """
+    found = tuple(checks.sequence("tolerances", tolerances, Tolerance, "vijax.design.tolerance.Tolerance records"))
+    for one in found:
+        checks.choice("tolerances: name", one.name, SCATTERED)
+        checks.choice(f"tolerances: kind of {one.name}", one.kind, ("uniform", "lognormal"))
+        must = "a number between 0 and 1, relative"
+        checks.real(f"tolerances: spread of {one.name}", one.spread, must, lambda x: 0 < x < 1)
+        if bounded and one.kind != "uniform":
+            raise ValueError(f"tolerances of a worst case must be uniform; got {one.kind} of {one.name}")
+    names = [one.name for one in found]
+    if len(set(names)) < len(names):
+        raise ValueError(f"tolerances must name a constant once; got {', '.join(names)}")
+    return found
+
+
+class Nodes(NamedTuple):
+    """Devices about a nominal one: factors [node, constant] and weights [node]; the first node is the nominal one."""
+
+    names: tuple[str, ...]
+    factors: np.ndarray
+    weights: np.ndarray
+
+
+def nodes(tolerances: tuple[Tolerance, ...], samples: int | None = None, seed: int = 0) -> Nodes:
+    """Nodes of the tolerances together.
+
+    Args:
+        tolerances: None for the nominal device alone.
+        samples: Random devices in place of a quadrature.
+        seed: Of the samples.
+
+    Returns:
+        Clenshaw and Curtis's rule for uniform constants, whose ends are among its nodes; Gauss and Hermite's for
+        log-normal ones; their products. The nominal device comes first, with weight 0 unless it is alone.
+    """
+    tolerances = check_tolerances(tolerances)
+    seed = checks.whole("seed", seed, 0, checks.MOST_SEED)
+    names = tuple(one.name for one in tolerances)
+    if not tolerances:
+        return Nodes(names, np.ones((1, 0)), np.ones(1))
+    if samples is not None:
+        samples = checks.whole("samples", samples, 1, _MOST_SAMPLES)
+        draw = np.random.default_rng(seed)
+        columns = [_factors(one, _drawn(one, draw, samples)) for one in tolerances]
+        factors, weights = np.stack(columns, axis=1), np.full(samples, 1 / samples)
+    else:
+        rules = [_rule(one, _NODES.get(len(tolerances), 3)) for one in tolerances]
+        columns = [_factors(one, x) for one, (x, _) in zip(tolerances, rules, strict=True)]
+        factors = np.array(list(itertools.product(*columns)))
+        weights = np.array([np.prod(ws) for ws in itertools.product(*(w for _, w in rules))])
+    return Nodes(names, np.vstack([np.ones(len(names)), factors]), np.append(0.0, weights))
+
+
+def _factors(one: Tolerance, x: np.ndarray) -> np.ndarray:
+    return 1 + one.spread * x if one.kind == "uniform" else np.exp(one.spread * x)
+
+
+def _drawn(one: Tolerance, draw: np.random.Generator, count: int) -> np.ndarray:
+    return draw.uniform(-1, 1, count) if one.kind == "uniform" else draw.standard_normal(count)
+
+
+def _rule(one: Tolerance, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of one constant, in units of its spread."""
+    if one.kind == "lognormal":
+        x, w = np.polynomial.hermite_e.hermegauss(count)
+        return x, w / w.sum()
+    x = np.cos(np.pi * np.arange(count) / (count - 1))
+    # The weights that integrate the Chebyshev polynomials through the nodes.
+    moments = [0.0 if k % 2 else 1 / (1 - k * k) for k in range(count)]
+    return x, np.linalg.solve(np.polynomial.chebyshev.chebvander(x, count - 1).T, np.array(moments))

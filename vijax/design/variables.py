@@ -1,0 +1,135 @@
+"""What of a device is tuned: quantities by name, the variables that an optimiser sees, and their bounds."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vijax.model import units
+from vijax.model.device import CONSTANTS, Harvester
+from vijax.model.quantities import check
+from vijax.runtime import checks
+from vijax.runtime.context import door
+
+# Other names of what a constant decides: each is applied after the constants, in this order.
+_ALIASES = {"k": "omega0", "kappa": "omega0", "d": "s", "gamma": "beta"}
+LINEAR = ("beta", "gamma")  # may be zero or negative: their variable is the value, that of others its logarithm
+_LEAST_KAPPA, _MOST_KAPPA = 2.0, 400.0
+_LEAST_R, _MOST_R = 0.05, 0.95
+_TILT = 0.1  # rad
+_MOVING = ("omega0", "s", "r", "A", "omega", "beta")  # the motion depends on these
+NAMES = CONSTANTS + tuple(_ALIASES)
+
+
+def constant(name: str) -> str:
+    """The constant of the device that a name decides."""
+    return _ALIASES.get(name, name)
+
+
+def moving(name: str) -> bool:
+    """Whether the motion depends on it, and not the energies alone."""
+    return constant(name) in _MOVING
+
+
+@door
+def values(names: tuple[str, ...], z: Any) -> Any:
+    """Values of the quantities for their variables, [..., quantity]."""
+    plain = np.array([name in LINEAR for name in names])
+    return jnp.where(plain, z, jnp.exp(jnp.where(plain, 0.0, z)))
+
+
+def variables(names: tuple[str, ...], x: Any) -> np.ndarray:
+    """Variables of the quantities for their values, [..., quantity]; the inverse of `values`."""
+    plain, x = np.array([name in LINEAR for name in names]), np.asarray(x, float)
+    return np.where(plain, x, np.log(np.where(plain, 1.0, x)))
+
+
+@door
+def tuned(device: Harvester, names: tuple[str, ...], z: Any) -> Harvester:
+    """The device with the quantities that the variables say."""
+    given = dict(zip(names, values(names, z), strict=True))
+    device = dataclasses.replace(device, **{name: x for name, x in given.items() if name not in _ALIASES})
+    for name in _ALIASES:
+        if name in given:
+            device = _decided(device, name, given[name])
+    return device
+
+
+def _decided(device: Harvester, name: str, x: Any) -> Harvester:
+    """The device in which a quantity that is no constant has the given value."""
+    value = {
+        "k": lambda: jnp.sqrt(x / device.m_b),
+        "kappa": lambda: x * device.omega / math.pi,
+        "d": lambda: x * device.length_unit,
+        "gamma": lambda: jnp.arcsin(x * device.A / device.g),
+    }[name]()
+    return dataclasses.replace(device, **{_ALIASES[name]: value})
+
+
+def value_of(device: Harvester, name: str) -> Any:
+    """The quantity's value in a device."""
+    if name not in _ALIASES:
+        return getattr(device, name)
+    if name == "k":
+        return device.k
+    return getattr(device.pair(), name)
+
+
+def check_names(names: tuple[str, ...]) -> None:
+    """Raise ValueError unless these can be tuned together."""
+    if not names:
+        raise ValueError("tune must name at least one quantity; got none; omega0 is the membrane's")
+    for name in names:
+        checks.choice("tune", name, NAMES)
+        rivals = [one for one in names if constant(one) == constant(name)]
+        if len(rivals) > 1:
+            raise ValueError(f"tune must name a quantity once; got {' and '.join(rivals)}")
+
+
+def limits(names: tuple[str, ...], bounds: Mapping[str, tuple[float, float]], device: Harvester) -> np.ndarray:
+    """Lower and upper bounds [2, quantity] of the quantities of a device.
+
+    Args:
+        names: Checked by `check_names`.
+        bounds: Of some; the others are: kappa 2 to 400, r 0.05 to 0.95, inclinations +-0.1 rad, all else half to twice
+            what the device has.
+
+    Raises:
+        ValueError: Bounds of what is not tuned, or that cannot be.
+    """
+    if not isinstance(bounds, Mapping):
+        raise ValueError(f"bounds must be two numbers by name, as in {{'r': (0.1, 0.9)}}; got {checks.shown(bounds)}")
+    for name in bounds:
+        if name not in names:
+            raise ValueError(f"bounds must be those of a tuned quantity; got {name!r}, not among {', '.join(names)}")
+    pairs = [_checked(name, bounds[name], device) if name in bounds else _default(name, device) for name in names]
+    return np.array(pairs).T
+
+
+def _checked(name: str, bounds: tuple[float, float], device: Harvester) -> tuple[float, float]:
+    low, high = checks.bounds(f"bounds of {name}", units.plain(name, bounds))
+    for bound in (low, high):
+        check(name, bound, f"bounds of {name}")
+    steepest = float(device.g) / float(device.A)
+    if name == "gamma" and max(abs(low), abs(high)) > steepest:
+        raise ValueError(f"bounds of gamma must lie in [-g/A, g/A], here +-{steepest:g}; got {low, high}")
+    return low, high
+
+
+def _default(name: str, device: Harvester) -> tuple[float, float]:
+    kappa = np.array([_LEAST_KAPPA, _MOST_KAPPA])
+    omega0 = kappa * float(device.omega) / math.pi
+    known: dict[str, Any] = {
+        "kappa": kappa,
+        "omega0": omega0,
+        "k": float(device.m_b) * omega0**2,
+        "r": (_LEAST_R, _MOST_R),
+        "beta": (-_TILT, _TILT),
+        "gamma": np.array([-1, 1]) * math.sin(_TILT) * float(device.g) / float(device.A),
+    }
+    now = float(value_of(device, name))
+    low, high = known.get(name, (0.5 * now, 2 * now))
+    return float(low), float(high)

@@ -1,0 +1,467 @@
+"""The stepping engine: diffrax's Runge-Kutta steps with located events, on the same seam as the exact engine.
+
+One `step` of a lane is one attempt of a solver step, accepted, rejected or cut short, so that no lane waits for
+another's solve. A cell's motion is a chain of smooth spells: flight in the displacement u, contact in the penetration
+w = side u - d/2; `mode` says which, and no sign of a rounded number is asked. The wall is met where the dense output of
+a step first crosses it; the step is then repeated up to there, and what is missing is closed by the Taylor polynomial
+of the repeated step, so that the state has the order of the solver and not that of the dense output.
+
+This is the only file that imports diffrax.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vijax.engine.method import Ode, Passage, decided
+from vijax.model.flow import PI
+from vijax.model.membrane import Wall
+from vijax.model.pair import ImpactPair, MembranePair
+from vijax.model.records import Impact, State
+from vijax.runtime.xla import share
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+Solver = Any  # a Runge-Kutta solver of diffrax
+
+_LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
+_CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step
+_ATTEMPTS = 6  # repeats after which a crossing is taken as it is: rounding holds it from closing
+_TRIPS = 5  # of a root on the dense output; a crossing missed by more than _CLOSED is located again
+_FIRST_STEP = 1e-3
+_VANISHING = 4  # roundings: a shorter step does not advance time
+
+
+# --- vector fields --------------------------------------------------------------------------------
+
+
+class Point(eqx.Module):
+    """A state of the solver: u and u' in flight, w and w' in contact; where asked for, the work and the tangent map."""
+
+    x: Scalar
+    z: Scalar
+    work: Scalar | None = None
+    tangent: tuple[Scalar, ...] | None = None  # row by row
+
+
+class Spell(eqx.Module):
+    """What a smooth spell of the motion depends on: the wall it is at, and its side (0: flight)."""
+
+    gamma: Scalar
+    mode: Int[Array, ""]
+    wall: Wall
+
+
+def _field(t: Any, y: Point, spell: Spell) -> Point:
+    held = spell.mode != 0
+    force = jnp.where(spell.mode < 0, -1.0, 1.0) * (jnp.cos(PI * t) - spell.gamma)
+    pull = jnp.where(held, spell.wall(y.x, y.z), 0.0)
+    work = tangent = None
+    if y.work is not None:
+        work = -pull * y.z
+    if y.tangent is not None:
+        a, b, c, d = y.tangent
+        rows = [jax.jvp(spell.wall, (y.x, y.z), column)[1] for column in ((a, c), (b, d))]
+        tangent = (c, d, *(jnp.where(held, row, 0.0) for row in rows))
+    return Point(y.z, force + pull, work, tangent)
+
+
+equation_38 = diffrax.ODETerm(_field)
+"""Eq. (38) in one spell: x'' = side (cos(pi t) - gamma) + membrane(w, w'), for `Point` and `Spell`."""
+
+
+def _field_39(t: Any, y: Point, args: tuple[MembranePair, Int[Array, ""]]) -> Point:
+    pair, mode = args
+    side = jnp.sign(mode).astype(y.x.dtype)
+    pull = jnp.where(mode == 0, 0.0, y.x - 0.5 * side + pair.c_star * y.z)
+    return Point(y.z, pair.A_star * jnp.cos(pair.omega_star * t) - pair.g_star - pull)
+
+
+equation_39 = diffrax.ODETerm(_field_39)
+"""Eq. (39), lengths in units of s and times in units of 1/omega0: for `Point` (x, x') and (`MembranePair`, mode)."""
+
+
+# --- one solver step ------------------------------------------------------------------------------
+
+
+class Motion(eqx.Module):
+    """The carry of a lane: where the ball is, the step it will try, and what its contact has seen so far."""
+
+    y: Point
+    t: Scalar
+    n: Int[Array, ""]
+    mode: Int[Array, ""]
+    h: Scalar
+    full: Scalar  # step to go on with after one that was cut short
+    other: Scalar  # step to go on with after the next change of mode
+    cut: Flag  # this step was cut short, to end at an event or before a second turning
+    aim: Scalar  # the event it was cut for: a wall in the direction -1 or +1, or a crest; 0 for none
+    attempts: Int[Array, ""]
+    onset_t: Scalar
+    onset_n: Int[Array, ""]
+    entered: Flag  # the contact had an onset
+    v_in: Scalar
+    depth: Scalar
+    left_t: Scalar  # when the ball left a wall last
+    left_n: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+_CREST = 2.0  # as an aim
+
+
+def _solver(engine: Ode, recorded: bool) -> Solver:
+    """diffrax's solver; its loop over stages is differentiable in reverse where a run is recorded."""
+    solver, kind = getattr(diffrax, engine.solver), "bounded" if recorded else "lax"
+    if issubclass(solver, diffrax.AbstractImplicitSolver):
+        tolerances: Any = (engine.rtol, engine.atol)
+        return solver(scan_kind=kind, root_finder=diffrax.VeryChord(*tolerances))
+    return solver(scan_kind=kind)
+
+
+def start(engine: Ode, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
+    """The carry of a start, in flight or inside a wall (then a contact without onset, which ends in no impact).
+
+    Args:
+        engine: The method's numbers.
+        pair: One cell (scalars), soft.
+        state: Where the ball is; its mode is believed.
+        deep: Whether greatest depths and works are wanted.
+        tangent: Whether tangent maps are wanted.
+    """
+    zero, whole = jnp.zeros_like(state.u), jnp.zeros_like(state.n)
+    side = state.mode.astype(zero.dtype)
+    held = state.mode != 0
+    x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
+    if engine.dt is None:
+        first, inside = zero + _FIRST_STEP, jnp.minimum(_FIRST_STEP, 0.1 / pair._soft_kappa())
+    else:
+        first = inside = zero + engine.dt
+    no = jnp.zeros_like(held)
+    return Motion(
+        y=Point(
+            x,
+            jnp.where(held, side * state.v, state.v),
+            zero if deep else None,
+            (zero + 1, zero, zero, zero + 1) if tangent else None,
+        ),
+        t=state.t,
+        n=state.n,
+        mode=state.mode,
+        h=jnp.where(held, inside, first),
+        full=first,
+        other=jnp.where(held, first, inside),
+        cut=no,
+        aim=zero,
+        attempts=whole,
+        onset_t=state.t,
+        onset_n=state.n,
+        entered=no,
+        v_in=state.v,
+        depth=jnp.where(held, x, 0.0),
+        left_t=state.t,
+        left_n=state.n,
+        steps=whole,
+    )
+
+
+def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: Point, y1: Point, error: Point):
+    """Whether a step is accepted, and the length of the next; the error of position and velocity alone decides."""
+    if engine.dt is not None:
+        return jnp.ones_like(t0, bool), jnp.full_like(t0, engine.dt)
+    controller = diffrax.PIDController(rtol=engine.rtol, atol=engine.atol)
+    t0, t1, y0, y1, error = lax.stop_gradient((t0, t1, y0, y1, error))
+    (x0, z0), (x1, z1), (e_x, e_z) = ((y.x, y.z) for y in (y0, y1, error))
+    one = jnp.ones_like(t0)
+    keep, begin, end, _, _, _ = controller.adapt_step_size(
+        t0, t1, (x0, z0), (x1, z1), None, (e_x, e_z), order, (one, one, jnp.asarray(False))
+    )
+    h = end - begin
+    return keep, jnp.where(jnp.isfinite(h), h, 0.2 * (t1 - t0))
+
+
+class Dense(eqx.Module):
+    """Dense output of a step at theta in [0, 1]: the quintic through position, velocity and acceleration at both ends.
+
+    A second-order equation gives it for nothing, and it is of higher order than diffrax's own interpolants.
+    """
+
+    c0: Scalar
+    c1: Scalar
+    c2: Scalar
+    c3: Scalar
+    c4: Scalar
+    c5: Scalar
+
+    def place(self, s: Scalar) -> Scalar:
+        """Position."""
+        return self.c0 + s * (self.c1 + s * (self.c2 + s * (self.c3 + s * (self.c4 + s * self.c5))))
+
+    def rate(self, s: Scalar) -> Scalar:
+        """Derivative of the position by theta."""
+        return self.c1 + s * (2 * self.c2 + s * (3 * self.c3 + s * (4 * self.c4 + s * (5 * self.c5))))
+
+    def bend(self, s: Scalar) -> Scalar:
+        """Second derivative."""
+        return 2 * self.c2 + s * (6 * self.c3 + s * (12 * self.c4 + s * (20 * self.c5)))
+
+    def jerk(self, s: Scalar) -> Scalar:
+        """Third derivative."""
+        return 6 * self.c3 + s * (24 * self.c4 + s * (60 * self.c5))
+
+
+def dense_output(h: Scalar, y0: Point, f0: Point, y1: Point, f1: Point) -> Dense:
+    """The dense output of a step of length h from the states at its ends and their derivatives."""
+    z, a = y0.z * h, f0.z * h * h
+    rise, gain, change = y1.x - y0.x - z - 0.5 * a, y1.z * h - z - a, f1.z * h * h - a
+    return Dense(
+        y0.x,
+        z,
+        0.5 * a,
+        10 * rise - 4 * gain + 0.5 * change,
+        -15 * rise + 7 * gain - change,
+        6 * rise - 3 * gain + 0.5 * change,
+    )
+
+
+def _root(function, low: Scalar, high: Scalar) -> Scalar:
+    """Root of a rising function in [low, high], by Newton's iteration with bisection where it leaves the bracket."""
+    x = 0.5 * (low + high)
+    for _ in range(_TRIPS):
+        value, slope = function(x)
+        low, high = jnp.where(value <= 0, x, low), jnp.where(value > 0, x, high)
+        newton = x - value / jnp.where(slope > 0, slope, jnp.inf)
+        inside = (slope > 0) & (newton >= low) & (newton <= high)
+        x = share(jnp.where(inside, newton, 0.5 * (low + high)))
+    return x
+
+
+class _Trial(eqx.Module):
+    """A step that was tried: where it leads, whether its error lets it pass, and the length to try next."""
+
+    h: Scalar
+    t: Scalar
+    y: Point
+    f: Point
+    passes: Flag
+    h_next: Scalar
+    dense: Dense
+
+
+def _try(engine: Ode, solver: Solver, m: Motion, spell: Spell, recorded: bool) -> _Trial:
+    """One step of the solver, at most to the end of the period if it is recorded."""
+    h = jnp.minimum(lax.stop_gradient(m.h), _LONGEST)
+    t = m.t + h
+    if recorded:
+        room = lax.stop_gradient(2 - m.t)
+        ends = decided(h >= room)
+        t, h = jnp.where(ends, 2.0, t), jnp.where(ends, room, h)
+    no = jnp.zeros_like(m.cut)
+    f0 = _field(m.t, m.y, spell)
+    fsal = solver.tableau.fsal
+    y, error, _, last, _ = solver.step(equation_38, m.t, t, m.y, spell, (no, f0) if fsal else None, no)
+    f = last[1] if fsal else _field(t, y, spell)
+    y, error, f0, f = share((y, error, f0, f))
+    passes, h_next = _control(engine, solver.error_order(equation_38), m.t, t, m.y, y, error)
+    dense = share(dense_output(h, *lax.stop_gradient((m.y, f0, y, f))))
+    return _Trial(h, t, y, f, passes, h_next, dense)
+
+
+class _Sight(eqx.Module):
+    """What the dense output of a step shows: whether to try it shorter, how much, and the event it should end at."""
+
+    seen: Flag
+    theta: Scalar
+    aim: Scalar
+
+
+def _look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) -> _Sight:
+    """The first wall crossing of a step, the crest of a contact before it, or a second turning of the velocity.
+
+    A velocity that changes sign between the ends turns once; the position is monotone up to there and from there on,
+    so each crossing is bracketed, and of two the earlier is found. Where the acceleration changes sign (at most once,
+    as a step is at most _LONGEST) the velocity is extreme: if it has changed sign there and back, the step is cut at
+    that place, and the next look sees one turning at a time (`untwisted`: it was cut so).
+    """
+    one, zero = jnp.ones_like(half), jnp.zeros_like(half)
+    z0, z1, bend0, bend1 = dense.c1, dense.rate(one), dense.c2, dense.bend(one)
+    heading = jnp.where(z0 == 0, jnp.sign(z1), jnp.sign(z0))
+    turns = heading * z1 < 0
+    turning = _root(lambda s: (-heading * dense.rate(s), -heading * dense.bend(s)), zero, one)
+    rising = jnp.sign(bend1)
+    extreme = _root(lambda s: (rising * dense.bend(s), rising * dense.jerk(s)), zero, one)
+    twice = (bend0 * bend1 < 0) & ~turns & ~untwisted & (heading * dense.rate(extreme) < 0)
+    # What may be met: either wall in flight, and in contact the membrane's rest from above.
+    wall = jnp.where(held, 0.0, half)
+    middle = jnp.where(turns, turning, one)
+    first = (~held | (heading < 0)) & (heading * dense.place(middle) > wall)
+    second = turns & ~first & (~held | (heading > 0)) & (-heading * dense.place(one) > wall)
+    aim = jnp.where(first, heading, -heading)
+    low, high = jnp.where(first, 0.0, middle), jnp.where(first, middle, 1.0)
+    crossing = _root(lambda s: (aim * dense.place(s) - wall, aim * dense.rate(s)), low, high)
+    crest = turns & held & (heading > 0) if deep else jnp.zeros_like(turns)
+    return _Sight(
+        twice | crest | first | second,
+        jnp.where(twice, extreme, jnp.where(crest, turning, crossing)),
+        jnp.where(twice, 0.0, jnp.where(crest, _CREST, aim)),
+    )
+
+
+class _Landing(eqx.Module):
+    """Whether a step that was cut for an event has met it, how much later in time it is, and the speed there."""
+
+    onset: Flag
+    exits: Flag
+    crest: Flag
+    delay: Scalar
+    speed: Scalar  # towards the wall at an onset, away from it at an exit
+
+
+def _land(m: Motion, half: Scalar, trial: _Trial) -> _Landing:
+    """Close the gap that the repeated step leaves, to second order: aim (x + z s + push s^2/2) = wall.
+
+    The root is -2 gap/(speed + sqrt(speed^2 - 2 push gap)), and the speed there is that square root. A ball that turns
+    just before the wall has none, and has not met it. Derivatives are those of the true event: the lengths of steps are
+    constants to them.
+    """
+    held, aim = m.mode != 0, lax.stop_gradient(m.aim)
+    x, z, push = trial.y.x, trial.y.z, trial.f.z
+    gap, speed, drive = aim * x - jnp.where(held, 0.0, half), aim * z, aim * push
+    square = speed * speed - 2 * drive * gap
+    root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    both = speed + root
+    real = ((square >= 0) | (gap > 0)) & ((root > 0) | (drive > 0))
+    tops = (aim == _CREST) & (push < 0)
+    delay = jnp.where(tops, -z / jnp.where(tops, push, -1.0), -2 * gap / jnp.where(both > 0, both, jnp.inf))
+    near = trial.passes & ((jnp.abs(delay) <= _CLOSED * trial.h) | (m.attempts >= _ATTEMPTS))
+    met, crest = decided((near & real & (jnp.abs(aim) == 1), near & tops))
+    return _Landing(met & ~held, met & held, crest, jnp.where(met | crest, delay, 0.0), root)
+
+
+def _ratio(change: Scalar, speed: Scalar) -> Scalar:
+    """Jump of the acceleration over the speed of crossing: the one entry of a soft saltation matrix."""
+    moving = speed != 0
+    return jnp.where(moving, change / jnp.where(moving, speed, 1.0), 0.0)
+
+
+def _meet(m: Motion, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, landing: _Landing) -> Point:
+    """The state at the event that a step has met (at its end, if none), in the coordinates of the spell after it."""
+    onset, exits, crest, delay, speed = landing.onset, landing.exits, landing.crest, landing.delay, landing.speed
+    y = jax.tree.map(lambda value, slope: value + delay * slope, trial.y, trial.f)
+    top = y.x + 0.5 * delay * delay * trial.f.z
+    x = jnp.where(onset, 0.0, jnp.where(exits, side * half, jnp.where(crest, top, y.x)))
+    z = jnp.where(onset, speed, jnp.where(exits, -side * speed, jnp.where(crest, 0.0, y.z)))
+    tangent = None
+    if y.tangent is not None:
+        a, b, c, d = y.tangent
+        zero = jnp.zeros_like(speed)
+        jump = jnp.where(onset, _ratio(wall(zero, speed), speed), 0.0)
+        jump = jnp.where(exits, _ratio(wall(zero, -speed), speed), jump)
+        tangent = (a, b, c + jump * a, d + jump * b)
+    return Point(x, z, None if y.work is None else jnp.where(onset, 0.0, y.work), tangent)
+
+
+def step(
+    engine: Ode, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
+) -> tuple[Motion, Passage, Flag]:
+    """Try one step of the solver.
+
+    Args:
+        engine: The method's numbers.
+        pair: One cell (scalars).
+        wall: Its membrane, (w, w') -> acceleration.
+        m: The carry, from `start` or an earlier step.
+        recorded: For trajectories: a step ends at phase 0, and can be differentiated in reverse.
+
+    Returns:
+        The carry after it, and the impact that this step finished, meaningless unless the flag says that it did. A
+        step that vanishes beside the time, or is not finite, makes an impact of NaN.
+    """
+    half, held = 0.5 * pair.d, m.mode != 0
+    trial = _try(engine, _solver(engine, recorded), m, Spell(pair.gamma, m.mode, wall), recorded)
+    landing = _land(m, half, trial)
+    sight = _look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
+    landing, sight = share((landing, sight))
+    shut = landing.onset | landing.exits
+    seen = trial.passes & sight.seen & ~shut & ~landing.crest
+    seen, moved = decided((seen, trial.passes & ~seen))
+    side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
+    y = _meet(m, half, side, wall, trial, landing)
+
+    t = trial.t + landing.delay
+    over = decided(t >= 2)
+    t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
+    n = m.n + (moved & over).astype(m.n.dtype)
+    passage = _passage(m, half, side, y, t, n, landing.speed)
+    lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
+    passage = eqx.tree_at(lambda p: p.impact.v_out, passage, jnp.where(lost, jnp.nan, passage.impact.v_out))
+
+    if y.tangent is not None:
+        unit = (1.0, 0.0, 0.0, 1.0)
+        fresh = tuple(jnp.where(landing.exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
+        y = eqx.tree_at(lambda y: y.tangent, y, fresh)
+    h, full, other = decided(_lengths(engine, m, trial, sight, seen, moved, shut))
+    depth = jnp.where(landing.crest, jnp.maximum(m.depth, y.x), m.depth)
+    new = Motion(
+        y=jax.tree.map(lambda new, old: jnp.where(moved, new, old), y, m.y),
+        t=t,
+        n=n,
+        mode=jnp.where(landing.onset, side.astype(m.mode.dtype), jnp.where(landing.exits, 0, m.mode)),
+        h=h,
+        full=full,
+        other=other,
+        cut=seen,
+        aim=decided(lax.stop_gradient(jnp.where(seen, sight.aim, 0.0))),
+        attempts=jnp.where(seen, m.attempts + 1, 0),
+        onset_t=jnp.where(landing.onset, t, m.onset_t),
+        onset_n=jnp.where(landing.onset, n, m.onset_n),
+        entered=(m.entered | landing.onset) & ~landing.exits,
+        v_in=jnp.where(landing.onset, side * landing.speed, m.v_in),
+        depth=jnp.where(landing.onset, 0.0, depth),
+        left_t=jnp.where(landing.exits, t, m.left_t),
+        left_n=jnp.where(landing.exits, n, m.left_n),
+        steps=m.steps + 1,
+    )
+    return new, passage, (landing.exits & m.entered) | lost
+
+
+def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, moved: Flag, shut: Flag):
+    """Length of the next step, the one to go on with after a cut one, and the one for after the next change of mode.
+
+    A change of mode changes the scale of time: each mode goes on with the length that it had.
+    """
+    ahead = trial.h_next if engine.dt is not None else jnp.maximum(trial.h_next, m.h)  # m.h: was capped
+    ahead = jnp.minimum(jnp.where(m.cut, m.full, ahead), _LONGEST)
+    after = jnp.where(shut, m.other, jnp.where(moved, ahead, trial.h_next))
+    h = jnp.where(seen, sight.theta * trial.h, after)
+    return lax.stop_gradient((h, jnp.where(seen, ahead, m.full), jnp.where(shut, m.full, m.other)))
+
+
+def _passage(m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[Array, ""], speed: Scalar) -> Passage:
+    """The impact that ends at (t, n) with the ball leaving at a speed."""
+    zero, v_out = jnp.zeros_like(half), -side * speed
+    impact = Impact(
+        n=m.onset_n,
+        t=m.onset_t,
+        side=side.astype(m.mode.dtype),
+        v_in=m.v_in,
+        v_out=v_out,
+        depth=m.depth,
+        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
+        work=zero if y.work is None else y.work,
+    )
+    flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
+    return Passage(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), y.tangent)
+
+
+def ball(pair: ImpactPair, method: Ode, m: Motion) -> State:
+    """Where the ball of a carry is."""
+    side = m.mode.astype(m.y.x.dtype)
+    held = m.mode != 0
+    u = jnp.where(held, side * (0.5 * pair.d + m.y.x), m.y.x)
+    return State(u, jnp.where(held, side * m.y.z, m.y.z), m.t, m.n, m.mode)

@@ -1,0 +1,180 @@
+"""The paper's own method: classical Runge-Kutta steps of constant length, the contact decided by the sign of a sample.
+
+For replaying published diagrams, and as the peer that other methods are measured against. What it cannot know:
+
+- When an impact begins or ends: onset and exit are the first samples inside and outside, late by up to a step. A graze
+  or a bounce between two samples is not seen at all.
+- The speeds there: v_in is read from the first sample inside, where a stiff membrane has taken part of it already, and
+  v_out from the first one outside; the depth is that of the deepest sample, the work a trapezoidal sum over samples.
+- The jump of the force: a stage on the wrong side of the wall costs the scheme its order, which is 1 here and not 4.
+- Stiff walls: above kappa h = 2.6 to 2.8 (h the step) a contact blows up, and the cell is called nonfinite.
+
+Source: the scheme behind the paper's figures, Eq. (38).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vijax.engine.method import Passage, Rk4, decided
+from vijax.model.flow import PI
+from vijax.model.membrane import Wall
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Impact, State
+from vijax.runtime.xla import share
+
+Scalar = Float[Array, ""]
+_ON_GRID = 1e-6  # of a step: a start so little before a sample is at it
+
+
+class Motion(eqx.Module):
+    """The carry of a lane: the last sample, and what its contact and the way since the last exit have seen."""
+
+    u: Scalar
+    v: Scalar
+    k: Scalar  # samples of this period behind it
+    offset: Scalar  # phase of sample 0
+    n: Int[Array, ""]
+    mode: Int[Array, ""]
+    onset_t: Scalar
+    onset_n: Int[Array, ""]
+    entered: Bool[Array, ""]
+    v_in: Scalar
+    depth: Scalar
+    work: Scalar
+    left_t: Scalar
+    left_n: Int[Array, ""]
+    tangent: tuple[Scalar, ...] | None  # row by row
+
+
+def start(method: Rk4, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
+    """The carry of a start; its phase is sample 0 if it lies on none of the grid of steps.
+
+    Args:
+        method: The method's numbers.
+        pair: One cell (scalars), soft.
+        state: Where the ball is.
+        deep: Taken for the seam's sake: depth and work cost nothing here.
+        tangent: Whether tangent maps are wanted: those of the numerical scheme, which has no saltation.
+    """
+    zero = jnp.zeros_like(state.u)
+    h = 2 / method.steps
+    k = jnp.floor(state.t / h + _ON_GRID)
+    return Motion(
+        u=state.u,
+        v=state.v,
+        k=k,
+        offset=state.t - k * h,
+        n=state.n,
+        mode=state.mode,
+        onset_t=state.t,
+        onset_n=state.n,
+        entered=jnp.zeros_like(state.mode, bool),
+        v_in=state.v,
+        depth=jnp.maximum(jnp.abs(state.u) - 0.5 * pair.d, 0.0),
+        work=zero,
+        left_t=state.t,
+        left_n=state.n,
+        tangent=(zero + 1, zero, zero, zero + 1) if tangent else None,
+    )
+
+
+def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Scalar, u: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
+    """One classical step; every stage is in contact if it lies beyond the wall."""
+
+    def push(forcing, u, v):
+        side = jnp.where(u < 0, -1.0, 1.0)
+        w = side * u - 0.5 * pair.d
+        return share(v), share(forcing + jnp.where(w >= 0, side * wall(w, side * v), 0.0))
+
+    middle = 0.5 * h
+    first, second, last = share(tuple(jnp.cos(PI * (t + s)) - pair.gamma for s in (0.0, middle, h)))
+    u1, v1 = push(first, u, v)
+    u2, v2 = push(second, u + middle * u1, v + middle * v1)
+    u3, v3 = push(second, u + middle * u2, v + middle * v2)
+    u4, v4 = push(last, u + h * u3, v + h * v3)
+    return u + h / 6 * (u1 + 2 * (u2 + u3) + u4), v + h / 6 * (v1 + 2 * (v2 + v3) + v4)
+
+
+def step(
+    method: Rk4, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
+) -> tuple[Motion, Passage, Bool[Array, ""]]:
+    """One step, and what its sample shows.
+
+    Args:
+        method: The method's numbers.
+        pair: One cell (scalars).
+        wall: Its membrane, (w, w') -> acceleration.
+        m: The carry.
+        recorded: Taken for the seam's sake: a sample at phase 0 and derivatives in reverse cost nothing here.
+
+    Returns:
+        The carry after it, and the impact that this sample ended, meaningless unless the flag says that it did.
+    """
+    h = 2 / method.steps
+    t = m.offset + m.k * h
+
+    def move(u, v):
+        return _runge_kutta(pair, wall, t, h, u, v)
+
+    u, v = share(move(m.u, m.v))
+    mapped = None
+    if m.tangent is not None:
+        a, b, c, d = m.tangent
+        (_, (p, q)), (_, (r, s)) = (jax.jvp(move, (m.u, m.v), column) for column in ((a, c), (b, d)))
+        mapped = (p, r, q, s)
+    k = m.k + 1
+    over = k >= method.steps
+    k, n = jnp.where(over, 0.0, k), m.n + over.astype(m.n.dtype)
+    t = m.offset + k * h
+    w = jnp.abs(u) - 0.5 * pair.d
+    mode = decided(jnp.where(w >= 0, jnp.where(u < 0, -1, 1), 0).astype(m.mode.dtype))
+    leaves, onset = (m.mode != 0) & (mode != m.mode), (mode != 0) & (mode != m.mode)
+    ends = leaves & m.entered
+
+    def given(u, v):  # power into the membrane at a sample inside
+        along = jnp.where(u < 0, -v, v)
+        depth = jnp.abs(u) - 0.5 * pair.d
+        return jnp.where(depth >= 0, -wall(depth, along) * along, 0.0)
+
+    work = jnp.where(onset, 0.0, m.work + 0.5 * h * (given(m.u, m.v) + given(u, v)))
+    impact = Impact(
+        n=m.onset_n,
+        t=m.onset_t,
+        side=m.mode,
+        v_in=m.v_in,
+        v_out=v,
+        depth=m.depth,
+        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
+        work=work,
+    )
+    flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
+    passage = Passage(impact, flight, State(u, v, t, n, mode), mapped)
+    tangent = None
+    if mapped is not None:
+        unit = (1.0, 0.0, 0.0, 1.0)
+        tangent = tuple(jnp.where(leaves, one, value) for one, value in zip(unit, mapped, strict=True))
+    new = Motion(
+        u=u,
+        v=v,
+        k=k,
+        offset=m.offset,
+        n=n,
+        mode=mode,
+        onset_t=jnp.where(onset, t, m.onset_t),
+        onset_n=jnp.where(onset, n, m.onset_n),
+        entered=onset | (m.entered & ~leaves),
+        v_in=jnp.where(onset, v, m.v_in),
+        depth=jnp.where(onset, w, jnp.where(leaves, 0.0, jnp.maximum(m.depth, w))),
+        work=work,
+        left_t=jnp.where(leaves, t, m.left_t),
+        left_n=jnp.where(leaves, n, m.left_n),
+        tangent=tangent,
+    )
+    return new, passage, ends
+
+
+def ball(pair: ImpactPair, method: Rk4, m: Motion) -> State:
+    """The last sample of a carry."""
+    return State(m.u, m.v, m.offset + m.k * (2 / method.steps), m.n, m.mode)

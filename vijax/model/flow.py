@@ -1,0 +1,280 @@
+"""Closed-form flow of the ball at elapsed time s: in flight, and in contact with a membrane.
+
+Differences are written without cancellation (1 - cos x and x - sin x by series), because low-speed bounces live in
+exactly the digits that the naive forms lose.
+"""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from vijax.model.pair import ImpactPair
+from vijax.runtime.xla import once, share
+
+PI = math.pi
+
+Scalar = Float[Array, ""]
+
+
+def _alternating(start: int, terms: int) -> tuple[float, ...]:
+    """Taylor coefficients (-1)^k / (start + 2k)! in ascending powers of x^2."""
+    return tuple((-1.0) ** k / math.factorial(start + 2 * k) for k in range(terms))
+
+
+class Membrane(eqx.Module):
+    """What the contact closed form needs of a soft wall: natural frequency, decay rate, damped frequency (all > 0).
+
+    `rolled` keeps its Taylor series a loop: a program that is differentiated compiles in seconds instead of minutes;
+    one that is not runs three times faster unrolled.
+    """
+
+    kappa: Scalar
+    zeta: Scalar
+    omega1: Scalar
+    rolled: bool = eqx.field(static=True, default=False)
+
+    @property
+    def mu(self) -> Scalar:
+        """Damping mu = 2 zeta of w'' + mu w' + kappa^2 w = f."""
+        return 2 * self.zeta
+
+
+class Force(eqx.Module):
+    """Forcing c cos(pi s) - q sin(pi s) - g at elapsed time s."""
+
+    c: Scalar
+    q: Scalar
+    g: Scalar
+
+    def at(self, s: Scalar) -> Scalar:
+        """Value at elapsed time s."""
+        sin_s, cos_s, _, _ = half_turn(s)
+        return self.c * cos_s - self.q * sin_s - self.g
+
+    def later(self, s: Scalar) -> "Force":
+        """The same forcing with its clock started a time s later."""
+        sin_s, cos_s, _, _ = half_turn(s)
+        return Force(self.c * cos_s - self.q * sin_s, self.q * cos_s + self.c * sin_s, self.g)
+
+    def slope(self) -> "Force":
+        """Time derivative."""
+        return Force(-PI * self.q, PI * self.c, jnp.zeros_like(self.g))
+
+
+def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
+    """The soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
+    decrement = 0.0 - jnp.log(pair.r)  # +0 at r = 1: a free half cycle that begins at -0 would be over at once
+    scale = pair.kappa / jnp.sqrt(PI**2 + decrement * decrement)
+    # Else every loop that needs omega1 makes its own, and some lanes of a loop round PI - omega1 once and others twice.
+    return share(Membrane(pair.kappa, decrement * scale, PI * scale, rolled))
+
+
+# On |x| <= pi/4 the first neglected term is below 1e-17 of the sum.
+_VERSINE = _alternating(2, 8)
+_LAG = _alternating(3, 8)
+# sinh(z)/z on |z| < 1/2 in powers of z^2.
+_SINHC = tuple(1.0 / math.factorial(2 * k + 1) for k in range(8))
+# The exponentials of a contact with max(kappa, pi) s < 1 need this many Taylor terms for 1e-17.
+_CONTACT_TERMS = 20
+_SERIES_REACH = 1.0
+
+
+def horner(coefficients: tuple[Any, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Polynomial with the given ascending coefficients at x."""
+    total = x * coefficients[-1] + coefficients[-2]
+    for coefficient in coefficients[-3::-1]:
+        total = total * x + coefficient
+    return total
+
+
+@once
+def half_turn(s: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
+    """sin, cos, versine and lag of pi s: (sin, cos, 1 - cos, pi s - sin), each to full relative accuracy near s = 0.
+
+    Args:
+        s: Half turns, any finite number; reduced by quadrants, so that sin(pi k/2) and cos(pi k/2) are exact.
+    """
+    quadrant = jnp.round(2 * s)
+    x = PI * (s - 0.5 * quadrant)
+    square = x * x
+    versine = square * horner(_VERSINE, square)
+    lag = x * square * horner(_LAG, square)
+    sine, cosine = x - lag, 1 - versine
+    quadrant = quadrant - 4 * jnp.floor(0.25 * quadrant)
+    odd, back = (quadrant == 1) | (quadrant == 3), quadrant >= 2
+    turned_sine, turned_cosine = jnp.where(odd, cosine, sine), jnp.where(odd, -sine, cosine)
+    turned_sine, turned_cosine = (
+        jnp.where(back, -turned_sine, turned_sine),
+        jnp.where(back, -turned_cosine, turned_cosine),
+    )
+    small = jnp.abs(s) < 0.25
+    return (
+        turned_sine,
+        turned_cosine,
+        jnp.where(small, versine, 1 - turned_cosine),
+        jnp.where(small, lag, PI * s - turned_sine),
+    )
+
+
+def wrap_phase(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Phase in [0, 2) and the whole periods taken off."""
+    periods = jnp.floor(0.5 * t)
+    return t - 2 * periods, periods
+
+
+@once
+def flight(gamma: Scalar, t0: Scalar, v0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+    """Displacement from the start and velocity after flying for a time s from phase t0 at velocity v0.
+
+    u - u0 = v0 s - gamma s^2/2 + (cos(pi t0)(1 - cos pi s) - sin(pi t0)(pi s - sin pi s))/pi^2
+    Source: Eqs. (6)-(7) scaled, derived again (physics.md).
+    """
+    sin0, cos0, _, _ = half_turn(t0)
+    sin_s, _, versine, lag = half_turn(s)
+    rise = (v0 - 0.5 * gamma * s) * s + (cos0 * versine - sin0 * lag) / PI**2
+    return share((rise, v0 - gamma * s + (cos0 * sin_s - sin0 * versine) / PI))
+
+
+def acceleration(gamma: Scalar, t: Scalar) -> Scalar:
+    """Acceleration in flight, cos(pi t) - gamma."""
+    return half_turn(t)[1] - gamma
+
+
+def _contact_series(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+    """Taylor series in s of (w, w'); accurate for max(kappa, pi) s < 1, where the closed form cancels."""
+    s = share(s)
+
+    def add(n, carry):
+        w, z, w_term, z_term, drive, next_drive, steady = carry
+        h = s / (n + 1)
+        square = m.kappa * m.kappa
+        w_term, z_term = z_term * h, (drive - steady - m.mu * z_term - square * w_term) * h
+        # The n-th derivative of the forcing times s^n/n!: two steps on it is -(pi s)^2/((n + 1)(n + 2)) of itself.
+        after = -drive * (PI * s) ** 2 / ((n + 1) * (n + 2))
+        return w + w_term, z + z_term, w_term, z_term, next_drive, after, jnp.zeros_like(steady)
+
+    start = (w0, z0, w0, z0, force.c, -force.q * PI * s, force.g)
+    if m.rolled:
+        w, z, *_ = lax.fori_loop(0, _CONTACT_TERMS, add, start)
+        return w, z
+    for n in range(_CONTACT_TERMS):
+        start = add(n, start)
+    return start[0], start[1]
+
+
+@once
+def free_response(m: Membrane, s: Scalar) -> tuple[Scalar, Scalar]:
+    """Impulse response h of the membrane and its derivative: h'' + mu h' + kappa^2 h = 0, h(0) = 0, h'(0) = 1.
+
+    sin(omega1 s)/omega1 is the sinc form: it tends to s as omega1 -> 0 (r -> 0).
+    """
+    decay = jnp.exp(-m.zeta * s)
+    sine = jnp.sin(m.omega1 * s) / m.omega1
+    return decay * sine, decay * (jnp.cos(m.omega1 * s) - m.zeta * sine)
+
+
+def _driven_response(m: Membrane, h: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+    """Responses from rest to cos(pi s), sin(pi s): the divided difference of exp at -zeta +- i omega1 and i pi.
+
+    Near kappa = pi, mu = 0 two of the three points meet: the secular form s e^m sinh(z)/z stays accurate there.
+    """
+    gap_re, gap_im = m.zeta, PI - m.omega1
+    re, im = 0.5 * s * gap_re, 0.5 * s * gap_im  # z
+    near = jnp.abs(re) + jnp.abs(im) < 0.5
+    re, im = jnp.where(near, re, 0.0), jnp.where(near, im, 0.0)
+    # sinh(z)/z by real arithmetic: complex division and powers compile to ten times the code.
+    square_re, square_im = re * re - im * im, 2 * re * im
+    sinhc_re, sinhc_im = jnp.full_like(s, _SINHC[-1]), jnp.zeros_like(s)
+    for coefficient in _SINHC[-2::-1]:
+        sinhc_re, sinhc_im = (
+            sinhc_re * square_re - sinhc_im * square_im + coefficient,
+            sinhc_re * square_im + sinhc_im * square_re,
+        )
+    middle = 0.5 * (PI + m.omega1) * s
+    scale = s * jnp.exp(-0.5 * m.zeta * s)
+    mean_re, mean_im = scale * jnp.cos(middle), scale * jnp.sin(middle)
+    secular_re = mean_re * sinhc_re - mean_im * sinhc_im
+    secular_im = mean_re * sinhc_im + mean_im * sinhc_re
+    sin_s, cos_s, _, _ = half_turn(s)
+    decay = jnp.exp(-m.zeta * s)
+    apart_re, apart_im = cos_s - decay * jnp.cos(m.omega1 * s), sin_s - decay * jnp.sin(m.omega1 * s)
+    inverse = 1 / jnp.where(near, 1.0, gap_re * gap_re + gap_im * gap_im)
+    first_re = jnp.where(near, secular_re, (apart_re * gap_re + apart_im * gap_im) * inverse) - h
+    first_im = jnp.where(near, secular_im, (apart_im * gap_re - apart_re * gap_im) * inverse)
+    far_im = PI + m.omega1
+    inverse = 1 / (m.zeta * m.zeta + far_im * far_im)
+    return (first_re * m.zeta + first_im * far_im) * inverse, (first_im * m.zeta - first_re * far_im) * inverse
+
+
+def _contact_closed(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+    """(w, w') by the closed form: free response plus Duhamel's integral of the forcing."""
+    h, slope = share(free_response(m, s))
+    from_cos, from_sin = share(_driven_response(m, h, s))
+    stay = slope + m.mu * h  # response to a unit displacement
+    square = m.kappa * m.kappa
+    w = w0 * stay + z0 * h + force.c * from_cos - force.q * from_sin - force.g * (1 - stay) / square
+    z = (z0 * slope - square * w0 * h) + force.c * (h - PI * from_sin) - force.q * PI * from_cos - force.g * h
+    return w, z
+
+
+@once
+def oscillate(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+    """(w, w') at time s of w'' + mu w' + kappa^2 w = force from (w0, z0) at s = 0.
+
+    Source: Eqs. (20)-(21) with the constants derived again (physics.md); each regime against mpmath in test_flow.py.
+    """
+    short = jnp.maximum(m.kappa, PI) * s < _SERIES_REACH
+    near = _contact_series(m, force, w0, z0, jnp.where(short, s, 0.0))
+    far = _contact_closed(m, force, w0, z0, jnp.where(short, 1.0, s))
+    return share((jnp.where(short, near[0], far[0]), jnp.where(short, near[1], far[1])))
+
+
+def flight_force(gamma: Scalar, t: Scalar) -> Force:
+    """The forcing cos(pi t) - gamma with its clock started at phase t."""
+    sin_t, cos_t, _, _ = half_turn(t)
+    return Force(cos_t, sin_t, gamma)
+
+
+def contact_force(gamma: Scalar, side: Scalar, t: Scalar) -> Force:
+    """The forcing of the penetration w = side u - d/2 in a contact that begins at phase t."""
+    sin_t, cos_t, _, _ = half_turn(t)
+    return Force(side * cos_t, side * sin_t, side * gamma)
+
+
+def steady_response(m: Membrane, force: Force) -> Force:
+    """Steady response of the membrane to `force`, in the same form; infinite at the undamped resonance.
+
+    The forcing is the real part of (c + i q) e^(i pi s): divide by kappa^2 - pi^2 + i mu pi.
+    """
+    stiffness, loss = (m.kappa - PI) * (m.kappa + PI), m.mu * PI
+    square = stiffness * stiffness + loss * loss
+    return Force(
+        (stiffness * force.c + loss * force.q) / square,
+        (stiffness * force.q - loss * force.c) / square,
+        force.g / (m.kappa * m.kappa),
+    )
+
+
+def flight_matrix(s: Scalar) -> Float[Array, "2 2"]:
+    """Tangent map of a flight of length s in (du, du')."""
+    one, zero = jnp.ones_like(s), jnp.zeros_like(s)
+    return jnp.array([[one, s], [zero, one]])
+
+
+def contact_matrix(m: Membrane, s: Scalar) -> Float[Array, "2 2"]:
+    """Tangent map of a whole contact of duration s in (du, du'), from flight to flight; its determinant is exp(-mu s).
+
+    The saltations at onset [[1, 0], [-mu, 1]] and exit [[1, 0], [mu, 1]] (physics.md) around the fundamental matrix
+    [[h' + mu h, h], [-kappa^2 h, h']] collapse to the form below: regular at grazing.
+    """
+    h, slope = free_response(m, s)
+    return jnp.array([[slope, h], [-m.kappa * m.kappa * h, slope + m.mu * h]])
+
+
+def rigid_matrix(r: Scalar, a: Scalar, v_in: Scalar) -> Float[Array, "2 2"]:
+    """Saltation matrix of a rigid impact in (du, du'): det = r^2, and it grows as 1/v_in at grazing."""
+    return jnp.array([[-r, jnp.zeros_like(r)], [(1 + r) * a / v_in, -r]])

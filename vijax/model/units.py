@@ -1,0 +1,119 @@
+"""Units: that of every quantity, and how a number with another one becomes a plain number in it.
+
+All that is computed is computed with plain SI numbers. What comes with a unit, as text or as a quantity of pint, is
+converted at the door; pint is imported only where there is one.
+"""
+
+import math
+import re
+import sys
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from vijax.runtime import checks
+
+UNITS = {
+    "omega": "rad/s",
+    "omega0": "rad/s",
+    "k": "N/m",
+    "s": "m",
+    "A": "m/s^2",
+    "beta": "rad",
+    "m_b": "kg",
+    "g": "m/s^2",
+    "w0": "m",
+    "R0": "m",
+    "eps_M": "F/m",
+    "C_T": "F",
+    "V": "V",
+    "r_b": "m",
+    "penetration_limit": "m",
+    "depth": "m",
+}
+"""What plain numbers are in; a quantity that is not here has no unit."""
+
+_WITH_UNIT = {"d": "s", "kappa": "omega0 or k", "gamma": "beta"}
+_PI = r"pi(?![^\W\d])"  # not the pico of picofarads
+_ONE = r"(?:[^\W\d]+|°)(?:(?:\^|\*\*)-?\d)?"
+# A multiple of pi keeps its pi, which pint would take for a unit.
+_WRITTEN = re.compile(
+    rf"([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?(?:{_PI})?+|{_PI}))\s*({_ONE}(?:[*/]{_ONE})*)", re.IGNORECASE
+)
+
+
+def split(text: str) -> tuple[str, str]:
+    """A number and its unit, as in 5Hz, 6pi rad/s or 20deg; the unit is empty where there is none."""
+    text = text.strip()
+    written = _WRITTEN.fullmatch(text)
+    return (written[1], written[2]) if written else (text, "")
+
+
+def with_unit(name: str, value: float, unit: str) -> float:
+    """A value in some unit as a plain number of the quantity `name`.
+
+    Raises:
+        ValueError: If no such unit is known, or it is not one of the quantity.
+    """
+    return value * _factor_of(name, unit)
+
+
+def plain(name: str, value: Any) -> Any:
+    """A quantity of pint, or a list of them, as plain numbers; whatever else comes is returned as it is.
+
+    Args:
+        name: The quantity that is meant.
+        value: What came.
+
+    Raises:
+        ValueError: If its unit is not one of the quantity, or only some of a list have one.
+    """
+    if isinstance(value, list | tuple) and any(map(_has_unit, value)):
+        if not all(map(_has_unit, value)):
+            raise ValueError(f"{name} must have a unit at every value or at none; got {checks.shown(value)}")
+        return np.array([plain(name, one) for one in value])
+    return value.magnitude * _factor(name, value.units) if _has_unit(value) else value
+
+
+def _has_unit(value: Any) -> bool:
+    pint = sys.modules.get("pint")  # without it nobody has made a quantity
+    return pint is not None and isinstance(value, pint.Quantity)
+
+
+@cache
+def _factor_of(name: str, text: str) -> float:
+    import pint
+
+    try:
+        return _factor(name, pint.application_registry.Unit(text))
+    except pint.UndefinedUnitError:
+        raise ValueError(
+            f"{name} must be in {UNITS.get(name, 'no unit')}, or in a unit that pint knows; got {text!r}"
+        ) from None
+
+
+def _factor(name: str, unit: Any) -> float:
+    """How many of the quantity's own units a unit of pint is."""
+    import pint
+
+    one = 1.0 * unit
+    if name not in UNITS:
+        if one.unitless:
+            return 1.0
+        hint = f"; with a unit there is {_WITH_UNIT[name]}" if name in _WITH_UNIT else ""
+        raise ValueError(f"{name} must be a number without a unit; got one in {unit}{hint}")
+    try:
+        factor = one.m_as(UNITS[name])
+    except pint.errors.PintError:
+        raise ValueError(f"{name} must be in {UNITS[name]}, or in a unit of that kind; got one in {unit}") from None
+    # Of what turns, hertz counts the turns; to pint it is 1/s, as rad/s is.
+    turns = sum(power for part, power in one.unit_items() if part.endswith("hertz")) if UNITS[name] == "rad/s" else 0
+    return factor * (2 * math.pi) ** turns
+
+
+def cf(name: str) -> str:
+    """The unit of a quantity as datasets write it: m s-2."""
+    above, _, below = UNITS.get(name, "1").partition("/")
+    unit, _, power = below.partition("^")
+    return f"{above} {unit}-{power or 1}" if below else above

@@ -1,0 +1,176 @@
+"""A branch of periodic orbits as a curve in the space of knots and one parameter, and one step along it.
+
+The orbit's equations go on through grazing into orbits that are none (`shooting`). What makes an orbit real, and what
+marks a bifurcation, are smooth functions along the curve: its test functions.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vijax.model.pair import ImpactPair
+from vijax.orbits import grazing, shooting
+from vijax.orbits.shooting import Sequence
+from vijax.runtime import linear_solve, tiles
+
+# Powers with which d, kappa and gamma go in a quantity of the device, by Eqs. (37)-(38).
+_POWERS: dict[str, dict[str, float]] = {
+    "omega": {"d": 2, "kappa": -1},
+    "omega0": {"kappa": 1},
+    "k": {"kappa": 0.5},
+    "s": {"d": 1},
+    "A": {"d": -1, "gamma": -1},
+}
+# What moves with each quantity that a branch can be followed along: of the pair itself alone, of the device several.
+MOVED: dict[str, tuple[str, ...]] = {name: (name,) for name in ("d", "kappa", "r", "gamma")}
+MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("gamma",)}
+CLOSE = 1e-11  # size of the last correction
+_BATCHES = (8, 64, 512)  # lanes of one compiled call
+_ROUNDS = 6  # Newton corrections of a step, at most
+
+
+class Tests(NamedTuple):
+    """Functions whose sign changes mark what happens on a branch; those from `speed` on are positive on real orbits."""
+
+    fold: Float[Array, ""]  # the parameter's share of the tangent
+    plus: Float[Array, ""]  # det(M - 1): a multiplier passes +1
+    minus: Float[Array, ""]  # det(M + 1): a multiplier passes -1
+    speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
+    flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
+    contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
+    exit: Float[Array, ""]  # least speed away from a wall, over that into it: the ball stays
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+
+
+FOLD, PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
+FIRST_END = Tests._fields.index("speed")
+
+
+def moved(pair: ImpactPair, along: str, x: Array, start: Array, steepest: Array) -> ImpactPair:
+    """A pair where a parameter, which was `start` there, is x; `steepest` is g/A, gamma of a vertical tube."""
+    fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
+    if along == "beta":
+        fields["gamma"] = steepest * tiles.library((pair, x)).sin(x)
+    elif along not in _POWERS:
+        fields[along] = x
+    for name, power in _POWERS.get(along, {}).items():
+        if fields[name] is not None:  # as kappa of a rigid wall is
+            fields[name] = fields[name] * (x / start) ** power
+    return ImpactPair(**fields)
+
+
+class Arc(eqx.Module):
+    """What a lane follows: the orbit's parameters where it began, its walls, and which parameter moves.
+
+    Attributes:
+        start: The parameter where the orbit began.
+        steepest: g/A of the device, gamma of a vertical tube (along="beta" only).
+        low, high: Bounds of the parameter; their distance is the unit of its share of the arclength.
+    """
+
+    pair: ImpactPair
+    sequence: Sequence
+    start: Float[Array, ""]
+    steepest: Float[Array, ""]
+    low: Float[Array, ""]
+    high: Float[Array, ""]
+    along: str = eqx.field(static=True)
+
+    def at(self, x: Float[Array, ""]) -> ImpactPair:
+        """The pair at a value of the parameter."""
+        return moved(self.pair, self.along, x, self.start, self.steepest)
+
+
+def unpack(arc: Arc, y):
+    """Knots and parameter of a point of the curve, or of many along leading axes."""
+    return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (arc.high - arc.low)
+
+
+def _equations(arc: Arc, y) -> shooting.Linear:
+    """Gap and its derivatives in knots and parameter."""
+    knots, x = unpack(arc, y)
+    pair, moved = jax.jvp(arc.at, (x,), (arc.high - arc.low,))
+    return shooting.linearise(pair, arc.sequence, knots, moved)
+
+
+class _Arrival(NamedTuple):
+    """Newton's way back to the branch: the point, the tangent there, the size of the last correction, how many."""
+
+    y: Float[Array, "unknown"]
+    tangent: Float[Array, "unknown"]
+    size: Float[Array, ""]
+    trips: Int[Array, ""]
+
+
+def _correct(arc: Arc, guess, former) -> _Arrival:
+    """Newton in the plane across the former tangent, and the tangent there."""
+    ahead = jnp.zeros_like(guess).at[-1].set(1.0)
+
+    def once(at: _Arrival) -> _Arrival:
+        gap, slope = _equations(arc, at.y)
+        slope = jnp.concatenate([slope, former[None]])
+        miss = jnp.append(gap, former @ (at.y - guess))
+        step, tangent = jax.vmap(linear_solve.solve, in_axes=(None, 0))(slope, jnp.stack([miss, ahead]))
+        return _Arrival(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.trips + 1)
+
+    def going(at: _Arrival):
+        return (at.size > CLOSE) & (at.size < 1.0) & (at.trips < _ROUNDS)
+
+    return lax.while_loop(going, once, _Arrival(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
+
+
+def _tests(arc: Arc, y, tangent) -> Tests:
+    knots, x = unpack(arc, y)
+    pair = arc.at(x)
+    around = shooting.monodromy(pair, arc.sequence, knots)
+    trace = around[0, 0] + around[1, 1]
+    determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
+    room = grazing.between(pair, arc.sequence, knots).clearance
+    return Tests(
+        fold=tangent[-1],
+        plus=1 - trace + determinant,
+        minus=1 + trace + determinant,
+        speed=room.speed,
+        flight=room.flight,
+        contact=room.contact,
+        exit=room.exit,
+        low=x - arc.low,
+        high=arc.high - x,
+    )
+
+
+class Place(NamedTuple):
+    """Points of branches, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
+
+    And how Newton came there: the size of its last correction, and how many it took.
+    """
+
+    y: np.ndarray
+    tangent: np.ndarray
+    tests: np.ndarray
+    size: np.ndarray
+    trips: np.ndarray
+
+
+@jax.jit
+def _compiled(arcs: Arc, y, tangent, length):
+    def one(arc, y, tangent, length):
+        at = _correct(arc, y + length * tangent, tangent)
+        return Place(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.trips)
+
+    return jax.vmap(one)(arcs, y, tangent, length)
+
+
+def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> Place:
+    """From points of branches on by an arclength each: the compiled program behind every step and every search."""
+    parts = []
+    for tile in tiles.tiles(y.shape[0], _BATCHES):
+        rows = jax.tree.map(lambda leaf, rows=tile.rows: np.asarray(leaf)[rows], (arcs, y, tangent, length))
+        parts.append(jax.tree.map(lambda leaf, real=tile.real: np.asarray(leaf)[:real], _compiled(*rows)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

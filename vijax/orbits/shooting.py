@@ -1,0 +1,298 @@
+"""Multiple shooting: a periodic orbit as the root of closed forms, one set of equations per impact.
+
+The unknowns of an impact are its onset time, its speed into the wall and how long the contact lasts; its equations say
+that the penetration is back at zero then, and that the flight after it meets the next impact in place and speed. No
+crossing is searched for, so the equations are smooth wherever an impact sits in the period, through folds, and through
+grazing. What they do not say is that nothing happens in between: that is for the impact map to verify.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.runtime import linear_solve
+
+Knots = Float[Array, "impact 3"]
+"""Onset time, speed into the wall (> 0) and contact time of each impact."""
+
+_TRIPS = 80  # evaluations that a damped search may take; a neighbour's orbit needs 4 or 5
+_LAST_STEP = 1e-9  # a Newton step this small is the last: the next one would be its square
+_FLOOR = 1e-12  # residual at which rounding may keep a search from improving
+_LEAST_PACE = 1e-4  # share of Newton's step below which the search has stalled
+
+
+class Sequence(eqx.Module):
+    """Which walls an orbit meets, and how it closes.
+
+    Attributes:
+        side: Wall of each impact, -1 or +1; 0 pads to a common width.
+        span: Time after which it closes: 2 p for period p, p for a mirror-symmetric orbit closed half way.
+        mirrored: Whether it closes onto its mirror image (gamma = 0, p odd).
+    """
+
+    side: Int[Array, "impact"]
+    span: Float[Array, ""]
+    mirrored: Bool[Array, ""]
+
+    @property
+    def real(self) -> Bool[Array, "impact"]:
+        """Which impacts are there."""
+        return self.side != 0
+
+
+class Linear(NamedTuple):
+    """The equations at a guess: what is missing, and how it changes with every knot (and a parameter, last)."""
+
+    gap: Float[Array, "3*impact"]
+    slope: Float[Array, "3*impact unknown"]
+
+
+class _Contact(NamedTuple):
+    """The end of a contact: penetration there over the contact's length, and w'; each in onset, speed and length."""
+
+    place: Float[Array, ""]
+    rate: Float[Array, ""]
+    place_slope: Float[Array, "3"]
+    rate_slope: Float[Array, "3"]
+
+
+def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
+    """A contact and its derivatives: all of them follow from the free response and the forcing at both ends.
+
+    An onset moved at the same length moves the whole motion, less the free motion of what the state at the onset gains.
+    Automatic derivatives would run a tangent of the closed form for every unknown, at five times the cost.
+    """
+    t, speed, stay, _, _ = knot
+    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
+    if pair.kappa is None:
+        return _Contact(stay, -pair.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -pair.r, zero]))
+    wall, force = flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t)
+    w, rate = flow.oscillate(wall, force, zero, speed, stay)
+    h, slope = flow.free_response(wall, stay)
+    square, begin = wall.kappa * wall.kappa, force.c - force.g
+    push = force.at(stay) - wall.mu * rate - square * w
+    onset = rate - slope * speed - h * begin
+    rate_onset = push + square * h * speed - slope * (begin - wall.mu * speed)
+    return _Contact(
+        w / stay,
+        rate,
+        jnp.stack([onset, h, rate - w / stay]) / stay,
+        jnp.stack([rate_onset, slope, push]),
+    )
+
+
+def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Float[Array, "3"], Float[Array, "3 5"]]:
+    """Equations of one contact and the flight after it to the wall `onward`, and their derivatives in the knot.
+
+    `knot` ends with the next time and speed. Divided by the contact's length, and by the flight's where it returns to
+    its wall: no trivial root at length zero.
+    """
+    t, _, stay, next_t, next_speed = knot
+    contact = _contact(pair, side, knot)
+    leave, length, speed = t + stay, next_t - t - stay, side * contact.rate
+    rise, v = flow.flight(pair.gamma, leave, speed, length)
+    # In (onset, speed, stay, next onset, next speed): how each end of the flight moves.
+    unit = jnp.eye(5, dtype=knot.dtype)
+    d_leave, d_next, d_next_speed = unit[0] + unit[2], unit[3], unit[4]
+    d_speed = side * jnp.pad(contact.rate_slope, (0, 2))
+    push = flow.acceleration(pair.gamma, leave)
+    d_rise = v * d_next + length * d_speed - (speed + length * push) * d_leave
+    d_v = flow.acceleration(pair.gamma, next_t) * d_next + d_speed - push * d_leave
+    back = side == onward
+    place = jnp.where(back, rise / length, rise - onward * pair.d)
+    d_place = jnp.where(back, (d_rise - rise / length * (d_next - d_leave)) / length, d_rise)
+    value = jnp.stack([contact.place, place, onward * v - next_speed])
+    return value, jnp.stack([jnp.pad(contact.place_slope, (0, 2)), d_place, onward * d_v - d_next_speed])
+
+
+def _following(sequence: Sequence):
+    """Index of the impact after each, its wall, and whether the orbit closes there."""
+    width = sequence.side.shape[0]
+    index = jnp.arange(width, dtype=jnp.int32)
+    closes = index == sequence.real.sum(dtype=jnp.int32) - 1
+    after = jnp.where(closes | ~sequence.real, 0, index + 1)
+    wall = sequence.side[after] * jnp.where(closes & sequence.mirrored, -1, 1)
+    return after, wall, closes
+
+
+def _joined(sequence: Sequence, knots: Knots):
+    """Wall, next wall and joint knots of every impact; harmless numbers where there is none."""
+    after, wall, closes = _following(sequence)
+    later = jnp.where(closes, sequence.span, 0.0)
+    joined = jnp.concatenate([knots, (knots[after, 0] + later)[:, None], knots[after, 1:2]], axis=1)
+    real = sequence.real
+    blank = jnp.array([0.0, 1.0, 0.5, 1.0, 1.0], knots.dtype)
+    side = jnp.where(real, sequence.side, 1).astype(knots.dtype)
+    return side, jnp.where(real, wall, -1).astype(knots.dtype), jnp.where(real[:, None], joined, blank)
+
+
+def gap(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "3*impact"]:
+    """What is missing to an orbit: zero at one, and where there is no impact."""
+    side, wall, joined = _joined(sequence, knots)
+    pieces, _ = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
+    return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
+
+
+def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactPair | None = None) -> Linear:
+    """The equations and their derivatives in the knots, block by block: each involves two neighbours only.
+
+    Args:
+        moved: Change of the pair along a parameter, whose derivative becomes the last column.
+    """
+    side, wall, joined = _joined(sequence, knots)
+
+    def each(pair):
+        return jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
+
+    if moved is None:
+        pieces, blocks = each(pair)
+    else:
+        pieces, change, blocks = jax.jvp(each, (pair,), (moved,), has_aux=True)
+    real, width = sequence.real, knots.shape[0]
+    here = jnp.eye(width, dtype=knots.dtype)
+    there = jax.nn.one_hot(_following(sequence)[0], width, dtype=knots.dtype)
+    # Entry (impact, equation, impact, knot).
+    full = here[:, None, :, None] * blocks[:, :, None, :3]
+    full = full.at[..., :2].add(there[:, None, :, None] * blocks[:, :, None, 3:5])
+    idle = here[:, None, :, None] * jnp.eye(3, dtype=knots.dtype)[None, :, None, :]
+    full = jnp.where(real[:, None, None, None], full, idle)
+    slope, missing = full.reshape(3 * width, 3 * width), jnp.where(real[:, None], pieces, 0.0).reshape(-1)
+    if moved is not None:
+        change = jnp.where(real[:, None], change, 0.0)
+        slope = jnp.concatenate([slope, change.reshape(-1, 1)], axis=1)
+    return Linear(missing, slope)
+
+
+class Passage(NamedTuple):
+    """The end of each contact and the impact that is to follow it."""
+
+    side: Float[Array, "impact"]
+    speed: Float[Array, "impact"]  # away from the wall
+    t: Float[Array, "impact"]
+    next_side: Float[Array, "impact"]
+    next_t: Float[Array, "impact"]
+    next_speed: Float[Array, "impact"]
+    next_stay: Float[Array, "impact"]
+
+
+def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
+    """How each contact ends, and where the flight after it is to lead."""
+    side, wall, joined = _joined(sequence, knots)
+    t, _, stay, next_t, next_speed = joined.T
+    rate = jax.vmap(lambda side, knot: _contact(pair, side, knot).rate)(side, joined)
+    next_stay = knots[_following(sequence)[0], 2]
+    return Passage(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
+
+
+def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, ""]:
+    """Whether every speed, contact and flight is longer than nothing."""
+    _, _, joined = _joined(sequence, knots)
+    t, speed, stay, next_t, _ = joined.T
+    touches = jnp.ones_like(speed, bool) if pair.kappa is None else stay > 0
+    return ((speed > 0) & touches & (next_t - t - stay > 0)).all()
+
+
+class _Descent(eqx.Module):
+    """Newton's search of a batch: knots, the full step from there, how much is missing, the share to try."""
+
+    knots: Float[Array, "orbit impact 3"]
+    step: Float[Array, "orbit impact 3"]
+    missing: Float[Array, "orbit"]
+    pace: Float[Array, "orbit"]
+    going: Bool[Array, "orbit"]
+    trip: Int[Array, ""]
+
+
+def newton(
+    pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"], trips: int = _TRIPS
+) -> tuple[Float[Array, "orbit impact 3"], Float[Array, "orbit"]]:
+    """Damped Newton on a batch of orbits: a step that does not shorten what is missing is halved.
+
+    Args:
+        trips: Evaluations that a search may take; the batch takes as many as its slowest search.
+
+    Returns:
+        The knots, and the largest residual at each; inf where the search stalled, or left what is possible.
+    """
+
+    def look(knots):
+        linear = jax.vmap(linearise)(pair, sequence, knots)
+        step = jax.vmap(linear_solve.solve)(linear.slope, linear.gap).reshape(knots.shape)
+        return step, jnp.abs(linear.gap).max(axis=1)
+
+    def size(step):
+        return jnp.abs(step).max(axis=(1, 2))
+
+    def advance(d: _Descent) -> _Descent:
+        trial = d.knots - d.pace[:, None, None] * d.step
+        step, missing = look(trial)
+        # NaN compares false: an overflow is a step too long.
+        better = jax.vmap(possible)(pair, sequence, trial) & (missing < (1 - 0.25 * d.pace) * d.missing)
+        better = d.going & better & jnp.isfinite(size(step))
+        pick = better[:, None, None]
+        pace = jnp.where(better, jnp.minimum(2 * d.pace, 1.0), 0.5 * d.pace)
+        step = jnp.where(pick, step, d.step)
+        return _Descent(
+            knots=jnp.where(pick, trial, d.knots),
+            step=step,
+            missing=jnp.where(better, missing, d.missing),
+            pace=jnp.where(d.going, pace, d.pace),
+            going=d.going & (pace > _LEAST_PACE) & ~(better & (size(step) <= _LAST_STEP)),
+            trip=d.trip + 1,
+        )
+
+    # The first trial is the guess itself.
+    zero, far = jnp.zeros_like(knots), jnp.full(knots.shape[0], jnp.inf)
+    start = _Descent(knots, zero, far, jnp.ones_like(far), far > 0, jnp.int32(0))
+    end = lax.while_loop(lambda d: d.going.any() & (d.trip < trips), advance, start)
+    arrived = (end.missing < jnp.inf) & ((size(end.step) <= _LAST_STEP) | (end.missing < _FLOOR))
+    knots = jnp.where(arrived[:, None, None], end.knots - end.step, end.knots)
+    residual = jnp.abs(jax.vmap(gap)(pair, sequence, knots)).max(axis=1)
+    arrived = arrived & jax.vmap(possible)(pair, sequence, knots)
+    return knots, jnp.where(arrived, residual, jnp.inf)
+
+
+def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "2 2"]:
+    """Tangent map once around in (du, du'), from the end of the last contact; onto the mirror image where it closes so.
+
+    Saltations included; its determinant is exp(-mu (contact time)), or r^(2 impacts) at rigid walls.
+    """
+    side, _, joined = _joined(sequence, knots)
+    t, speed, stay, next_t, _ = joined.T
+
+    def one(before, here):
+        side, t, speed, stay, flight, real = here
+        if pair.kappa is None:
+            contact = flow.rigid_matrix(pair.r, flow.acceleration(pair.gamma, t), side * speed)
+        else:
+            contact = flow.contact_matrix(flow.membrane(pair, rolled=True), stay)
+        step = flow.flight_matrix(flight) @ contact
+        return jnp.where(real, step @ before, before), None
+
+    # A cyclic shift of the product: contact then flight, which has the multipliers of flight then contact.
+    start = jnp.eye(2, dtype=knots.dtype)
+    around, _ = lax.scan(one, start, (side, t, speed, stay, next_t - t - stay, sequence.real))
+    return jnp.where(sequence.mirrored, -1.0, 1.0) * around
+
+
+def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
+    """Eigenvalues of 2 x 2 monodromy matrices, the larger modulus first; squared where the orbit is closed half way.
+
+    The smaller of two real ones is the determinant over the larger: their difference would cancel.
+    """
+    half = 0.5 * (around[:, 0, 0] + around[:, 1, 1])
+    product = around[:, 0, 0] * around[:, 1, 1] - around[:, 0, 1] * around[:, 1, 0]
+    spread = half * half - product
+    root = jnp.sqrt(jnp.abs(spread))
+    large = half + jnp.where(half < 0, -root, root)
+    small = product / jnp.where(large == 0, 1.0, large)
+    real = (spread >= 0)[:, None]
+    parts = jnp.where(real, jnp.stack([large, small], axis=1), half[:, None])
+    values = lax.complex(parts, jnp.where(real, 0.0, jnp.stack([root, -root], axis=1)))
+    return jnp.where(mirrored[:, None], values * values, values)

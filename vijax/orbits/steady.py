@@ -1,0 +1,230 @@
+"""The steady state that an attracting orbit keeps up, as a differentiable function of the device or of the pair.
+
+The orbit follows its parameters by the implicit function theorem on the shooting equations, (I - DP) dx = dP/dp
+with every impact's own unknowns kept. Where that derivative means nothing, values and derivatives are NaN.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vijax.engine.exact import implicit_root
+from vijax.model import energy, flow
+from vijax.model.device import Harvester, check_device
+from vijax.model.pair import ImpactPair, check_pair
+from vijax.model.records import Status, WithStatus
+from vijax.orbits import shooting
+from vijax.orbits.grazing import Clearance, between
+from vijax.orbits.shooting import Knots, Sequence
+from vijax.runtime import checks, linear_solve
+from vijax.runtime.context import door
+
+_CONVERGED = 1e-10  # residual of an orbit's equations
+# Nearer than this to |multiplier| = 1 an orbit is at its bifurcation, and derivatives have lost half of their digits.
+_MARGIN = 1e-7
+
+
+class Steady(WithStatus):
+    """What an attracting periodic orbit yields, impact by impact, and how far that can be trusted.
+
+    Values are NaN, as are their derivatives, unless `status` is OK. Padded impacts hold 0 (`work`: inf).
+
+    Attributes:
+        P: Energy harvested per half forcing period [J].
+        power: P omega/pi [W].
+        speed: Largest speed into a wall [m/s].
+        depth, energy, work: Largest penetration [m], harvested energy [J], and energy given to the membrane [J] of each
+            impact.
+        multiplier: Largest modulus of the Floquet multipliers of the full orbit.
+        condition: Condition number of I - DP, Frobenius.
+        clearance: How far the orbit is from grazing.
+        residual: Largest violation of the equations.
+        status: A `Status`, whose `advice` says what to do. OK; UNSTABLE: it repels, or is at a bifurcation;
+            VIRTUAL: the ball would meet a wall in between; NO_ORBIT: Newton found none.
+        left, right, period: Label of the orbit: impacts on either wall, in so many forcing periods.
+        knots: The orbit; see `shooting`.
+    """
+
+    P: Float[Array, ""]
+    power: Float[Array, ""]
+    speed: Float[Array, ""]
+    depth: Float[Array, "impact"]
+    energy: Float[Array, "impact"]
+    work: Float[Array, "impact"]
+    multiplier: Float[Array, ""]
+    condition: Float[Array, ""]
+    clearance: Clearance
+    residual: Float[Array, ""]
+    status: Int[Array, ""]
+    left: Int[Array, ""]
+    right: Int[Array, ""]
+    period: Int[Array, ""]
+    knots: Knots
+
+
+@jax.custom_jvp
+def _follows(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Knots:
+    """`knots` as a function of the pair by the orbit's equations: value unchanged, derivatives of every order right."""
+    return knots
+
+
+@_follows.defjvp
+def _follows_jvp(primals, tangents):
+    pair, sequence, knots = primals
+    # The rule calls itself on the knots, so that second derivatives see them move too.
+    knots = _follows(pair, sequence, knots)
+    # Not the last column of `linearise`: reverse mode cannot tell it from the matrix.
+    _, moved = jax.jvp(lambda pair: shooting.gap(pair, sequence, knots), (pair,), (tangents[0],))
+    slope = shooting.linearise(pair, sequence, knots).slope
+    return knots, -linear_solve.solve(slope, moved).reshape(knots.shape)
+
+
+@door
+def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> Steady:
+    """The steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
+
+    Args:
+        device: Constants, scalars; those under differentiation traced.
+        orbit: One element of a `periodic.Orbit` (`found[0]`) of the device or of a near one: its walls, and
+            where Newton begins. Values come from `device`, not from `orbit.pair`.
+        pair: d, kappa, r, gamma to move directly; those of the device unless given. Its wall is the orbit's.
+
+    Returns:
+        The record; NaN with a `status` where there is no attracting orbit.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
+    """
+    _check(device, orbit, pair)
+    if orbit.knots.dtype != np.float64:
+        raise ValueError(
+            f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbits.periodic` found it"
+        )
+    wall = "rigid" if orbit.pair.kappa is None else "soft"
+    # Numbers of one kind, however they are given: each kind would be a program of its own.
+    device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
+    return _near(device, pair, orbit.sequence, orbit.knots, wall)
+
+
+@partial(jax.jit, static_argnames="wall")
+def _near(device: Harvester, pair: ImpactPair | None, sequence: Sequence, guess: Knots, wall: str) -> Steady:
+    """The steady state near a guess.
+
+    Compiled once, and so are its derivatives and batches: as one call they are known by its identity, while loops run
+    one by one would be compiled for every call, as each makes their bodies anew.
+    """
+    pair = device.pair(wall) if pair is None else pair
+    guess = jnp.where(sequence.real[:, None], guess, 0.0)
+    return response(device, pair, sequence, *find(pair, sequence, guess))
+
+
+def _check(device: Any, orbit: Any, pair: Any) -> None:
+    """Raise ValueError unless these are records of the right kind; what is traced passes unseen."""
+    check_device(device)
+    if not all(hasattr(orbit, name) for name in ("pair", "sequence", "knots")):
+        raise ValueError(
+            f"orbit must be one of a vijax.orbits.periodic.Orbit; got {checks.shown(orbit)}; take found[0]"
+        )
+    if jnp.ndim(orbit.knots) != 2:
+        raise ValueError(f"orbit must be a single one; got knots of shape {jnp.shape(orbit.knots)}; take found[0]")
+    if pair is not None and (check_pair(pair).kappa is None) != (orbit.pair.kappa is None):
+        raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
+
+
+def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Float[Array, ""]]:
+    """Knots of the orbit near a guess and their residual, constants of differentiation."""
+    batch = jax.tree.map(lambda x: lax.stop_gradient(x)[None], (pair, sequence, guess))
+    knots, residual = shooting.newton(*batch)
+    return lax.stop_gradient(knots[0]), lax.stop_gradient(residual[0])
+
+
+def response(
+    device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]
+) -> Steady:
+    """What the orbit with the given knots yields; the knots follow device and pair under differentiation."""
+    frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
+    status, multiplier, condition, (room, deepest) = _validity(*frozen)
+    # Harmless numbers where there is no orbit: what is computed from them is thrown away.
+    absent = (status == Status.NO_ORBIT) | ~sequence.real
+    knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)
+    knots = _follows(pair, sequence, knots)
+    valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
+    depth, harvested, work = (valid * x for x in _impacts(device, pair, sequence, knots, deepest))
+    P = jnp.where(sequence.real, harvested, 0.0).sum() / sequence.span
+    left, right = ((sequence.side == wall).sum(dtype=jnp.int32) for wall in (-1, 1))
+    # Closed half way, the mirror image of the orbit is the rest of it.
+    left, right = (jnp.where(sequence.mirrored, left + right, side) for side in (left, right))
+    return Steady(
+        P=P,
+        power=P * device.omega / flow.PI,
+        speed=valid * jnp.where(sequence.real, knots[:, 1], 0.0).max() * device.speed_unit,
+        depth=depth,
+        energy=harvested,
+        work=work,
+        multiplier=multiplier,
+        condition=condition,
+        clearance=room,
+        residual=residual,
+        status=status,
+        left=left,
+        right=right,
+        period=jnp.round(sequence.span * jnp.where(sequence.mirrored, 1.0, 0.5)).astype(jnp.int32),
+        knots=knots,
+    )
+
+
+_HARMLESS = (0.0, 1.0, 0.5)  # a knot
+
+
+def _validity(pair: ImpactPair, sequence: Sequence, knots: Knots, residual):
+    around = shooting.monodromy(pair, sequence, knots)
+    multiplier = jnp.abs(shooting.floquet(around[None], sequence.mirrored[None])).max()
+    away = jnp.eye(2, dtype=knots.dtype) - around
+    condition = (away * away).sum() / jnp.abs(away[0, 0] * away[1, 1] - away[0, 1] * away[1, 0])
+    motion = between(pair, sequence, knots)
+    found = residual < _CONVERGED
+    real = jnp.stack(motion.clearance).min() > 0
+    attracts = multiplier < 1 - _MARGIN
+    status = jnp.where(attracts, Status.OK, Status.UNSTABLE)
+    status = jnp.where(real, status, Status.VIRTUAL)
+    status = jnp.where(found, status, Status.NO_ORBIT).astype(jnp.int32)
+    return status, multiplier, condition, motion
+
+
+def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):
+    """Depth [m], harvested energy [J] and energy given to the membrane [J] of every impact."""
+    real = sequence.real
+    t, speed, stay = knots.T
+    if pair.kappa is None:
+        kappa = device.omega0 * flow.PI / device.omega
+        depth = speed * energy.rigid_penetration(pair.r) / kappa
+        work = energy.membrane_work_rigid(speed, pair.r)
+    else:
+        passage = shooting.passages(pair, sequence, knots)
+        depth = _depths(pair, passage.side, knots, deepest)
+        signed = passage.side * speed, -passage.side * passage.speed
+        work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, passage.side, t, stay, *signed)
+    depth = jnp.where(real, depth, 0.0) * device.length_unit
+    work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
+    return depth, energy.harvested_energy(device, depth), work
+
+
+def _depths(pair: ImpactPair, side, knots: Knots, deepest) -> Float[Array, "impact"]:
+    """Largest penetration of each contact on a soft wall: that of its deepest turning point, which moves along."""
+    wall = flow.membrane(pair, rolled=True)
+
+    def one(side, knot, when):
+        t, speed, _ = knot
+        args = wall, flow.contact_force(pair.gamma, side, t), jnp.zeros_like(t), speed
+        return flow.oscillate(*args, implicit_root(_rate, when, args))[0]
+
+    return jax.vmap(one)(side, knots, jnp.nan_to_num(deepest))
+
+
+def _rate(s, args):
+    return flow.oscillate(*args, s)[1]

@@ -1,0 +1,284 @@
+"""Axes of a sweep: text -> values -> the quantities that the dynamics and the energies of every cell depend on.
+
+This is the door of `sweep.sweep` and of the scripts: whatever can be wrong with an axis is found here.
+"""
+
+import errno
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vijax.model import units
+from vijax.model.device import Harvester
+from vijax.model.quantities import AXES, check
+from vijax.runtime import checks
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+# Different names of one quantity: a sweep takes at most one of each row.
+_RIVALS = (("d", "s"), ("kappa", "omega0", "k"), ("gamma", "beta"))
+
+START = (0.05853, -0.47898)
+# A start off the centre of every gap: the default displacement is at most this part of the gap.
+_START_REACH = 0.49
+
+_FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
+_MOST_VALUES = 10**7  # of an axis: the largest planes have some 10^6 a side
+_MOST_CELLS = 10**12  # of a plane, whose store is then some 80 TB
+_BYTES = 8  # of a number
+_MOST_TEXT = 32 * _MOST_VALUES  # bytes of a file that holds them
+
+
+def parse_axis(name: str, text: str) -> np.ndarray:
+    """Values of an axis written as a number (0-d), a comma list, `LO:HI:N`, `LO:HI:N:log` or `@FILE` (1-d).
+
+    A number may be written with pi, as in `pi` or `12pi`, and with a unit, as in `5Hz` or `20deg`; then all are. Of an
+    angular frequency Hz are turns a second. A file holds numbers apart by white space or commas.
+
+    Raises:
+        ValueError: If the text is none of these, or its values are not allowed on the axis `name`.
+    """
+    text = text.strip()
+    if text.startswith("@"):
+        values: Any = _from_file(name, text[1:])
+    elif ":" in text:
+        values = _from_range(name, text)
+    elif "," in text:
+        values = _numbers(name, text.split(","), text)
+    else:
+        (values,) = _numbers(name, [text], text)
+    return check_axis(name, values)
+
+
+def _numbers(name: str, items: list[str], text: str) -> list[float]:
+    """Numbers of which all have a unit or none has, or a reader would not know what the others are in."""
+    parts = [units.split(item) for item in items]
+    if len({bool(unit) for _, unit in parts}) > 1:
+        raise ValueError(f"{name} must have a unit at every number or at none; got {text!r}")
+    return [_number(name, *part, text) for part in parts]
+
+
+def _number(name: str, item: str, unit: str, text: str) -> float:
+    factor, pi, rest = item.partition("pi")
+    try:
+        value = float({"": "1", "-": "-1"}.get(factor, factor)) * math.pi if pi and not rest else float(item)
+    except ValueError:
+        within = "" if item == text else f" in {text!r}"
+        raise ValueError(f"{name} must be {_FORMS}; got {item!r}{within}") from None
+    return units.with_unit(name, value, unit) if unit else value
+
+
+def _from_range(name: str, text: str) -> np.ndarray:
+    low, high, count, *spacing = text.split(":") if text.count(":") > 1 else [text, text, ""]
+    if not count or spacing not in ([], ["log"]):
+        raise ValueError(f"{name} must be {_FORMS}; got {text!r}")
+    digits = count.strip()
+    # Thousands of digits are more than Python takes for a number.
+    if not digits.isdecimal() or len(digits) > len(str(_MOST_VALUES)) or not 1 <= int(digits) <= _MOST_VALUES:
+        raise ValueError(
+            f"{name}: N in LO:HI:N must be a whole number of at least 1 and at most {_MOST_VALUES:,}; "
+            f"got {count[:20]!r} in {checks.shown(text)}"
+        )
+    first, last = _numbers(name, [low, high], text)
+    check_axis(name, [first, last])
+    if not spacing:
+        return np.linspace(first, last, int(count))
+    if first * last <= 0:
+        raise ValueError(f"{name}: LO and HI of a log axis must be on one side of zero; got {text!r}")
+    return np.geomspace(first, last, int(count))
+
+
+def _from_file(name: str, path: str) -> list[float]:
+    try:
+        items = _text(Path(path)).replace(",", " ").split()
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not text"
+        raise ValueError(
+            f"{name} must name a file that can be read; got {checks.shown(f'@{path}')} ({reason})"
+        ) from None
+    return _numbers(name, items, f"@{path}")
+
+
+def _text(path: Path) -> str:
+    """What a file holds, unless it is none or too large to be an axis: a device may have no end."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "not a plain file")
+    if path.stat().st_size > _MOST_TEXT:
+        raise OSError(errno.EFBIG, f"more than {checks.gigabytes(_MOST_TEXT)}")
+    return path.read_text(encoding="utf-8")
+
+
+def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarray:
+    """The values of an axis as a float64 array of at most one dimension.
+
+    Args:
+        name: Of the argument that an error speaks of.
+        values: What came.
+        quantity: That they are of, unless it is `name`.
+
+    Raises:
+        ValueError: With what must hold, what came and where, if they are not allowed.
+    """
+    array = checks.numbers(name, units.plain(quantity or name, values))
+    if array.ndim > 1:
+        raise ValueError(f"{name} must be a number or a 1-D array; got shape {array.shape}")
+    if array.size > _MOST_VALUES:
+        raise ValueError(f"{name} must have at most {_MOST_VALUES:,} values; got {array.size:,}")
+    array = array.astype(np.float64)
+    if name in ("u0", "v0"):
+        return checks.finite(name, array)
+    check(quantity or name, array, name)
+    return array
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of a sweep: which dimensions the dynamics see, and what each cell and each variant of it is.
+
+    Attributes:
+        given: The axes as they were given.
+        sizes: Length of every dimension, in the order given.
+        dynamic: Dimensions that the dynamics depend on: one simulation for each of their points.
+        variant: The other dimensions, which enter the energies alone.
+        quantities: d, kappa, r, gamma, u0, v0, omega [rad/s] and A [m/s^2], each over the dimensions it depends on.
+        length: Metres per unit of displacement (rigid wall: of speed over omega0, the engine's depth).
+        speed: Metres per second per unit of velocity.
+    """
+
+    given: "dict[str, xr.Variable]"
+    sizes: dict[str, int]
+    dynamic: tuple[str, ...]
+    variant: tuple[str, ...]
+    quantities: "dict[str, xr.Variable]"
+    length: "xr.Variable"
+    speed: "xr.Variable"
+
+    @property
+    def count(self) -> int:
+        """Number of simulations."""
+        return math.prod(self.sizes[dim] for dim in self.dynamic)
+
+    def flat(self, quantity: "xr.Variable", index: np.ndarray) -> np.ndarray:
+        """Values of a quantity in the cells with the given flat indices; variants at their first point."""
+        first = quantity.isel({dim: 0 for dim in self.variant if dim in quantity.dims})
+        if not first.dims:
+            return np.broadcast_to(first.values, index.shape)
+        # Never over all dimensions at once: a plane may be larger than memory.
+        places = np.unravel_index(index, [self.sizes[dim] for dim in self.dynamic])
+        place = dict(zip(self.dynamic, places, strict=True))
+        return np.broadcast_to(first.values[tuple(place[str(dim)] for dim in first.dims)], index.shape)
+
+    def cut(self, block: Mapping[str, slice]) -> "Cells":
+        """The cells of a block, the other dimensions whole."""
+
+        def within(variable: "xr.Variable") -> "xr.Variable":
+            return variable.isel({dim: part for dim, part in block.items() if dim in variable.dims})
+
+        return replace(
+            self,
+            given={name: within(values) for name, values in self.given.items()},
+            sizes={dim: len(range(size)[block.get(dim, slice(None))]) for dim, size in self.sizes.items()},
+            quantities={name: within(values) for name, values in self.quantities.items()},
+            length=within(self.length),
+            speed=within(self.speed),
+        )
+
+    def factors(self, scale: "xr.Variable") -> np.ndarray:
+        """Factors by which the variants change a scale; the same for every cell, as scales are products over axes."""
+        first = scale.isel({dim: 0 for dim in self.dynamic if dim in scale.dims})
+        full = first.set_dims({dim: self.sizes[dim] for dim in self.variant}).transpose(*self.variant)
+        return np.ravel(full.values / full.values.flat[0])
+
+
+def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: bool = True) -> Cells:
+    """Cells of a sweep over the given axes; a quantity that no axis gives is the device's.
+
+    Without `restitution`, of a membrane whose loss is not told by r, there is no axis r, and r is NaN.
+
+    Raises:
+        ValueError: If a value is not allowed, two axes give one quantity, or a start lies outside a rigid gap.
+        TypeError: If there is no axis of a given name.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    for name in given:
+        if name not in AXES:
+            raise TypeError(f"there is no axis {name!r}; the axes are {', '.join(AXES)}")
+    for row in _RIVALS:
+        rivals = [name for name in row if name in given]
+        if len(rivals) > 1:
+            raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
+    if "r" in given and not restitution:
+        raise ValueError(f"r must be left out with a membrane that has no restitution; got {checks.shown(given['r'])}")
+    arrays = {name: check_axis(name, values) for name, values in given.items()}
+    values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
+    sizes = {name: array.size for name, array in arrays.items() if array.ndim}
+    _check_sizes(sizes)
+    quantities = _quantities(values, device, xr)
+    if not restitution:
+        quantities["r"] = xr.Variable((), np.nan)
+    if wall == "rigid":
+        _check_start(quantities["d"], quantities["u0"])
+    motion = [quantities[name] for name in ("d", "r", "gamma", "u0", "v0")]
+    motion += [quantities["kappa"]] if wall == "soft" else []
+    dynamic = tuple(dim for dim in sizes if any(dim in quantity.dims for quantity in motion))
+    length = quantities["A"] * math.pi**2 / quantities["omega"] ** 2
+    return Cells(
+        given=values,
+        sizes=sizes,
+        dynamic=dynamic,
+        variant=tuple(dim for dim in sizes if dim not in dynamic),
+        quantities=quantities,
+        length=length if wall == "soft" else length / quantities["kappa"],
+        speed=quantities["A"] * math.pi / quantities["omega"],
+    )
+
+
+def _check_sizes(sizes: dict[str, int]) -> None:
+    """Raise unless there is room for the quantities that follow from several axes, and for the indices of cells."""
+    for rows in (("s", "omega", "A"), ("omega0", "k", "omega"), ("beta", "A")):
+        along = [name for name in rows if name in sizes]
+        checks.fits(along, _BYTES * math.prod(sizes[name] for name in along), "the quantities of cells")
+    if (count := math.prod(sizes.values())) > _MOST_CELLS:
+        names = checks.joined(name for name, size in sizes.items() if size > 1)
+        raise ValueError(
+            f"{names} must make at most {_MOST_CELLS:.0e} cells; got {count:.1e}; cut the plane into several"
+        )
+
+
+def _quantities(values: "dict[str, xr.Variable]", device: Harvester, xr: Any) -> "dict[str, xr.Variable]":
+    def own(name: str) -> "xr.Variable":
+        if name in values:
+            return values[name]
+        return xr.Variable((), check_axis(name, getattr(device, name)))
+
+    r, omega, amplitude, beta = own("r"), own("omega"), own("A"), own("beta")
+    omega0 = np.sqrt(values["k"] / float(device.m_b)) if "k" in values else own("omega0")
+    d = values["d"] if "d" in values else own("s") * omega**2 / (amplitude * math.pi**2)
+    # A level tube has gamma = 0 whatever A is: dividing would make an energy-only axis a dynamic one.
+    tilt = float(device.g) * np.sin(beta)
+    gamma = values["gamma"] if "gamma" in values else (tilt / amplitude if tilt.values.any() else tilt)
+    return {
+        "d": d,
+        "kappa": values["kappa"] if "kappa" in values else omega0 * math.pi / omega,
+        "r": r,
+        "gamma": gamma,
+        "u0": values["u0"] if "u0" in values else np.minimum(START[0], _START_REACH * d),
+        "v0": values["v0"] if "v0" in values else xr.Variable((), START[1]),
+        "omega": omega,
+        "A": amplitude,
+    }
+
+
+def _check_start(d: "xr.Variable", u0: "xr.Variable") -> None:
+    room = 0.5 * d - abs(u0)
+    first = np.argmin(room.values >= 0)
+    if room.values.flat[first] < 0:
+        got = [float((0 * room + value).values.flat[first]) for value in (u0, d)]
+        raise ValueError(f"u0 must lie in the gap of a rigid wall, |u0| <= d/2; got {got[0]:g} where d = {got[1]:g}")

@@ -1,0 +1,384 @@
+"""Coexisting attractors: their basins, and what share of all starts each one takes.
+
+All of it is the one line of a sweep over many starts; here the cells that ended on the same attractor are found, by
+what was measured on it.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from vijax.model.device import Harvester, one_device
+from vijax.model.label import FAILED, label, ordered
+from vijax.model.records import Status
+from vijax.planes import sweep
+from vijax.planes.axes import cells, check_axis
+from vijax.planes.dataset import Plan
+from vijax.runtime import checks
+from vijax.runtime.context import door
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["basin_fractions", "basins", "label"]
+
+SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
+_START_POINTS = 256
+MOST_STARTS = 10**7  # of a cell
+# Invariants of polished orbits agree to 3e-11 from start to start on a dozen planes of 4096 starts, and differ between
+# attractors by 2e-2 and more. In single precision an orbit passes for one of twice its period: there is no `dtype`.
+_SAME = 1e-6
+_COUNTS = ("impacts_left", "impacts_right")
+_ENDED = ("period", *_COUNTS, "status")
+_INVARIANTS = ("max_impact_speed", "asymmetry", "contact_fraction", "restitution_left", "restitution_right")
+_MEASURES = ("P", "max_impact_speed", "impacts_per_period", "contact_fraction", "lyapunov")
+_OUTPUTS = tuple(dict.fromkeys((*_ENDED, *_INVARIANTS, *_MEASURES, "admissible", "periods_run")))
+_TEXTS = {
+    "label": "impacts left:right/forcing periods",
+    "periodic": "whether a period was found",
+    "starts": "starts that end on the attractor",
+    "fraction": "part of all starts",
+    "fraction_stderr": "standard error of the fraction if the starts are drawn at random",
+}
+# What stands past the last attractor of a cell, by kind of value and for those that are counts.
+_BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "O": ""}
+_NONE = {"starts": 0, "fraction": 0.0, "fraction_stderr": 0.0}
+
+
+@door
+def basins(
+    *,
+    u0: ArrayLike | None = None,
+    v0: ArrayLike | None = None,
+    merge_mirrors: bool = False,
+    periods: int = 400,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Any,
+) -> "xr.Dataset":
+    """Which attractor each start of a (u0, v0) plane ends on, and a table of the attractors.
+
+        found = basins(d=0.2, kappa=3.0, r=0.5, v0=np.linspace(-0.6, 0.6, 400))
+        found.label.values, found.fraction.values  # the commonest first
+
+    Starts are matched by invariants of the polished orbit: period, impacts on either side, the greatest impact speed,
+    the part of the time in contact, restitution left and right, and the mean impact velocity, which tells mirror
+    images apart. Level ground and d > 2/pi^2: all motions that touch no wall again are one entry, "no impact".
+    Aperiodic motions of one parameter cell are one entry as well, and so are undecided ones: "aperiodic" says that no
+    period was found in `periods_run` periods, not that none will be.
+
+    Args:
+        u0: Displacements at the start; the whole of the widest gap unless given, in as many points as `v0` has.
+        v0: Velocities at the start; 256 between -0.6 and 0.6 unless given.
+        merge_mirrors: Count mirror images as one attractor; gamma must be 0 everywhere.
+        periods, wall, device, progress: As in `sweep`.
+        axes: Any other axes of `sweep`; every point of arrays among them has a table of its own.
+
+    Returns:
+        `basin` over all axes: the place of the start's attractor in its parameter cell's table, whose variables have
+        the dimension `attractor`: `label`, `period`, `impacts_left`, `impacts_right`, `P` [J per half period],
+        `max_impact_speed` [m/s], `impacts_per_period`, `contact_fraction`, `lyapunov`, `admissible`, `periodic`,
+        `starts` (how many end there), `fraction` (of all) and, for starts drawn at random, `fraction_stderr`,
+        `periods_run` (the most any start took), `status`. Entries are in the order of `starts`; rows past a cell's last
+        hold "" and NaN. `attractors` counts those of a cell.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+    """
+    planned = plan_basins(axes | {"u0": u0, "v0": v0}, device, merge_mirrors=merge_mirrors, periods=periods, wall=wall)
+    return matched(sweep.run(planned, progress), merge_mirrors)
+
+
+@door
+def plan_basins(
+    axes: Mapping[str, Any], device: Harvester | None = None, *, merge_mirrors: bool = False, **settings: Any
+) -> Plan:
+    """Check what `basins` is asked for and lay out its cells; runs nothing.
+
+    Args:
+        axes: Value or values of each axis; None counts as not given.
+        device, merge_mirrors: As in `basins`.
+        settings: periods, wall: both of them, as in `basins`.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came.
+    """
+    others = {name: values for name, values in axes.items() if values is not None and name not in ("u0", "v0")}
+    u0, v0 = axes.get("u0"), axes.get("v0")
+    v0 = np.linspace(-SPEED, SPEED, _START_POINTS) if v0 is None else check_axis("v0", v0)
+    if u0 is None:
+        gap = cells(others, one_device(device), "soft").quantities["d"].values.max()
+        u0 = gap * _middles(max(np.size(v0), 2))
+    return _plan({"u0": u0, "v0": v0} | others, device, merge_mirrors, settings)
+
+
+@door
+def basin_fractions(
+    *,
+    starts: int = 64,
+    speed: float = SPEED,
+    seed: int | None = None,
+    merge_mirrors: bool = False,
+    periods: int = 400,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Any,
+) -> "xr.Dataset":
+    """The share of starts that each coexisting attractor takes, for every parameter cell: multistability maps.
+
+    Starts are spread uniformly over the gap and over velocities between -`speed` and `speed`, alike in every cell.
+
+    Args:
+        starts: How many, in every cell.
+        speed: Largest velocity at the start, dimensionless.
+        seed: Of starts drawn at random; unless given they lie on a lattice, which is more even.
+        merge_mirrors, periods, wall, device, progress: As in `basins`.
+        axes: Any axes of `sweep` but u0 and v0.
+
+    Returns:
+        As `basins`, with the dimension `start` in place of u0 and v0, which are its coordinates.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+    """
+    planned = plan_fractions(
+        axes,
+        device,
+        starts=starts,
+        speed=speed,
+        seed=seed,
+        merge_mirrors=merge_mirrors,
+        periods=periods,
+        wall=wall,
+    )
+    return matched(sweep.run(planned, progress), merge_mirrors)
+
+
+@door
+def plan_fractions(
+    axes: Mapping[str, Any],
+    device: Harvester | None = None,
+    *,
+    starts: int,
+    speed: float,
+    seed: int | None,
+    merge_mirrors: bool = False,
+    **settings: Any,
+) -> Plan:
+    """Check what `basin_fractions` is asked for and lay out its cells; runs nothing.
+
+    Args:
+        axes, device, starts, speed, seed, merge_mirrors: As in `basin_fractions`.
+        settings: periods, wall: both of them, as in `basins`.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came.
+    """
+    for name in ("u0", "v0"):
+        if axes.get(name) is not None:
+            raise TypeError(f"{name} must be left out where starts are drawn; got {checks.shown(axes[name])}")
+    speed, seed = checks.positive("speed", speed), checks.seed(seed)
+    starts = checks.whole("starts", starts, 1, MOST_STARTS)
+    planned = _plan(axes, device, merge_mirrors, settings)
+    check_starts(planned, starts)
+    place = spread(starts, seed)
+    return started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
+
+
+def _plan(axes: Mapping[str, Any], device: Harvester | None, merge_mirrors: bool, settings: dict[str, Any]) -> Plan:
+    checks.flag("merge_mirrors", merge_mirrors)
+    planned = sweep.plan(
+        axes, _OUTPUTS, device, until="attractor", transient=0, method="exact", dtype="float64", **settings
+    )
+    gamma = planned.cells.quantities["gamma"].values
+    if merge_mirrors and gamma.any():
+        got = gamma[gamma != 0].flat[0]
+        raise ValueError(f"merge_mirrors must be left out unless gamma is 0 everywhere; got gamma = {got:g}")
+    return planned
+
+
+def _middles(count: int) -> np.ndarray:
+    """Middles of `count` equal parts of [-1/2, 1/2]."""
+    return (np.arange(count) + 0.5) / count - 0.5
+
+
+def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
+    """Points spread uniformly over the unit square around 0, along the dimension `start`; drawn at random by a seed."""
+    import xarray as xr  # here, as importing vijax must not load it
+
+    if seed is None:
+        # The lattice of the root of x^3 = x + 1, as even in the plane as that of the golden ratio is on a line.
+        root = 1.324717957244746
+        points = (0.5 + np.arange(1, count + 1) * np.array([[1 / root], [1 / root**2]])) % 1
+    else:
+        points = np.random.default_rng(seed).random((2, count))
+    first, second = points - 0.5
+    return xr.Variable("start", first), xr.Variable("start", second)
+
+
+def check_starts(planned: Plan, starts: int) -> None:
+    """Raise ValueError unless a plan's cells fit in memory with so many starts each."""
+    names = ["starts", *(dim for dim, size in planned.cells.sizes.items() if size > 1)]
+    checks.fits(names, starts * planned.size, f"{planned.count:,} cells of {starts:,} starts")
+
+
+def started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:
+    """A plan whose cells have one more dimension, `start`, on which their starts depend."""
+    of = planned.cells
+    laid = replace(
+        of,
+        sizes=of.sizes | {"start": u0.sizes["start"]},
+        dynamic=(*of.dynamic, "start"),
+        quantities=of.quantities | {"u0": u0, "v0": v0},
+    )
+    return replace(planned, cells=laid)
+
+
+# --- which starts end on the same attractor ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Starts sorted by the attractor on which they end; the groups of a cell lie together.
+
+    Attributes:
+        order: Starts, group by group.
+        first: Where each group begins in that order.
+        counts: Starts of each group.
+        cell: The parameter cell of each group.
+        rank: Its place among the groups of its cell, the largest first.
+    """
+
+    order: np.ndarray
+    first: np.ndarray
+    counts: np.ndarray
+    cell: np.ndarray
+    rank: np.ndarray
+
+
+def _groups(cell: np.ndarray, group: np.ndarray) -> _Groups:
+    order = np.argsort(group, kind="stable")
+    _, first, counts = np.unique(group[order], return_index=True, return_counts=True)
+    of = cell[order[first]]
+    places = np.lexsort((-counts, of))
+    rank = np.empty_like(places)
+    rank[places] = np.arange(of.size) - np.searchsorted(of, of)[places]
+    return _Groups(order, first, counts, of, rank)
+
+
+def _group(cell: np.ndarray, measured: dict[str, np.ndarray], merge_mirrors: bool, apart: float) -> np.ndarray:
+    """A number for every start, alike where it is the same attractor of the same cell; in the order of the cells."""
+    period = np.where(np.isin(measured["status"], FAILED), -2, measured["period"]).astype(np.int64)
+    left, right = ordered(measured["impacts_left"], measured["impacts_right"], merge_mirrors)
+    resting = measured["status"] == Status.PERMANENT_CONTACT
+    kind = ((period << 20 | left + 1) << 20 | right + 1) << 1 | resting
+    group = _parted(cell, kind, 0)
+    for values in _invariants(measured, merge_mirrors):
+        # Averages over chaos differ from start to start and tell nothing apart.
+        group = _parted(group, np.where(period > 0, values, 0.0), apart)
+    return group
+
+
+def _invariants(measured: dict[str, np.ndarray], merge_mirrors: bool) -> list[np.ndarray]:
+    """What is the same for all starts of a periodic attractor and, of mirror images to be merged, for both of them."""
+    speed, asymmetry, contact, *restitution = (np.nan_to_num(measured[name], nan=-1.0) for name in _INVARIANTS)
+    while speed.ndim > 1:  # the unit of speed may vary where the motion does not
+        speed = speed[0]
+    speed = np.log(np.maximum(speed, np.finfo(speed.dtype).tiny))
+    if merge_mirrors:
+        asymmetry, restitution = abs(asymmetry), [np.minimum(*restitution), np.maximum(*restitution)]
+    return [speed, asymmetry, contact, *restitution]
+
+
+def _parted(group: np.ndarray, values: np.ndarray, apart: float) -> np.ndarray:
+    """Groups parted further wherever, in ascending order, values of one group are further apart than a tolerance."""
+    order = np.lexsort((values, group))
+    parts = (np.diff(group[order]) != 0) | (np.diff(values[order]) > apart)
+    parted = np.empty_like(group)
+    parted[order] = np.concatenate([[0], np.cumsum(parts)])
+    return parted
+
+
+def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
+    """The attractor of every start, and a table of attractors for every cell of the other dimensions.
+
+    Args:
+        found: A sweep over starts (u0, v0, or `start`) with the outputs that `basins` asks for.
+        merge_mirrors: As in `basins`.
+
+    Returns:
+        As `basins`.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    over = tuple(dim for dim in ("u0", "v0", "start") if dim in found["period"].dims)
+    dims = tuple(str(dim) for dim in found["period"].dims if dim not in over)
+    shape = tuple(found.sizes[dim] for dim in dims)
+    starts = math.prod(found.sizes[dim] for dim in over)
+    measured = {name: _flat(found[name].variable, dims, over) for name in _OUTPUTS}
+    cell = np.repeat(np.arange(math.prod(shape)), starts)
+    group = _group(cell, measured, merge_mirrors, _SAME)
+    groups = _groups(cell, group)
+    basin = groups.rank[group].reshape(*shape, *(found.sizes[dim] for dim in over)).astype(np.int32)
+    variables = {"basin": xr.Variable((*dims, *over), basin, described("place of the start's attractor in the table"))}
+    variables["basin"] = variables["basin"].transpose(*found["period"].dims)
+    for name, values in _entries(measured, groups, merge_mirrors, starts).items():
+        further = [dim for dim in found[name].dims if dim not in (*dims, *over)] if name in found else []
+        attributes = found[name].attrs if name in found else described(_TEXTS[name])
+        table = _laid_out(values, groups, shape, _NONE.get(name, _BLANK[values.dtype.kind]))
+        variables[name] = xr.Variable((*further, *dims, "attractor"), table, attributes)
+    variables["attractors"] = (variables["period"] >= 0).sum("attractor")
+    variables["attractors"].attrs = described("attractors found; aperiodic motions are one, undecided starts none")
+    attributes = found.attrs | {"title": "Basins of attraction", "merge_mirrors": int(merge_mirrors)}
+    return xr.Dataset(variables, coords=found.coords, attrs=attributes)
+
+
+def _flat(variable: "xr.Variable", dims: tuple[str, ...], over: tuple[str, ...]) -> np.ndarray:
+    """Values of every start, cell by cell, on the last axis; dimensions that leave the motion alone before it."""
+    further = [dim for dim in variable.dims if dim not in (*dims, *over)]
+    values = variable.transpose(*further, *dims, *over).values
+    return values.reshape(*values.shape[: len(further)], -1)
+
+
+def _entries(
+    measured: dict[str, np.ndarray], groups: _Groups, merge_mirrors: bool, starts: int
+) -> dict[str, np.ndarray]:
+    """The table's columns, each [..., group]."""
+    first = {name: measured[name][..., groups.order[groups.first]] for name in (*_ENDED, "admissible")}
+    share = groups.counts / starts
+    left, right = ordered(first["impacts_left"], first["impacts_right"], merge_mirrors)
+    means = {
+        name: np.add.reduceat(measured[name][..., groups.order], groups.first, axis=-1) / groups.counts
+        for name in _MEASURES
+    }
+    return {
+        # Objects, as zarr has no lasting format for strings of fixed length.
+        "label": label(first["period"], left, right, first["status"]).astype(object),
+        **first,
+        "impacts_left": left,
+        "impacts_right": right,
+        **means,
+        "periods_run": np.maximum.reduceat(measured["periods_run"][groups.order], groups.first),
+        "periodic": first["period"] > 0,
+        "starts": groups.counts,
+        "fraction": share,
+        "fraction_stderr": np.sqrt(share * (1 - share) / starts),
+    }
+
+
+def _laid_out(values: np.ndarray, groups: _Groups, shape: tuple[int, ...], blank: Any) -> np.ndarray:
+    """Values of every group [..., group] over the cells and, by rank, their groups; blank past a cell's last."""
+    table = np.full((*values.shape[:-1], math.prod(shape), groups.rank.max() + 1), blank, values.dtype)
+    table[..., groups.cell, groups.rank] = values
+    return table.reshape(*values.shape[:-1], *shape, -1)
+
+
+def described(text: str) -> dict[str, Any]:
+    """Attributes of a variable without units."""
+    return {"units": "1", "long_name": text}

@@ -1,0 +1,159 @@
+"""Chaos, and what only looks like it: Lyapunov exponents of ensembles, and how long chaos survives."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Unpack
+
+import numpy as np
+
+from vijax.model.device import Harvester
+from vijax.planes import sweep
+from vijax.planes.basins import MOST_STARTS, SPEED, check_starts, described, plan_fractions, spread, started
+from vijax.planes.sweep import Axes
+from vijax.runtime import checks
+from vijax.runtime.context import door
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["lyapunov", "survival"]
+
+# Its growth from the identity is no stretching along the motion: the difference to a longer window is.
+_WARM_UP = 100
+# How survival looks: so often, so long; growth of the tangent map in powers of e; impacts per period.
+_INSTANTS, _WATCHED, _GROWN, _RARE = 8, 200, 7.0, 0.1
+_SURVIVAL = ("part of all starts still chaotic", "mean lifetime of chaos, forcing periods", "its standard error")
+_SPREADS = ("its standard error", "the lowest of the ensemble", "the highest of the ensemble")
+_NEAR = 0.01  # spread of an ensemble around its start, in parts of the gap and of the unit of velocity
+
+
+@door
+def lyapunov(
+    *,
+    starts: int = 64,
+    periods: int = 2000,
+    transient: int = 500,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Unpack[Axes],
+) -> "xr.Dataset":
+    """Largest Lyapunov exponent per forcing period of the motion from a start, with its standard error.
+
+    The exact tangent map is multiplied up along an ensemble of motions from starts around the given one, u0 up to 1 %
+    nearer to the middle and v0 up to 0.005 off. The map starts from the identity, which biases the exponent of a window
+    by some 1.7/periods: the growth in 100 periods before the window, when it turns to the most unstable direction, is
+    taken off.
+
+    Args:
+        starts: Size of the ensemble, at least 2.
+        periods: Forcing periods over which the growth is measured, for every start.
+        transient: Forcing periods to drop first: long enough to reach the attractor, and for the starts to part.
+        wall, device, progress, axes: As in `sweep`.
+
+    Returns:
+        Over the axes `lyapunov` [per forcing period], `lyapunov_stderr`, and `lyapunov_lowest` and `lyapunov_highest`
+        of the ensemble: where these lie many standard errors times sqrt(starts) apart, the starts have ended on
+        different attractors. NaN where the motion leaves the walls for ever.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    periods = checks.whole("periods", periods, 1)
+    place = spread(checks.whole("starts", starts, 2, MOST_STARTS), None)
+    settings = {"until": "window", "transient": transient, "wall": wall, "method": "exact", "dtype": "float64"}
+    growths = []
+    for done, window in enumerate((_WARM_UP, _WARM_UP + periods)):
+        planned = sweep.plan(axes, ("lyapunov",), device, periods=window, **settings)
+        of = planned.cells.quantities
+        check_starts(planned, starts)
+        near = started(planned, of["u0"] * (1 - _NEAR * (0.5 + place[0])), of["v0"] + _NEAR * place[1])
+        tell = _share_of(progress, done, 2)
+        run = sweep.run(near, tell)
+        growths.append(run["lyapunov"] * window)
+    first, last = growths
+    # What sticks to a wall forgets its start altogether.
+    exponent = ((last - first) / periods).where(last > -np.inf, -np.inf).where(last.notnull())
+    error = exponent.std("start", ddof=1) / starts**0.5
+    found = {
+        "lyapunov": exponent.mean("start"),
+        "lyapunov_stderr": error,
+        "lyapunov_lowest": exponent.min("start", skipna=False),
+        "lyapunov_highest": exponent.max("start", skipna=False),
+    }
+    for values, text in zip(found.values(), ("largest Lyapunov exponent per forcing period", *_SPREADS), strict=True):
+        values.attrs = described(text)
+    return xr.Dataset(found, attrs=run.attrs | {"title": "Largest Lyapunov exponents", "periods": periods})
+
+
+def _share_of(progress: Callable[[int, int], None] | None, done: int, runs: int) -> Callable[[int, int], None] | None:
+    """The progress of one of several equal runs, `done` of them over, as that of all."""
+    tell = checks.function("progress", progress)
+    return tell and (lambda now, total: tell(done * total + now, runs * total))
+
+
+@door
+def survival(
+    *,
+    starts: int = 1000,
+    speed: float = SPEED,
+    seed: int | None = None,
+    periods: int = 10_000,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Any,
+) -> "xr.Dataset":
+    """How long chaos lasts: chaos that ends is a transient, however much it looked like an attractor.
+
+    At eight instants up to `periods` every motion is watched for 200 periods: it is chaotic still if its tangent map
+    grows by e^7 and it meets a wall in one period of ten. What creeps towards motions that touch no wall meets ever
+    fewer, without an end; chaos of an exponent below 0.035 is not counted. Of those chaotic at one instant, the part
+    that are so at the next gives the mean lifetime by an exponential law.
+
+    Args:
+        starts, speed, seed, axes: As in `basin_fractions`.
+        periods: Forcing periods to look, at least 8.
+        wall, device, progress: As in `sweep`.
+
+    Returns:
+        Over the axes: `survival` over `after` [forcing periods], the part of all starts that are still chaotic;
+        `lifetime` [forcing periods] and `lifetime_stderr`, infinite where no chaos ended, NaN where there was none.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+
+    Source: `tests/test_chaos.py` recovers a known lifetime.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    step = checks.whole("periods", periods, _INSTANTS) // _INSTANTS
+    after = step * np.arange(1, _INSTANTS + 1)
+    planned = plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, periods=_WATCHED, wall=wall)
+    alive = []
+    for done, instant in enumerate(after):
+        settings = planned.settings | {"until": "window", "transient": int(instant)}
+        watched = replace(planned, settings=settings, outputs=("impacts_per_period", "lyapunov", "status"))
+        found = sweep.run(watched, _share_of(progress, done, _INSTANTS))
+        alive.append((found["lyapunov"] * _WATCHED > _GROWN) & (found["impacts_per_period"] > _RARE))
+    chaotic = xr.concat(alive, xr.Variable("after", after, described("forcing periods")))
+    before, still = chaotic.isel(after=slice(None, -1)).values, chaotic.isel(after=slice(1, None)).values
+    result = _lifetime(before.sum((0, -1)), (before & still).sum((0, -1)), step)
+    cells = [dim for dim in chaotic.dims if dim not in ("after", "start")]
+    variables = {"survival": chaotic.mean("start").transpose(..., "after")}
+    variables |= {name: xr.DataArray(values, dims=cells) for name, values in result.items()}
+    for values, text in zip(variables.values(), _SURVIVAL, strict=True):
+        values.attrs = described(text)
+    return xr.Dataset(variables, attrs=found.attrs | {"title": "Survival of chaos"})
+
+
+def _lifetime(before: np.ndarray, still: np.ndarray, step: int) -> dict[str, np.ndarray]:
+    """Mean lifetime and its standard error, of so many chaotic motions so many of which are so a step later."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = still / before
+        rate = abs(np.log(part)) / step
+        error = np.sqrt((1 - part) / (part * before)) / (rate * rate * step)
+        lifetime = 1 / rate
+    return {"lifetime": lifetime, "lifetime_stderr": np.where(part == 1, np.inf, error)}

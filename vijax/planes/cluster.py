@@ -1,0 +1,175 @@
+"""Tasks on the workers of a Dask cluster, of this machine or of many; knows neither what a task does nor its results.
+
+Dask finds who is idle, runs again what a lost worker was at, and says what is done. Nothing but tasks and the word
+that they are done goes over the network: a task writes its own results.
+"""
+
+import asyncio
+import itertools
+import logging
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from functools import partial
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import jax
+
+from vijax.runtime import checks
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+Task = TypeVar("Task")
+Workers = int | str
+"""So many processes of this machine, among which its cores are divided; or the address of a scheduler."""
+
+_MOST_WORKERS = 4096  # processes of one machine
+_ANSWER = 10  # seconds that a scheduler has to answer
+_WAITING = 2  # tasks a thread of a worker: one runs and one waits, so that nobody does
+_LOGS = ("distributed.batched", "distributed.client", "distributed.core", "distributed.utils", "tornado.application")
+_CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+
+
+def check(workers: Workers) -> None:
+    """Raise unless there are such workers, or can be; starts none.
+
+    Raises:
+        ValueError: If a number is none, or an address no address.
+        OSError: If no scheduler answers there.
+        ModuleNotFoundError: Without Dask.
+    """
+    if isinstance(workers, str):
+        with _joined(workers):
+            pass
+    else:
+        _dask()
+        checks.whole("workers", workers, 1, _MOST_WORKERS)
+
+
+def done(work: Callable[[Task], None], tasks: Iterable[Task], workers: Workers) -> Iterator[Task]:
+    """Work on every task, once or more often; yields each as it is done.
+
+    Args:
+        work: What a worker does with a task, whole or not at all; what it raises is raised here.
+        tasks: Each light enough to be sent; taken only as workers need them, so that there may be any number.
+        workers: Of a scheduler those that it has, as they come and go; without any this waits.
+
+    Raises:
+        As `check`; ChildProcessError if a task lost one worker after another; ConnectionError if the scheduler is lost.
+    """
+    with _joined(workers) if isinstance(workers, str) else _local(workers) as client:
+        try:
+            yield from _in_turn(client, work, iter(tasks))
+        except (_dask().comm.CommClosedError, CancelledError):
+            raise ConnectionError("the scheduler was lost") from None
+
+
+def _in_turn(client: "Client", work: Callable[[Task], None], tasks: Iterator[Task]) -> Iterator[Task]:
+    from distributed import as_completed
+
+    running: dict[Future, Task] = {}
+    finished = as_completed(loop=client.loop)
+
+    def fill() -> None:
+        most = _WAITING * max(sum(client.nthreads().values()), 1)
+        some = list(itertools.islice(tasks, max(most - len(running), 0)))
+        # Not pure: what it is for is what it does, and that may have been undone since the same was asked.
+        futures = client.map(work, some, pure=False)
+        running.update(zip(futures, some, strict=True))
+        finished.update(futures)
+
+    fill()
+    for batch in finished.batches():
+        ended = []
+        for future in batch:
+            _check_ended(future)
+            ended.append(running.pop(future))
+        fill()
+        yield from ended
+
+
+def _check_ended(future: "Future") -> None:
+    """Raise what ended a task, if it did not come to its own end."""
+    from distributed.scheduler import KilledWorker
+
+    try:
+        future.result()
+    except KilledWorker as error:
+        lost = error.allowed_failures + 1
+        raise ChildProcessError(f"{lost} workers were lost, one after another, at the same tile") from None
+
+
+def _dask() -> ModuleType:
+    try:
+        import distributed
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("workers must have Dask to be led by; got none; install vijax[cluster]") from None
+    return distributed
+
+
+@contextmanager
+def _joined(address: str) -> "Iterator[Client]":
+    """The scheduler at an address."""
+    dask = _dask()
+    try:
+        dask.comm.get_address_host_port(address)
+    except ValueError:
+        raise ValueError(
+            f"workers or scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}"
+        ) from None
+    try:
+        client = dask.Client(address, timeout=_ANSWER, set_as_default=False)
+    except TypeError as error:  # of TLS without certificates
+        raise ValueError(
+            f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
+        ) from None
+    except OSError:
+        raise ConnectionError(
+            f"workers or scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give "
+            "its address"
+        ) from None
+    with _quiet(), client:
+        yield client
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from the logs the tracebacks of connections that are lost: what is raised here says it in one line."""
+
+    def other(record: logging.LogRecord) -> bool:
+        return not (record.exc_info and isinstance(record.exc_info[1], OSError | asyncio.CancelledError))
+
+    loggers = [logging.getLogger(name) for name in _LOGS]
+    for logger in loggers:
+        logger.addFilter(other)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(other)
+
+
+@contextmanager
+def _local(number: int) -> "Iterator[Client]":
+    """So many new processes, which share the cores and end with this one, however that ends."""
+    made = _dask().LocalCluster(
+        n_workers=number,
+        threads_per_worker=max((os.cpu_count() or 1) // number, 1),
+        memory_limit=None,  # set by the tile; a worker holds no results that it could spill
+        dashboard_address=None,
+    )
+    with made, _dask().Client(made, set_as_default=False) as client:
+        kept = {name: getattr(jax.config, name) for name in _CACHE}
+        client.register_worker_callbacks(partial(_settle, kept))
+        yield client
+
+
+def _settle(kept: dict[str, Any]) -> None:
+    """Make a new process ready: it keeps compiled programs where its driver does, and leaves Ctrl-C to that."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # which reaches all processes of a terminal
+    for name, value in kept.items():
+        jax.config.update(name, value)

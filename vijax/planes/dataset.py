@@ -1,0 +1,263 @@
+"""The map that a sweep returns: its variables, coordinates and units, and the record of how it was made."""
+
+import math
+import os
+import platform
+import subprocess
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from vijax.batch import simulate
+from vijax.engine.method import Method, record
+from vijax.model.device import CONSTANTS, Harvester
+from vijax.model.quantities import AXES
+from vijax.model.records import Status
+from vijax.planes.axes import Cells
+from vijax.runtime import tiles
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Found = dict[str, Any]  # field of Summary -> xr.Variable
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A sweep that has passed the door: its cells, its settings by name, its method unless it is the exact one.
+
+    And the outputs wanted, the device, and the levels of refinement, 0 where every cell is computed.
+    """
+
+    cells: Cells
+    settings: dict[str, Any]
+    method: Method | None
+    outputs: tuple[str, ...]
+    device: Harvester
+    refine: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of simulations."""
+        return self.cells.count
+
+    @property
+    def size(self) -> int:
+        """Bytes of the variables wanted, at eight a number; a store compresses them."""
+        of = self.cells
+        variants = math.prod(of.sizes[dim] for dim in of.variant)
+        varied = sum(bool(_VARIED & set(OUTPUTS[name].needs)) for name in self.outputs)
+        return 8 * self.count * (varied * variants + len(self.outputs) - varied)
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Fields of `Summary` that the outputs are made of."""
+        return frozenset(need for name in self.outputs for need in OUTPUTS[name].needs)
+
+    def cut(self, block: Mapping[str, slice]) -> "Plan":
+        """The same for a block of the cells."""
+        return replace(self, cells=self.cells.cut(block))
+
+
+class Output(NamedTuple):
+    """A variable of the map: what it is, the fields of `Summary` it needs, and how it follows from them."""
+
+    units: str
+    description: str
+    needs: tuple[str, ...]
+    formula: "Callable[[Found, Plan], xr.Variable] | None" = None
+
+
+def _power(found: Found, planned: Plan) -> "xr.Variable":
+    return found["P"] * planned.cells.quantities["omega"] / np.pi
+
+
+def _penetration(found: Found, planned: Plan) -> "xr.Variable":
+    return found["deepest"] * planned.cells.length
+
+
+def _speed(found: Found, planned: Plan) -> "xr.Variable":
+    return found["fastest"] * planned.cells.speed
+
+
+def _admissible(found: Found, planned: Plan) -> "xr.Variable":
+    within = _penetration(found, planned) <= float(planned.device.depth_limit)
+    return (found["energy_ratio"] <= 1) & within
+
+
+OUTPUTS = {
+    "P": Output("J", "energy harvested per half forcing period", ("P",)),
+    "power": Output("W", "harvested power, P omega / pi", ("P",), _power),
+    "P_stderr": Output("J", "standard error of P by batch means, 0 when periodic", ("P_stderr",)),
+    "period": Output("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided", ("period",)),
+    "impacts_left": Output("1", "left impacts in `period` periods, -1 unless period > 0", ("impacts_left",)),
+    "impacts_right": Output("1", "right impacts in `period` periods, -1 unless period > 0", ("impacts_right",)),
+    "impacts_per_period": Output("1", "impacts on both walls per forcing period", ("impacts_per_period",)),
+    "max_penetration": Output("m", "greatest penetration of the membrane", ("deepest",), _penetration),
+    "max_impact_speed": Output("m s-1", "greatest speed at the onset of an impact", ("fastest",), _speed),
+    "asymmetry": Output(
+        "1",
+        "mean velocity at the onset of an impact over the greatest; mirror images differ in its sign",
+        ("asymmetry",),
+    ),
+    "restitution": Output("1", "mean of -v_out / v_in over all impacts, NaN without impacts", ("restitution",)),
+    "restitution_left": Output("1", "mean of -v_out / v_in over left impacts", ("restitution_left",)),
+    "restitution_right": Output("1", "mean of -v_out / v_in over right impacts", ("restitution_right",)),
+    "contact_time": Output("1", "mean duration of a contact, in half forcing periods", ("contact_time",)),
+    "contact_fraction": Output("1", "part of the time spent in contact", ("contact_fraction",)),
+    "admissible": Output(
+        "1",
+        "no impact yields more energy than it gives to the membrane, none passes the penetration limit",
+        ("energy_ratio", "deepest"),
+        _admissible,
+    ),
+    "energy_ratio": Output("1", "largest ratio of harvested energy to energy given to the membrane", ("energy_ratio",)),
+    "lyapunov": Output("1", "largest Lyapunov exponent per forcing period", ("lyapunov",)),
+    "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
+    "status": Output("1", "how the cell ended", ("status",)),
+}
+# Their units vary where the motion does not.
+_VARIED = {"P", "P_stderr", "energy_ratio", "deepest", "fastest"}
+# Few ask for them.
+ON_REQUEST = ("asymmetry", "lyapunov")
+
+
+def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
+    """The map from the fields of `Summary`, each [cells] or [cells, variants] in the flat order of the plan."""
+    import xarray as xr  # here, as importing vijax must not load it
+
+    return xr.Dataset(variables(planned, fields_found), coords=coordinates(planned.cells), attrs=provenance(planned))
+
+
+def variables(planned: Plan, fields_found: dict[str, np.ndarray]) -> "dict[str, xr.Variable]":
+    """As `label`, without what is the same for every tile of a plane."""
+    import xarray as xr
+
+    of = planned.cells
+    found = {}
+    for name, values in fields_found.items():
+        dims = of.dynamic + (of.variant if values.ndim > 1 else ())
+        found[name] = xr.Variable(dims, values.reshape([of.sizes[dim] for dim in dims]))
+    named = {name: _variable(name, found, planned) for name in planned.outputs}
+    return named | {"status": flagged(named["status"])}
+
+
+def specimen(planned: Plan) -> "xr.Dataset":
+    """The map of the first cell alone, its numbers void: what kind of variables there will be."""
+    first = planned.cut({dim: slice(1) for dim in planned.cells.dynamic})
+    variants = math.prod(planned.cells.sizes[dim] for dim in planned.cells.variant)
+    blank = simulate.blank(1, variants, planned.settings["dtype"])
+    return label(first, {name: np.asarray(getattr(blank, name)) for name in planned.needs})
+
+
+def flagged(status: "xr.Variable") -> "xr.Variable":
+    """A variable of `Status` codes that says what they mean."""
+    found = status.astype(np.int8)
+    found.attrs = status.attrs | {
+        "flag_values": [int(status) for status in Status],
+        "flag_meanings": " ".join(status.name.lower() for status in Status),
+    }
+    return found
+
+
+def best(dataset: "xr.Dataset") -> "xr.DataArray | None":
+    """The largest admissible P with the coordinates of its cell; None if no cell yields any."""
+    power = dataset["P"].where(dataset["admissible"]).fillna(0.0)
+    peak = power.isel({dim: int(i) for dim, i in power.argmax(...).items()})
+    return peak if peak > 0 else None
+
+
+def warn_if_held(dataset: "xr.Dataset") -> None:
+    """Warn where gravity along the axis keeps the ball on a wall in every cell: then there is nothing to see."""
+    status, gamma = dataset["status"], dataset["gamma"]
+    # One cell first: a store may be larger than memory.
+    if status.isel(dict.fromkeys(status.dims, 0)) != Status.PERMANENT_CONTACT or not gamma.all():
+        return
+    if (status == Status.PERMANENT_CONTACT).all():
+        span = " to ".join(f"{x:.4g}" for x in np.unique([gamma.min(), gamma.max()]))
+        advice = "from 1 on it outweighs the forcing; raise A or lower beta"
+        warnings.warn(f"gravity holds the ball: gamma = {span}, permanent contact everywhere; {advice}", stacklevel=2)
+
+
+def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":
+    output = OUTPUTS[name]
+    values = output.formula(found, planned) if output.formula else found[output.needs[0]]
+    values = values.transpose(*(dim for dim in planned.cells.sizes if dim in values.dims))
+    # Scales are float64 whatever the cells were computed in.
+    values = values.astype(planned.settings["dtype"] if values.dtype.kind == "f" else values.dtype)
+    values.attrs = {"units": output.units, "long_name": output.description}
+    return values
+
+
+def coordinates(of: Cells) -> "dict[str, xr.Variable]":
+    """The axes as given and the quantities of the cells, with symbols and units."""
+    found = {}
+    for name, values in {**of.given, **of.quantities}.items():
+        axis = AXES[name]
+        found[name] = values.transpose(*(dim for dim in of.sizes if dim in values.dims))
+        found[name].attrs = {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
+    return found
+
+
+def provenance(planned: Plan) -> dict[str, Any]:
+    """How a map was made: versions, commit, machine, and all that was asked."""
+    return {
+        "title": "Energy harvested by a vibro-impact pair",
+        "Conventions": "CF-1.11",
+        **made_by(),
+        **asked(planned),
+    }
+
+
+@cache
+def made_by() -> dict[str, str]:
+    """What computes here: versions, commit, machine."""
+    places = tiles.places()
+    return {
+        "source": f"vijax {_version('vijax')}",
+        "commit": _commit(),
+        **{f"version_{name}": _version(name) for name in ("jax", "jaxlib", "equinox", "numpy", "xarray", "zarr")},
+        "version_python": platform.python_version(),
+        "device": f"{len(set(places))} {places[0].device_kind} ({places[0].platform}), {platform.machine()}, "
+        f"{os.cpu_count()} cores",
+    }
+
+
+def asked(planned: Plan) -> dict[str, Any]:
+    """What a map holds besides its coordinates: settings, outputs, constants, tolerances."""
+    # The constants that axes stand for are coordinates.
+    constants = [name for name in CONSTANTS if name not in AXES]
+    return {
+        **planned.settings,
+        **record(planned.method),
+        "outputs": " ".join(planned.outputs),
+        **{f"harvester_{name}": float(getattr(planned.device, name)) for name in constants},
+        "harvester_penetration_limit": float(planned.device.depth_limit),
+        **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings["dtype"]).items()},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _commit() -> str:
+    """Commit of the source that runs, with -dirty if it was changed; "unknown" outside its own repository."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    options: dict[str, Any] = {"capture_output": True, "text": True, "check": True}
+    try:
+        # An installed copy may lie inside some other repository.
+        subprocess.run([*git, "ls-files", "--error-unmatch", Path(__file__).name], **options)
+        described = subprocess.run([*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"], **options)
+        return described.stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"

@@ -1,0 +1,181 @@
+"""Compiled calls over the cells of a plan, on every device and core, each as it is done."""
+
+import itertools
+import logging
+import math
+import queue
+import time
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vijax.batch import simulate
+from vijax.model.pair import ImpactPair
+from vijax.planes.dataset import Plan
+from vijax.planes.tiled_store import LARGEST_TILE, SMALLEST_TILE
+from vijax.runtime import context
+from vijax.runtime.tiles import padded, places
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_LOG = logging.getLogger(__name__)
+_WAITING = logging.getLogger("vijax.waiting")  # tells at INFO what a run is waiting for; scripts show it
+
+Fields = dict[str, np.ndarray]
+"""Fields of `Summary`, by name."""
+
+
+class Call(NamedTuple):
+    """Cells of a plan by flat index, how many rows their call has, and which tile it is."""
+
+    planned: Plan
+    cells: np.ndarray
+    rows: int
+    number: int
+
+
+def rows_for(cells: int) -> int:
+    """Rows of the call for so many cells: a power of two, so that few programs are compiled."""
+    return max(padded(cells), SMALLEST_TILE)
+
+
+def rows_each(cells: int) -> int:
+    """Rows of a call where there are so many cells for all devices together."""
+    return min(rows_for(math.ceil(cells / len(places()))), LARGEST_TILE)
+
+
+def compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
+    """Compute cells, given by flat indices, into fields over all cells; yields how many are done."""
+    of, done = planned.cells, 0
+    gamma = of.flat(of.quantities["gamma"], wanted)
+    # Level cells have a faster program, and one cell with gravity in a call would keep all of it from that.
+    for group in (wanted[gamma == 0], wanted[gamma != 0]):
+        for index, part in _each(planned, group, rows or rows_each(group.size)):
+            _put(found, of.count, index, part)
+            done += index.size
+            yield done
+
+
+def _each(planned: Plan, group: np.ndarray, rows: int) -> Iterator[tuple[np.ndarray, Fields]]:
+    """Flat indices and fields of every call over a group of cells, as the calls are done."""
+    if not group.size:
+        return
+    # Strided tiles are samples of the whole plane: they cost the same, and nobody is left with the slow corner.
+    number = max(math.ceil(group.size / rows), min(len(places()), math.ceil(group.size / SMALLEST_TILE)))
+    for call, found, _ in in_turn(Call(planned, group[first::number], rows, first) for first in range(number)):
+        yield call.cells, found
+
+
+def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
+    """Lay a part of the cells into the fields of all."""
+    for name, values in part.items():
+        found.setdefault(name, np.empty((count, *values.shape[1:]), values.dtype))[index] = values
+
+
+def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None, None]:
+    """Calls, their fields and the seconds they took, as they are done; the next ones run meanwhile."""
+    calls, here = iter(calls), places()
+    free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
+    for place in here:
+        free.put(place)
+    # Nothing runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
+    pool = context.pool(len(here))
+    running: dict[Future[tuple[Fields, float]], Call] = {}
+
+    def fill() -> None:
+        for call in itertools.islice(calls, len(here) + 1 - len(running)):  # one waits, so that nobody does
+            running[pool.submit(_where_free, call, free)] = call
+
+    try:
+        if first := next(calls, None):
+            # Or the first calls' seconds would hold it.
+            _WAITING.info("compiling")
+            wait([pool.submit(prepare, first, place) for place in set(here)])
+            _WAITING.info("running %s cells side by side, done with the slowest", f"{first.cells.size:,}")
+            calls = itertools.chain([first], calls)
+        fill()
+        while running:
+            done = wait(running, return_when=FIRST_COMPLETED).done
+            for future in [future for future in running if future in done]:  # in the order in which they began
+                call = running.pop(future)
+                fill()
+                yield call, *future.result()
+    finally:
+        # After Ctrl-C the waiting calls are dropped, and those that run end by themselves.
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _where_free(call: Call, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
+    """As `perform`, on a device that is free."""
+    place = free.get()
+    try:
+        return perform(call, place)
+    finally:
+        free.put(place)
+
+
+def perform(call: Call, place: jax.Device) -> tuple[Fields, float]:
+    """Fields for the cells of a call, and the seconds it took."""
+    began = time.perf_counter()
+    _LOG.info("tile %d begins", call.number)
+    found: Fields = {}
+    for part in _kinds(call):
+        _put(found, call.cells.size, part, _summarise(call, call.cells[part], part.size, place))
+    return found, time.perf_counter() - began
+
+
+def prepare(call: Call, place: jax.Device) -> None:
+    """Compile what a call needs, without running a cell. Threads that ask for the same wait for one, by `jax.jit`."""
+    for part in _kinds(call):
+        _summarise(call, call.cells[part], 0, place)
+
+
+def _kinds(call: Call) -> list[np.ndarray]:
+    """Places of a call's level cells, which have a faster program, and of the others; those that there are."""
+    of = call.planned.cells
+    level = of.flat(of.quantities["gamma"], call.cells) == 0
+    return [kind for kind in (np.flatnonzero(level), np.flatnonzero(~level)) if kind.size]
+
+
+def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> Fields:
+    """Fields for the first `count` of these cells, padded so that one program serves all."""
+    planned = call.planned
+    of, settings = planned.cells, planned.settings
+    rows = np.resize(index, call.rows)
+    needs = planned.needs
+
+    def column(quantity: "xr.Variable") -> jax.Array:
+        return jnp.asarray(of.flat(quantity, rows).astype(settings["dtype"]))
+
+    def factors(scale: "xr.Variable") -> jax.Array:
+        own = of.factors(scale).astype(settings["dtype"])
+        return jnp.asarray(np.resize(own, padded(own.size)))
+
+    d, kappa, r, gamma, u0, v0 = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0"))
+    summary = simulate.summarise(
+        ImpactPair(d=d, kappa=kappa if settings["wall"] == "soft" else None, r=r, gamma=gamma),
+        u0,
+        v0,
+        simulate.Scale(
+            length=column(of.length),
+            speed=column(of.speed),
+            length_variant=factors(of.length),
+            speed_variant=factors(of.speed),
+        ),
+        jax.tree.map(lambda constant: np.asarray(constant, settings["dtype"]), planned.device),
+        periods=settings["periods"],
+        until=settings["until"],
+        transient=settings["transient"],
+        outputs=needs,
+        method=planned.method,
+        count=count,
+        on=place,
+    )
+    variants = of.factors(of.length).size
+    fields = {name: getattr(summary, name)[:count] for name in needs}
+    return {name: field if field.ndim == 1 else field[:, :variants] for name, field in fields.items()}

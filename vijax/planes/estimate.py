@@ -1,0 +1,130 @@
+"""How long a run takes and how much it makes, said before it begins, from what this machine did lately.
+
+Wherever compiled programs are kept, so are the paces of the last runs: seconds of a cell and a period asked for, by
+kind of run. A machine that has none yet is taken for a slow one.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from vijax.planes.dataset import Plan
+from vijax.runtime import checks, export_cache
+from vijax.runtime.context import door
+from vijax.runtime.files import write_json
+from vijax.runtime.tiles import places
+
+_HOUR, _GIGABYTES = 3600.0, 10e9
+# Seconds of a cell and a period by two slow cores; rk4 at 1000 steps.
+_SLOW = {"exact level": 2e-7, "exact inclined": 2e-6, "ode": 2e-5, "rk4": 2e-6}
+_RECORDED = 1e-5  # of cells whose impacts are recorded
+_LEAST_TIMED = 2.0  # seconds, for a pace that is worth keeping
+_UNITS = (("days", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
+_FILE = "paces.json"
+
+
+class Estimate(NamedTuple):
+    """What a run asks of the machine.
+
+    Attributes:
+        cells: Simulations.
+        size: Bytes of the map, at most.
+        seconds: That it takes, about.
+    """
+
+    cells: int
+    size: float
+    seconds: float
+
+    @property
+    def long(self) -> bool:
+        """Whether somebody should agree before it begins: an hour, or 10 GB."""
+        return self.seconds > _HOUR or self.size > _GIGABYTES
+
+    def __str__(self) -> str:
+        unit, length = next((row for row in _UNITS if self.seconds >= row[1]), _UNITS[-1])
+        return f"{self.cells:,} cells, up to {checks.gigabytes(self.size)}, about {self.seconds / length:,.2g} {unit}"
+
+
+@door
+def of(*plans: Plan) -> Estimate:
+    """What runs of such plans take together."""
+    kept = _paces()
+    return Estimate(
+        sum(plan.count for plan in plans),
+        sum(plan.size for plan in plans),
+        sum(plan.count * _periods(plan) * kept.get(_kind(plan), _slow(plan)) for plan in plans),
+    )
+
+
+@door
+def of_recorded(cells: int, periods: int, size: float) -> Estimate:
+    """What cells take whose impacts are recorded: the points of an orbit diagram, the balls of a survey."""
+    return Estimate(cells, size, cells * periods * _RECORDED)
+
+
+class Watch:
+    """Progress that is passed on, and timed from the first cells that are done: until then programs are compiled."""
+
+    def __init__(self, tell: Callable[[int, int], None]):
+        self._tell = tell
+        self._seen: list[tuple[int, float]] = []
+
+    def __call__(self, done: int, total: int) -> None:
+        """Pass on how many cells are done, of how many."""
+        if not self._seen or done > self._seen[-1][0]:
+            self._seen.append((done, time.perf_counter()))
+        self._tell(done, total)
+
+    def keep(self, planned: Plan) -> None:
+        """Keep the pace, if it is one, beside compiled programs."""
+        if len(self._seen) < 3:
+            return
+        # The first entry is of nothing done yet.
+        (first, began), (last, ended) = self._seen[1], self._seen[-1]
+        file = _file()
+        if file is not None and ended - began >= _LEAST_TIMED:
+            pace = (ended - began) / ((last - first) * _periods(planned))
+            with suppress(OSError):  # of a closed or full folder: what was run is worth more than how fast
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_json(_paces() | {_kind(planned): pace}, file)
+
+
+def _periods(planned: Plan) -> int:
+    return planned.settings["periods"] + planned.settings["transient"]
+
+
+def _level(planned: Plan) -> str:
+    return "inclined" if planned.cells.quantities["gamma"].values.any() else "level"
+
+
+def _kind(planned: Plan) -> str:
+    """Runs of one kind keep one pace."""
+    settings = planned.settings
+    devices = f"{len(places())} {places()[0].device_kind}"
+    return f"{settings['method']} {settings['until']} {settings['dtype']} {_level(planned)} {devices}"
+
+
+def _slow(planned: Plan) -> float:
+    method = planned.settings["method"]
+    return _SLOW[f"exact {_level(planned)}" if method == "exact" else method]
+
+
+def _file() -> Path | None:
+    folder = export_cache.cache_folder()
+    return None if folder is None else folder / _FILE
+
+
+def _paces() -> dict[str, float]:
+    """What was kept; nothing of a file that is missing or broken."""
+    file = _file()
+    try:
+        kept = {} if file is None else json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    numbers = kept.items() if isinstance(kept, dict) else ()
+    return {kind: pace for kind, pace in numbers if isinstance(pace, float) and 0 < pace < math.inf}

@@ -1,0 +1,377 @@
+"""Orbit diagrams: attractors along an axis, each point starting in the state in which the last one ended.
+
+`plan` checks everything that can be wrong and starts nothing, `run` does the work, `orbit_diagram` is both.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import as_completed
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Unpack
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from vijax.batch import simulate
+from vijax.batch.impact_log import Record, record
+from vijax.model import energy
+from vijax.model.device import Harvester, one_device
+from vijax.model.pair import WALLS, ImpactPair
+from vijax.model.quantities import AXES
+from vijax.model.records import State, Status
+from vijax.planes import estimate
+from vijax.planes.axes import cells, check_axis
+from vijax.planes.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
+from vijax.planes.sweep import Axes, most_periods
+from vijax.runtime import checks, context
+from vijax.runtime.context import door
+from vijax.runtime.tiles import arrays, padded, workers
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_LOG = logging.getLogger(__name__)
+_WAITING = logging.getLogger("vijax.waiting")  # see `dispatch`
+_WAYS = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
+_CHOICES = {"direction": tuple(_WAYS), "wall": WALLS, "dtype": ("float64", "float32")}
+# A call takes chains so many points further: one compiled program for diagrams of every length.
+_LINKS = 64
+_FEWEST_LANES, _MOST_LANES = 8, 512
+_POINTS = {
+    "P": ("J", "energy harvested per half forcing period"),
+    "period": ("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided"),
+    "impacts_left": ("1", "left impacts in `period` periods, -1 unless period > 0"),
+    "impacts_right": ("1", "right impacts in `period` periods, -1 unless period > 0"),
+    "status": ("1", "how the point ended"),
+    "filled": ("1", "impacts in the kept periods"),
+    **{name: OUTPUTS[name][:2] for name in ("max_penetration", "energy_ratio", "admissible")},
+}
+_IMPACTS = {
+    "phase": ("1", "phase of the onset, in half forcing periods from that of the greatest forcing"),
+    "period_number": ("1", "forcing period of the onset, from the first one kept"),
+    "side": ("1", "wall: -1 left, 1 right"),
+    "v_in": ("1", "velocity at the onset, in units of A pi / omega"),
+    "v_out": ("1", "velocity at the exit, in units of A pi / omega"),
+    "restitution": ("1", "-v_out / v_in"),
+    "duration": ("1", "duration of the contact, in half forcing periods"),
+    "depth": ("m", "penetration of the membrane"),
+    "E": ("J", "energy harvested from the impact"),
+}
+_STROBES = {
+    "u_strobe": ("1", "displacement at phase 0, in units of A pi^2 / omega^2"),
+    "v_strobe": ("1", "velocity at phase 0, in units of A pi / omega"),
+}
+
+
+@door
+def orbit_diagram(
+    *,
+    along: str,
+    values: ArrayLike,
+    direction: str = "down",
+    periods: int = 400,
+    keep: int = 25,
+    wall: str = "soft",
+    device: Harvester | None = None,
+    dtype: str = "float64",
+    progress: Callable[[int, int], None] | None = None,
+    **axes: Unpack[Axes],
+) -> "xr.Dataset":
+    """The impacts of attractors along an axis, by the usual procedure: every point starts where the last one ended.
+
+        orbit_diagram(along="d", values=np.linspace(0.3, 0.05, 126), kappa=[400, 40, 4], r=0.5, direction="both")
+        orbit_diagram(along="omega", values=np.linspace(0.5, 15, 200), s=0.2, direction="up")  # one device
+
+    What is carried from point to point is the physical displacement and velocity, and the phase: so u and v change
+    with their units where omega or A do, and a wall may move over the ball, which then starts in contact; a rigid one
+    puts it back to |u| = 0.49 d. All other axes, and both directions, run side by side.
+
+    A point whose attractor is certain ends there: its orbit, polished, is what it would have come to, and is taken to
+    the end of its periods as it is. Elsewhere all periods are run. What is handed on is the ball at phase 0; where a
+    contact spans that moment, the ball at its exit, with its phase; where a point fails, the state it started from.
+
+    Args:
+        along: The axis that is swept, any but u0 and v0.
+        values: Its values [point], visited in falling order, in rising order, or in both.
+        direction: "down", "up" or "both".
+        periods: Forcing periods of every point.
+        keep: How many of these, at the end, are recorded.
+        wall: "soft" or "rigid".
+        device: Constants of the device; Tables I and II unless given.
+        dtype: "float64", or "float32" with tolerances to match.
+        progress: Called with (points done, points in all) from the calling thread, first with 0 done.
+        axes: As in `sweep`: numbers or 1-D arrays. u0 and v0 are the starts of the first points.
+
+    Returns:
+        A dataset with the dimensions "direction" (of both), the other axes in the order given, `along`, and
+        "impact" or "strobe". Over impacts, in order, those of whole orbits repeated, NaN beyond `filled`: `phase` in
+        [0, 2), `period_number`, `side`, `v_in`, `v_out`, `restitution`, `duration`, `depth` [m], `E` [J]. Over
+        strobes: `u_strobe`, `v_strobe` at the end of every kept period. Over points: `P` [J per half period] (over
+        whole periods of the orbit; of an aperiodic motion over its last three quarters), `period`, `impacts_left`,
+        `impacts_right`, `status`, `filled`, and, over the same impacts as P, `max_penetration` [m], `energy_ratio` and
+        `admissible`.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+
+    Source: the procedure of the paper's bifurcation diagrams.
+    """
+    settings = {"direction": direction, "periods": periods, "keep": keep, "wall": wall, "dtype": dtype}
+    return run(plan(along, values, axes, device, **settings), progress)
+
+
+@dataclass(frozen=True)
+class Diagram:
+    """An orbit diagram that has passed the door: what a sweep's plan holds, the axis swept, the ways it is gone."""
+
+    planned: Plan
+    along: str
+    ways: tuple[str, ...]
+
+    @property
+    def dims(self) -> dict[str, int]:
+        """Sizes of all dimensions but that of impacts, in order."""
+        others = {dim: size for dim, size in self.planned.cells.sizes.items() if dim != self.along}
+        both = {"direction": len(self.ways)} if len(self.ways) > 1 else {}
+        return {**both, **others, self.along: self.points}
+
+    @property
+    def points(self) -> int:
+        """Points of a chain."""
+        return self.planned.cells.sizes[self.along]
+
+    @property
+    def count(self) -> int:
+        """Points in all."""
+        return math.prod(self.dims.values())
+
+    @property
+    def expected(self) -> estimate.Estimate:
+        """What it asks of the machine."""
+        return estimate.of_recorded(self.count, self.planned.settings["periods"], self.size)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the dataset where there are two impacts a period."""
+        return 8 * self.count * (self.planned.settings["keep"] * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
+
+
+@door
+def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | None = None, **settings: Any) -> Diagram:
+    """Check what an orbit diagram is asked for; runs nothing.
+
+    Args:
+        along, values, device: As in `orbit_diagram`.
+        axes: Value or values of each other axis; None counts as not given.
+        settings: direction, periods, keep, wall, dtype: all of them, as in `orbit_diagram`.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came.
+    """
+    swept = [name for name in AXES if name not in ("u0", "v0")]
+    checks.choice("along", along, swept)
+    for name, allowed in _CHOICES.items():
+        checks.choice(name, settings[name], allowed)
+    given = {name: value for name, value in axes.items() if value is not None}
+    if along in given:
+        raise ValueError(f"{along} must not be given twice; got it as the axis swept and as another")
+    points = check_axis("values", values, along)
+    if not points.ndim:
+        raise ValueError(f"values must be a 1-D array of {along}; got {points}")
+    for name in ("periods", "keep"):
+        settings[name] = checks.whole(name, settings[name], 1, most_periods(settings["dtype"]))
+    if settings["keep"] > settings["periods"]:
+        raise ValueError(f"keep must be at most periods; got {settings['keep']} of {settings['periods']}")
+    device = one_device(device)
+    # A start that a rigid gap does not hold is put back into it: to this door all walls are soft.
+    laid_out = cells({**given, along: points}, device, "soft")
+    outputs = (*_POINTS, *_IMPACTS, *_STROBES)
+    planned = Plan(laid_out, {"along": along, **settings}, None, outputs, device)
+    diagram = Diagram(planned, along, _WAYS[settings["direction"]])
+    names = ["keep", "values", *(name for name in diagram.dims if name in given)]
+    checks.fits(names, diagram.size, f"the impacts of {diagram.count:,} points")
+    return diagram
+
+
+@door
+def run(diagram: Diagram, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
+    """The dataset of a plan, its chains run tile by tile on every core; see `orbit_diagram`."""
+    tell = checks.function("progress", progress) or (lambda done, total: None)
+    if diagram.expected.long:
+        _LOG.warning("a long run begins: %s", diagram.expected)
+    tell(0, diagram.count)
+    table = _table(diagram)
+    found: dict[int, dict[str, np.ndarray]] = {}
+    done = 0
+    for index, part in _simulate_all(diagram, table):
+        found |= {int(chain): {name: x[i] for name, x in part.items()} for i, chain in enumerate(index)}
+        done += index.size * diagram.points
+        tell(done, diagram.count)
+    widest = max(chain["v_in"].shape[-1] for chain in found.values())
+    order = [found[chain] for chain in sorted(found)]
+    fields = {name: np.stack([_widened(chain[name], widest, name) for chain in order]) for name in order[0]}
+    dataset = _label(diagram, fields)
+    warn_if_held(dataset)
+    return dataset
+
+
+def _widened(values: np.ndarray, widest: int, name: str) -> np.ndarray:
+    """The impacts of a chain, padded as those of the chain with the most."""
+    if name not in _IMPACTS:
+        return values
+    return np.pad(values, ((0, 0), (0, widest - values.shape[-1])), constant_values=np.nan)
+
+
+def _orders(diagram: Diagram) -> np.ndarray:
+    """Where every chain finds its points in the order in which it visits them, [chain, point]."""
+    rising = np.argsort(diagram.planned.cells.given[diagram.along].values, kind="stable")
+    each = diagram.count // (diagram.points * len(diagram.ways))
+    return np.concatenate([np.tile(rising[::-1] if way == "down" else rising, (each, 1)) for way in diagram.ways])
+
+
+def _table(diagram: Diagram) -> dict[str, np.ndarray]:
+    """Parameters, units and starts of every chain in the order of its visit, [chain, point]."""
+    of, orders = diagram.planned.cells, _orders(diagram)
+    dims = {dim: size for dim, size in diagram.dims.items() if dim != "direction"}
+
+    def column(quantity: "xr.Variable") -> np.ndarray:
+        full = quantity.set_dims(dims).transpose(*dims).values.reshape(-1, diagram.points)
+        return np.take_along_axis(np.tile(full, (len(diagram.ways), 1)), orders, axis=1)
+
+    table = {name: column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0")}
+    # In metres per unit of displacement; of a rigid wall the engine's depth is that of kappa = 1.
+    table |= {"metres": column(of.length), "speed": column(of.speed)}
+    rigid = diagram.planned.settings["wall"] == "rigid"
+    table["depth"] = table["metres"] / table["kappa"] if rigid else table["metres"]
+    return table
+
+
+def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    """Indices and fields of every tile of chains, as the tiles are done."""
+    level = (table["gamma"] == 0).all(axis=1)
+    pool = context.pool(workers())
+    try:
+        for group in (np.flatnonzero(level), np.flatnonzero(~level)):
+            if not group.size:
+                continue
+            share = math.ceil(group.size / workers())
+            lanes = min(max(padded(share), _FEWEST_LANES), _MOST_LANES)
+            number = math.ceil(group.size / lanes)
+            tiles = [group[first::number] for first in range(number)]
+            chains = f"{tiles[0].size:,} chains of {diagram.points:,} points side by side"
+            if number > 1:
+                _WAITING.info("compiling")
+                # Compiles; all threads at once would each do so.
+                brief = {name: x[:, :1] for name, x in table.items()}
+                pool.submit(_simulate, diagram, brief, tiles[0][:1], lanes, 1, 1).result()
+                _WAITING.info("running %s", chains)
+            else:
+                _WAITING.info("compiling, then running %s", chains)
+            periods, keep = (diagram.planned.settings[name] for name in ("periods", "keep"))
+            running = {pool.submit(_simulate, diagram, table, tile, lanes, periods, keep): tile for tile in tiles}
+            for future in as_completed(running):
+                yield running.pop(future), future.result()
+    finally:
+        # After Ctrl-C the waiting tiles are dropped, and those that run end by themselves.
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _simulate(
+    diagram: Diagram, table: dict[str, np.ndarray], index: np.ndarray, lanes: int, periods: int, keep: int
+) -> dict[str, np.ndarray]:
+    """The fields of the dataset for these chains, [chain, point] or [chain, point, impact or strobe]."""
+    planned = diagram.planned
+    table = {name: x[index].astype(planned.settings["dtype"]) for name, x in table.items()}
+    summary = _follow(planned, table, lanes, periods, keep)
+    flown = _fly(planned, table, summary, keep)
+    impacts, shape = flown.impacts, table["d"].shape
+    depth = impacts["depth"] * table["depth"].reshape(-1, 1)
+    fields = {
+        "filled": flown.filled,
+        "phase": impacts["t"],
+        "period_number": impacts["n"],
+        "restitution": -impacts["v_out"] / impacts["v_in"],
+        "depth": depth,
+        "E": np.asarray(energy.harvested_energy(planned.device, depth)),
+        **{name: impacts[name] for name in ("side", "v_in", "v_out", "duration")},
+        "u_strobe": flown.u,
+        "v_strobe": flown.v,
+    }
+    points = {"P": summary.P[..., 0], "energy_ratio": summary.energy_ratio[..., 0]}
+    points["max_penetration"] = summary.deepest * table["depth"]
+    within = points["max_penetration"] <= float(planned.device.depth_limit)
+    points["admissible"] = within & (points["energy_ratio"] <= 1)
+    points |= {name: getattr(summary, name) for name in ("period", "impacts_left", "impacts_right", "status")}
+    return points | {name: values.reshape(shape + values.shape[1:]) for name, values in fields.items()}
+
+
+def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: int, keep: int) -> Any:
+    """The summary of every point, [chain, point], the chains taken so many points further by every call."""
+    chains, points = table["d"].shape
+    growth = {name: np.ones_like(table[name]) for name in ("metres", "speed")}
+    for name, units in growth.items():
+        units[:, 1:] = table[name][:, :-1] / table[name][:, 1:]
+    state, parts = (table["u0"][:, 0], table["v0"][:, 0], np.zeros_like(table["u0"][:, 0])), []
+    for first in range(0, points, _LINKS):
+        links = min(_LINKS, points - first)
+
+        def extended(x: np.ndarray, first: int = first, links: int = links) -> jax.Array:
+            widths = ((0, lanes - chains), (0, _LINKS - links))
+            return jnp.asarray(np.pad(x[:, first : first + links], widths, mode="edge"))
+
+        soft = planned.settings["wall"] == "soft"
+        d, kappa, r, gamma = (extended(table[name]) for name in ("d", "kappa", "r", "gamma"))
+        summary = simulate.follow(
+            ImpactPair(d, kappa if soft else None, r, gamma),
+            simulate.Starts(*(jnp.asarray(np.pad(x, (0, lanes - chains), mode="edge")) for x in state)),
+            simulate.Growth(extended(growth["metres"]), extended(growth["speed"])),
+            extended(table["depth"]),
+            extended(table["speed"]),
+            planned.device,
+            periods=periods,
+            keep=keep,
+            count=chains,
+            links=links,
+        )
+        part = jax.tree.map(lambda x, links=links: x[:chains, :links], summary)
+        end = part.handover
+        state = (end.u[:, -1], end.v[:, -1], end.t[:, -1])
+        parts.append(part)
+    return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
+
+
+def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -> Record:
+    """The kept periods of every point, flown again from where they begin."""
+    soft = planned.settings["wall"] == "soft"
+    d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])
+    u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
+    whole_numbers = (x.astype(np.int32) for x in (n, held))
+    lost = np.isin(summary.status, (Status.EVENT_BUDGET, Status.NONFINITE)).ravel()
+    return record(ImpactPair(d, kappa if soft else None, r, gamma), State(u, v, t, *whole_numbers), keep, ~lost)
+
+
+def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
+    """The dataset from the fields of all chains, each in the order of its visit."""
+    import xarray as xr  # here, as importing vijax must not load it
+
+    planned, sizes = diagram.planned, diagram.dims
+    given_order = np.argsort(_orders(diagram), axis=1)
+    variables = {}
+    for further, descriptions in (((), _POINTS), (("impact",), _IMPACTS), (("strobe",), _STROBES)):
+        for name, (units, text) in descriptions.items():
+            values = fields[name][np.arange(len(given_order))[:, None], given_order]
+            values = values.reshape(*sizes.values(), *values.shape[2:])
+            values = values.astype(planned.settings["dtype"]) if values.dtype.kind == "f" else values
+            variables[name] = xr.Variable((*sizes, *further), values, {"units": units, "long_name": text})
+    variables["status"] = flagged(variables["status"])
+    of = planned.cells
+    # A start is that of the first points alone.
+    known = {name: x for name, x in coordinates(of).items() if name in of.given or name not in ("u0", "v0")}
+    # Text of fixed width has no place in the third format of zarr.
+    names = np.array(diagram.ways, dtype=np.dtypes.StringDType())
+    ways = {"direction": ("direction", names)} if "direction" in sizes else {}
+    title = {"title": "Orbit diagram of a vibro-impact pair"}
+    return xr.Dataset(variables, coords=ways | known, attrs=provenance(planned) | title)

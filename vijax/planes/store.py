@@ -1,0 +1,170 @@
+"""Maps on disk: zarr stores that are whole or absent, each chunk with a checksum, every file in an inventory."""
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vijax.planes import inventory
+from vijax.runtime import checks
+from vijax.runtime.files import check_ending, check_folder, recover, replacing_folder
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Level 3 of compression takes twice as long and saves a thousandth more.
+_LEVEL = 1
+
+
+def check_store(name: str, path: str | Path, overwrite: bool = False) -> Path:
+    """Check that a new store can be written, and give its path; `name` is the argument that an error speaks of.
+
+    Raises:
+        ValueError: If it has another ending than stores have.
+        FileExistsError: If it is taken, and may not be replaced: what vijax did not write never.
+        FileNotFoundError, PermissionError: If its folder is missing or closed.
+    """
+    target = check_place(name, path)
+    if os.path.lexists(target):
+        if not overwrite:
+            raise FileExistsError(f"{name} must not exist yet; got {path}; allow overwriting, or take another name")
+        check_ours(name, target)
+    return target
+
+
+def check_place(name: str, path: str | Path) -> Path:
+    """Check that a store can have this name, and give its path; what a killed run left there is put right.
+
+    Raises:
+        ValueError, FileNotFoundError, PermissionError: As `check_store`.
+    """
+    check_ending(name, path, ".zarr")
+    target = check_folder(name, path)
+    recover(target)
+    return target
+
+
+def check_ours(name: str, target: Path) -> None:
+    """Raise FileExistsError unless something is a store and all that it holds was written by vijax."""
+    if target.is_dir() and (stranger := inventory.foreign(target)):
+        raise FileExistsError(
+            f"{name} must not replace what vijax did not write; got {target}, which holds {stranger}; "
+            "move it elsewhere, or take another name"
+        )
+    if not inventory.is_store(target):
+        raise FileExistsError(f"{name} must not replace what is no store of vijax; got {target}; take another name")
+
+
+def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a map as a zarr store (format 3, zstd, CRC-32C); a write that fails or is stopped leaves nothing behind.
+
+    Args:
+        dataset: What `sweep` returned, or any part of it.
+        path: Folder to make; it ends in .zarr.
+        overwrite: Replace a store that is there.
+
+    Raises:
+        ValueError, FileExistsError, FileNotFoundError, PermissionError: As `check_store`.
+    """
+    checks.variables("dataset", dataset, (), "sweep")
+    target = check_store("path", path, checks.flag("overwrite", overwrite))
+    with replacing_folder(target) as part:
+        write(dataset, part)
+        seal(part)
+
+
+def write(dataset: "xr.Dataset", path: Path) -> None:
+    """Write a new store, which others may add to before it is sealed."""
+    encoding = {name: {"compressors": compressors()} for name in dataset.variables}
+    dataset.to_zarr(path, mode="w-", zarr_format=3, consolidated=False, encoding=encoding)
+
+
+def seal(path: Path, **facts: Any) -> None:
+    """Consolidate the metadata of a new store, so that it opens at once anywhere, and list its files; see `inventory`.
+
+    The metadata of a study do not change with its tiles: they are consolidated before there is any.
+    """
+    import zarr
+
+    with warnings.catch_warnings():
+        # A reader that does not know of them finds the same in every array.
+        warnings.filterwarnings("ignore", "Consolidated metadata", UserWarning)
+        zarr.consolidate_metadata(path)
+    inventory.write(path, **facts)
+
+
+def compressors() -> tuple[Any, ...]:
+    """Of every chunk, its checksum last."""
+    from zarr.codecs import Crc32cCodec, ZstdCodec  # here, as importing vijax must not load it
+
+    return ZstdCodec(level=_LEVEL), Crc32cCodec()
+
+
+def encoded(chunk: np.ndarray) -> bytes:
+    """The file of a chunk in the format of `compressors`, as zarr writes it at three times the cost."""
+    from numcodecs import Zstd
+    from numcodecs.checksum32 import CRC32C
+
+    ordered = np.ascontiguousarray(chunk, chunk.dtype.newbyteorder("<"))
+    return bytes(CRC32C(location="end").encode(Zstd(level=_LEVEL).encode(ordered)))
+
+
+def load(path: str | Path) -> "xr.Dataset":
+    """The map that `save` wrote, equal to the one that was saved, or what there is of a study.
+
+    Raises:
+        FileNotFoundError: If there is no store.
+        ValueError: If a file of it is not what was written; FileExistsError if a folder stands in its place.
+
+    Warns:
+        UserWarning: If the store has no list of its files, as those of earlier versions: chunks alone are checked then.
+    """
+    path = checks.path("path", path)
+    with view(path) as dataset:
+        _check(path, inventory.records(path))
+        with _in_one_line(path):
+            found = dataset.load()
+    if inventory.read(path) is None:
+        warnings.warn(
+            f"{path} has no {inventory.LIST}, the list of its files, as stores of earlier versions: edits of its "
+            "metadata go unseen; make it anew for a store that is checked",
+            stacklevel=2,
+        )
+    return found
+
+
+def view(path: str | Path) -> "xr.Dataset":
+    """As `load`, but nothing is read before it is looked at, nor are the files of tiles compared with their records."""
+    import xarray as xr  # here, as importing vijax must not load it
+
+    target = Path(path)
+    if not (target / "zarr.json").is_file() and not inventory.is_store(target):
+        raise FileNotFoundError(f"path must name a zarr store written by vijax; got {path}")
+    _check(target, inventory.listed(target))
+    # What has no list may be of an earlier version, whose metadata are not consolidated.
+    with _in_one_line(path):
+        return xr.open_zarr(path, consolidated=inventory.read(target) is not None, chunks=None)
+
+
+def _check(path: Path, faults: Iterator[tuple[str, str]]) -> None:
+    """Raise ValueError with the first of some faults, if there is any."""
+    name, reason = next(faults, ("", ""))
+    if reason:
+        remedy = "run again, the call that made it mends it" if inventory.is_study(path) else "make it anew"
+        raise ValueError(f"path must name a store as it was written; got {path}, where {name} {reason}; {remedy}")
+
+
+@contextmanager
+def _in_one_line(path: str | Path) -> Iterator[None]:
+    """What zarr and xarray say of a store that has no list, and that they cannot read."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"path must name a store that can be read; got {path} ({said}); make it anew") from error

@@ -1,0 +1,168 @@
+"""What a store of tiles holds besides them, metadata and coordinates: made, mended, compared with a plan."""
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vijax.model.records import Status
+from vijax.planes import inventory
+from vijax.planes.dataset import Plan, asked, coordinates, provenance, specimen
+from vijax.planes.store import compressors, seal, view
+from vijax.planes.store import write as write_store
+from vijax.runtime.files import replacing
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_SHOWN = 3  # of the settings that differ
+
+
+def write(planned: Plan, tile: Mapping[str, int], birth: str, path: Path) -> None:
+    """Write the store of a plan, every variable void.
+
+    Args:
+        planned: What it will hold.
+        tile: Lengths of a tile along the dimensions that the dynamics see.
+        birth: Of the store: no other has the same.
+        path: Folder to make.
+    """
+    import xarray as xr
+    import zarr
+
+    of = planned.cells
+    write_store(xr.Dataset(coords=coordinates(of), attrs=provenance(planned)), path)
+    group = zarr.open_group(path, mode="r+")
+    for name, variable in specimen(planned).data_vars.items():
+        group.create_array(
+            str(name),
+            shape=tuple(of.sizes[str(dim)] for dim in variable.dims),
+            chunks=tuple(tile.get(str(dim), of.sizes[str(dim)]) for dim in variable.dims),
+            dtype=variable.dtype,
+            fill_value=void(str(name), variable.dtype),
+            compressors=compressors(),
+            dimension_names=[str(dim) for dim in variable.dims],
+            attributes=variable.attrs,
+        )
+    seal(path, birth=birth, tile=dict(tile))
+
+
+def void(name: str, dtype: np.dtype) -> Any:
+    """Give what a variable holds where nothing was run."""
+    if name == "status":
+        return int(Status.NOT_RUN)
+    return {"f": np.nan, "i": -1, "b": False}[dtype.kind]
+
+
+# --- damage ----------------------------------------------------------------------------------------------------------
+
+
+def mend(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
+    """Write again what is damaged: metadata by their copies, coordinates by the plan if it has the same as was there.
+
+    Args:
+        planned: What the store should hold.
+        tile, birth: As in `write`, for a store that has lost the list of its files.
+        path: Of the store; one of an earlier version, which never had such a list, stays as it is.
+        say: Takes a line for every file.
+
+    Raises:
+        FileExistsError: If the plan has something else there, or nothing tells what was there.
+    """
+    listed = inventory.read(path)
+    if listed is None:
+        _mend_list(planned, tile, birth, path, say)
+        return
+    faults = dict(inventory.faults(path, listed["files"]))
+    for name in [name for name in faults if name in listed["metadata"]]:
+        _put(name, faults.pop(name), listed["metadata"][name].encode(), path, say)
+    if not faults:
+        return
+    with _fresh(planned, listed["tile"], listed["birth"]) as fresh:
+        for name, reason in faults.items():
+            if inventory.fault(fresh / name, listed["files"][name]):
+                raise FileExistsError(
+                    f"out must be whole or what this plane can mend; got {path}, where {name} {reason}, "
+                    "and this plane has something else there; allow overwriting, or take another name"
+                )
+            _put(name, reason, (fresh / name).read_bytes(), path, say)
+
+
+def _mend_list(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
+    """Write the list of a store again that has lost it, and what metadata of arrays differ from those of the store."""
+    reason = inventory.fault(path / inventory.LIST, None)
+    if reason == "is missing" and not inventory.had_list(path):
+        return
+    with _fresh(planned, tile, birth) as fresh:
+        faults = dict(inventory.faults(path, (inventory.read(fresh) or {})["files"]))
+        if any("/zarr.json" not in name for name in faults):
+            raise FileExistsError(
+                f"out must be whole or what this plane can mend; got {path}, where {inventory.LIST} {reason}, "
+                f"which would tell whether {next(iter(faults))} is what was written; allow overwriting, "
+                "or take another name"
+            )
+        for name, fault in [*faults.items(), (inventory.LIST, reason)]:
+            _put(name, fault, (fresh / name).read_bytes(), path, say)
+
+
+@contextmanager
+def _fresh(planned: Plan, tile: Mapping[str, int], birth: str) -> Iterator[Path]:
+    """The store of a plan as it would be made now."""
+    with tempfile.TemporaryDirectory() as folder:
+        write(planned, tile, birth, Path(folder, "fresh"))
+        yield Path(folder, "fresh")
+
+
+def _put(name: str, reason: str, content: bytes, path: Path, say: Callable[[str], None]) -> None:
+    """Write a file of a store again."""
+    target = path / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as part:
+        part.write_bytes(content)
+    say(f"{name} of {path} is written again: it {reason}")
+
+
+# --- which plane -----------------------------------------------------------------------------------------------------
+
+
+def check_same(planned: Plan, path: Path) -> None:
+    """Raise FileExistsError unless a store holds the plane of a plan, or part of it."""
+    with view(path) as store:
+        found = list(_differences(planned, store))
+    if found:
+        more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+        raise FileExistsError(
+            f"out must be new or hold the same plane; got {path}, where {'; '.join(found[:_SHOWN])}{more}; "
+            "allow overwriting, or take another name"
+        )
+
+
+def _differences(planned: Plan, store: "xr.Dataset") -> Iterator[str]:
+    """What was asked otherwise than the store has it, a phrase each."""
+    for name, value in json.loads(json.dumps(asked(planned))).items():
+        if store.attrs.get(name, "left out") != value:
+            yield f"{name} is {store.attrs.get(name, 'left out')}, and not {value}"
+    axes = coordinates(planned.cells)
+    for name in dict.fromkeys([*axes, *map(str, store.coords)]):
+        here, there = axes.get(name), store.coords.get(name)
+        if here is None or there is None or here.dims != there.dims or not _equal(here.values, there.values):
+            yield f"{name} is {_words(there)}, and not {_words(here)}"
+    yield from (f"{name} is left out" for name in planned.outputs if name not in store)
+
+
+def _equal(one: np.ndarray, other: np.ndarray) -> bool:
+    return np.array_equal(one, other, equal_nan=True)
+
+
+def _words(values: "xr.Variable | xr.DataArray | None") -> str:
+    """A coordinate in a few words."""
+    if values is None:
+        return "left out"
+    if values.ndim == 0:
+        return f"{float(values)}"
+    first, last = (float(values.values.flat[at]) for at in (0, -1))
+    return f"{values.size} values over {', '.join(map(str, values.dims))} from {first} to {last}"

@@ -1,0 +1,420 @@
+"""Sweeps: axes -> cells -> calls on every device and core -> a labelled map, in memory or on disk.
+
+`plan` checks everything that can be wrong and starts nothing, `run` does the work, `sweep` is both.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from vijax.engine import method as methods
+from vijax.model.device import Harvester, one_device
+from vijax.model.membrane import HuntCrossley, Law
+from vijax.model.pair import WALLS
+from vijax.planes import cluster, dispatch, estimate, tiled_store
+from vijax.planes import refine as refinement
+from vijax.planes.axes import Cells, cells
+from vijax.planes.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
+from vijax.planes.dispatch import Call, Fields
+from vijax.planes.store import check_store, load, save, view
+from vijax.runtime import checks, context
+from vijax.runtime.context import door
+from vijax.runtime.tiles import places
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Axes", "load", "plan", "run", "save", "sweep"]
+
+_CHOICES = {
+    "until": ("attractor", "window"),
+    "wall": WALLS,
+    "dtype": ("float64", "float32"),
+}
+_LOG = logging.getLogger(__name__)
+
+
+class Axes(TypedDict, total=False):
+    """The axes of a sweep, each a number or a 1-D array; `vijax.model.quantities.AXES` describes them."""
+
+    d: ArrayLike
+    kappa: ArrayLike
+    r: ArrayLike
+    gamma: ArrayLike
+    omega: ArrayLike
+    s: ArrayLike
+    omega0: ArrayLike
+    k: ArrayLike
+    A: ArrayLike
+    beta: ArrayLike
+    u0: ArrayLike
+    v0: ArrayLike
+
+
+@door
+def sweep(
+    *,
+    periods: int = 400,
+    until: str = "attractor",
+    transient: int = 0,
+    wall: str = "soft",
+    method: str = "exact",
+    solver: str | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    membrane: Law | None = None,
+    steps: int | None = None,
+    outputs: Iterable[str] | None = None,
+    device: Harvester | None = None,
+    dtype: str = "float64",
+    refine: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    workers: cluster.Workers | None = None,
+    **axes: Unpack[Axes],
+) -> "xr.Dataset":
+    """Energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
+
+    Each axis is a number or a 1-D array, or such a quantity of pint; arrays become dimensions in the order given:
+
+        sweep(d=np.linspace(0.05, 0.3, 128), kappa=np.geomspace(3, 400, 128), r=0.5)  # the (d, kappa) plane
+        sweep(omega=np.pi * np.linspace(1, 12, 64), omega0=np.linspace(20, 400, 64))  # one device, other frequencies
+        sweep(d=0.2, kappa=np.geomspace(3, 400, 64), A=[1, 2, 5])                     # here A enters energies alone
+
+    Dimensionless axes are d, kappa, r, gamma and the start u0, v0; physical ones omega [rad/s], s [m], omega0 [rad/s]
+    or k [N/m], A [m/s^2], beta [rad]. d and s are one quantity, so are kappa, omega0 and k, gamma and beta: give one
+    of each. Whatever no axis gives is the device's (s, omega0, r, A, omega, beta): d follows omega unless d is given.
+    The start is u0 = min(0.05853, 0.49 d), v0 = -0.47898 unless given.
+    Cells that share (d, kappa, r, gamma, u0, v0) are simulated once however many omega or A there are, and with rigid
+    walls however many kappa: it then enters energies alone.
+
+    Args:
+        periods: Forcing periods to run: at most (until="attractor"), or after the transient (until="window").
+        until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
+            `transient` periods and measures over the next `periods`.
+        transient: Forcing periods to drop before a window. The search for an attractor begins at once and takes none;
+            where it finds nothing, averages leave out the first quarter of `periods`.
+        wall: "soft" or "rigid".
+        method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
+            paper's fixed steps without event location (`vijax.engine.rk4` says what it cannot know).
+        solver: Of "ode": Tsit5 unless given; Bosh3, Dopri5, Dopri8, Kvaerno3, Kvaerno4 or Kvaerno5.
+        rtol, atol: Of "ode": tolerances of position and velocity step by step, 1e-8 and 1e-10 unless given.
+        membrane: Of "ode" and "rk4": `HuntCrossley(chi)` for the linear membrane. It takes no r: the map's
+            `restitution` is what came out.
+        steps: Of "rk4": steps per forcing period, 1000 unless given.
+        outputs: The variables wanted, of those in `vijax.planes.dataset.OUTPUTS`; all but `asymmetry` and `lyapunov`
+            unless given. What is not wanted is not computed. `status` always comes.
+        device: Constants of the device; Tables I and II unless given.
+        dtype: "float64", or "float32" with tolerances to match.
+        refine: Levels of refinement: every 2^refine-th cell along each axis is computed, then only those at borders
+            between kinds of motion or where P is not interpolated to 1 %, and the others are filled
+            (`vijax.planes.refine`). `computed` says which are which.
+        progress: Called with (cells done, cells in all) from the calling thread, first before anything is run. While a
+            plane is refined, all are those known to be needed, and grow.
+        out: Zarr store, named *.zarr, to write tile by tile, so that memory is set by a tile. It opens at any time,
+            cells that were not run yet by their `status`; stopped in whatever way, the same call goes on with what is
+            left of it, and mends what was damaged. A refined plane is written when it is whole. Without, everything is
+            in memory.
+        overwrite: Begin anew whatever the store holds; what vijax did not write is never replaced.
+        workers: With `out`: who runs and writes the tiles, under Dask (extra `cluster`): so many new processes, which
+            share the cores, or the address of a scheduler whose workers see `out` under the same path. A worker runs a
+            tile a thread, on its first device. New processes import the calling script: what it does must stand under
+            `if __name__ == "__main__":`.
+
+    Returns:
+        A dataset with one dimension per array, every parameter as a coordinate with units, and the variables wanted,
+        each without the dimensions that it cannot depend on. P is in joules per HALF forcing period. Believe it only
+        where `admissible` is true, and read `status` (CF flags) where `period` is -1. Attributes record versions,
+        commit, machine, tolerances and every setting. With `out` nothing of it is read before it is looked at.
+        What a cell's numbers are does not depend on the other cells, to the last bit on one kind of device. Where other
+        `outputs`, or another number of variants, make another program, it rounds otherwise: periodic cells agree to
+        1e-12, aperiodic ones, where chaos makes much of a rounding, within the errors of their averages.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
+        OSError: If `out` holds anything else, is being written by another run, or can be written no more; if no
+            scheduler answers, or its workers are lost.
+        ModuleNotFoundError: With `workers` but without Dask.
+
+    Warns:
+        UserWarning: If beta exceeds pi/2, or gravity holds the ball in every cell.
+
+    Source: Eqs. (36)-(38), corrected.
+    """
+    planned = plan(
+        axes,
+        outputs,
+        device,
+        periods=periods,
+        until=until,
+        transient=transient,
+        wall=wall,
+        method=method,
+        dtype=dtype,
+        solver=solver,
+        rtol=rtol,
+        atol=atol,
+        membrane=membrane,
+        steps=steps,
+        refine=refine,
+    )
+    return run(planned, progress, out, overwrite, workers)
+
+
+@door
+def plan(
+    axes: Mapping[str, Any], outputs: Iterable[str] | None = None, device: Harvester | None = None, **settings: Any
+) -> Plan:
+    """Check what a sweep is asked for and lay out its cells; runs nothing.
+
+    Args:
+        axes: Value or values of each axis; None counts as not given.
+        outputs: As in `sweep`.
+        device: As in `sweep`.
+        settings: periods, until, transient, wall, method, dtype: all of them, as in `sweep`; and of solver, rtol, atol,
+            membrane, steps, refine those that are given.
+
+    Raises:
+        ValueError, TypeError: Which argument, what must hold, what came.
+    """
+    for name, allowed in _CHOICES.items():
+        checks.choice(name, settings[name], allowed)
+    for name, least in (("periods", 1), ("transient", 0)):
+        settings[name] = checks.whole(name, settings[name], least, most_periods(settings["dtype"]))
+    if settings["transient"] and settings["until"] == "attractor":
+        raise ValueError(
+            f"transient must be 0 with until='attractor', whose search begins at once; got {settings['transient']}; "
+            "until='window' drops a transient"
+        )
+    refine = settings.pop("refine", None)
+    options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
+    method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
+    if outputs is None:
+        outputs = (name for name in OUTPUTS if name not in ON_REQUEST)
+    wanted = checks.words("outputs", outputs, OUTPUTS)
+    device = one_device(device)
+    given = {name: values for name, values in axes.items() if values is not None}
+    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    laid_out = cells(given, device, settings["wall"], restitution=lossy)
+    return Plan(
+        cells=laid_out,
+        settings=settings,
+        method=method,
+        # No map can be read without knowing how its cells ended.
+        outputs=tuple(name for name in OUTPUTS if name in wanted or name == "status"),
+        device=device,
+        refine=0 if refine is None else _levels(refine, laid_out, settings["until"]),
+    )
+
+
+def most_periods(dtype: str) -> int:
+    """Periods that a cell may be told to run: two such numbers together are still counted one by one."""
+    return min(checks.MOST, 1 << int(np.finfo(dtype).nmant))
+
+
+def _levels(refine: Any, of: Cells, until: str) -> int:
+    levels = checks.whole("refine", refine, 1)
+    if until != "attractor":
+        raise ValueError(f"refine must be left out with until={until!r}, whose cells have no label; got {levels}")
+    longest = max((of.sizes[dim] for dim in of.dynamic), default=1)
+    most = refinement.most_levels(longest)
+    if levels > most:
+        raise ValueError(
+            f"refine must leave 4 steps of 2^refine cells along the longest axis that the motion depends on, "
+            f"at most {most} levels for {longest} values; got {levels}"
+        )
+    return levels
+
+
+@door
+def run(
+    planned: Plan,
+    progress: Callable[[int, int], None] | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    workers: cluster.Workers | None = None,
+) -> "xr.Dataset":
+    """The map of a plan, its cells simulated tile by tile on every device; see `sweep`."""
+    watch = estimate.Watch(checks.function("progress", progress) or (lambda done, total: None))
+    checks.flag("overwrite", overwrite)
+    if workers is not None:
+        check_workers(planned, workers, out)
+    if out is None:
+        check_room(planned)
+    else:
+        check(planned, out, overwrite)
+    if (expected := estimate.of(planned)).long:
+        _LOG.warning("a long run begins: %s", expected)
+    found = _run(planned, watch, None if out is None else Path(out), overwrite, workers)
+    if not planned.refine:
+        watch.keep(planned)
+    warn_if_held(found)
+    return found
+
+
+def _run(
+    planned: Plan,
+    tell: Callable[[int, int], None],
+    out: Path | None,
+    overwrite: bool,
+    workers: cluster.Workers | None,
+) -> "xr.Dataset":
+    if out is None:
+        return _refined(planned, tell) if planned.refine else label(planned, _in_memory(planned, tell))
+    if planned.refine:
+        # Which cells are computed depends on all that were: no part of it could be gone on with.
+        save(_refined(planned, tell), out, overwrite=overwrite)
+        return view(out)
+    if workers is None and not out.exists():
+        _compile_ahead(planned)
+    with tiled_store.opened(planned, out, overwrite) as plane:
+        _fill(plane, tell, workers)
+    return view(out)
+
+
+def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
+    """Raise unless the map of a plan can be written there, or goes on there; makes nothing.
+
+    Raises:
+        ValueError, OSError: As `tiled_store.check`; of a refined map as `store.check_store`, or it does not fit
+            in memory.
+    """
+    if planned.refine:
+        check_store("out", out, overwrite)
+        check_room(planned)
+    else:
+        tiled_store.check(planned, checks.path("out", out), overwrite)
+
+
+def check_room(planned: Plan) -> None:
+    """Raise ValueError unless the map of a plan fits in memory, where it is not written tile by tile."""
+    names = [name for name, size in planned.cells.sizes.items() if size > 1]
+    hint = "" if planned.refine else "; give out, a store that is written tile by tile"
+    checks.fits(names, planned.size, f"{planned.count:,} cells", hint)
+
+
+def check_workers(planned: Plan, workers: cluster.Workers, out: str | Path | None) -> None:
+    """Raise unless such workers can run the plan; starts none.
+
+    Raises:
+        ValueError, OSError, ModuleNotFoundError: As `cluster.check`; ValueError without a store, and with refinement.
+    """
+    if out is None:
+        raise ValueError(f"workers must come with out, the store that they write; got {checks.shown(workers)} alone")
+    if planned.refine:
+        raise ValueError(
+            f"workers must be left out with refine, which goes on from all that was found; got {checks.shown(workers)}"
+        )
+    cluster.check(workers)
+
+
+def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
+    count = planned.count
+    tell(0, count)
+    found: Fields = {}
+    for done in dispatch.compute(planned, np.arange(count), found):
+        tell(done, count)
+    return found
+
+
+def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
+    """The map of a plan of which a part is computed, in rounds, and the rest filled."""
+    of = planned.cells
+    varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
+    mesh = refinement.Mesh(tuple(of.given[dim].values for dim in varied), planned.refine)
+    level_ground = of.flat(of.quantities["gamma"], np.arange(of.count)) == 0
+    asked = replace(planned, outputs=tuple(dict.fromkeys((*planned.outputs, *refinement.NEEDS))))
+    found: Fields = {}
+    computed = np.zeros(of.count, bool)
+    past = 0
+    for cells_wanted in refinement.rounds(mesh, found, level_ground):
+        tell(past, past + cells_wanted.size)
+        # The tile of the whole plane for all rounds: one program to compile, and the one of the plane in full.
+        for done in dispatch.compute(asked, cells_wanted, found, dispatch.rows_each(of.count)):
+            tell(past + done, past + cells_wanted.size)
+        computed[cells_wanted] = True
+        past += cells_wanted.size
+    refinement.fill(mesh, found, computed, level_ground)
+    told = {"units": "1", "long_name": "whether the cell was computed; the others are filled between those that were"}
+    dataset = label(planned, found)
+    dataset["computed"] = of.dynamic, computed.reshape([of.sizes[dim] for dim in of.dynamic]), told
+    dataset.attrs |= {
+        "refine": planned.refine,
+        "refine_tolerance": refinement.TOLERANCE,
+        "refine_computed": past,
+        "refine_shown": of.count,
+    }
+    return dataset
+
+
+def _compile_ahead(planned: Plan) -> None:
+    """Begin to compile what the tiles of a new store need: XLA needs no Python, and importing zarr a core."""
+    most = math.prod(tiled_store.blocks(planned.cells).values())
+    whole = Call(planned, np.arange(min(most, planned.count)), dispatch.rows_for(most), 0)
+    context.pool(1).submit(dispatch.prepare, whole, places()[0])
+
+
+def _fill(plane: tiled_store.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:
+    """Simulate and write the tiles of a study that are not done."""
+    left = tiled_store.left(plane, _LOG.warning)
+    total = plane.planned.count
+    done = total - sum(map(plane.count, left))
+    tiles = map(plane.tile, left)
+    try:
+        tell(done, total)
+        # Closed at once whatever happens, or workers would go on for as long as somebody holds the error.
+        with closing(_made(tiles, dispatch.rows_for(plane.most), workers)) as made:
+            for tile in made:
+                done += tile.planned.count
+                tell(done, total)
+    except (KeyboardInterrupt, OSError) as error:
+        error.add_note(f"{done:,} of {total:,} cells are in {plane.path}; the same command goes on from there")
+        raise
+
+
+def _made(
+    tiles: Iterable[tiled_store.Tile], rows: int, workers: cluster.Workers | None
+) -> Generator[tiled_store.Tile, None, None]:
+    """Tiles as they are done, by whomever."""
+    if workers is None:
+        yield from _here(tiles, rows)
+    else:
+        yield from cluster.done(partial(_make, rows), tiles, workers)
+
+
+def _here(tiles: Iterable[tiled_store.Tile], rows: int) -> Iterator[tiled_store.Tile]:
+    """Tiles, simulated and written by this process, as they are done."""
+    running: dict[int, tiled_store.Tile] = {}
+
+    def one_each() -> Iterator[Call]:
+        for tile in tiles:
+            running[tile.number] = tile
+            yield _whole(tile, rows)
+
+    with closing(dispatch.in_turn(one_each())) as ended:
+        for call, found, seconds in ended:
+            tiled_store.write(running[call.number], variables(call.planned, found), seconds)
+            yield running.pop(call.number)
+
+
+@door
+def _make(rows: int, tile: tiled_store.Tile) -> None:
+    """Simulate and write a tile, in a worker, on its first device."""
+    call, place = _whole(tile, rows), places()[0]
+    dispatch.prepare(call, place)
+    found, seconds = dispatch.perform(call, place)
+    tiled_store.write(tile, variables(tile.planned, found), seconds)
+
+
+def _whole(tile: tiled_store.Tile, rows: int) -> Call:
+    """All cells of a tile of a study."""
+    return Call(tile.planned, np.arange(tile.planned.count), rows, tile.number)

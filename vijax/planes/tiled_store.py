@@ -1,0 +1,361 @@
+"""A plane in tiles on disk: what is done, what is left, who may write.
+
+A tile is a block of the dimensions that the dynamics see, with all their variants: one chunk of every variable. Its
+record is written last, after its chunks, and tells how and by what the tile was made, and what its files must be like.
+Records and lock lie beside the chunks of `status`, where no reader of zarr looks.
+"""
+
+import logging
+import math
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vijax.planes import inventory, store_metadata
+from vijax.planes.axes import Cells
+from vijax.planes.dataset import Plan, made_by
+from vijax.planes.store import check_place, check_store, encoded, view
+from vijax.runtime.files import beside, replacing, replacing_folder, write_json
+from vijax.runtime.tiles import places
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
+SMALLEST_TILE, LARGEST_TILE = 1024, 32768
+_SHARES = 2  # tiles of a small plane for everyone who takes some: blocks do not cost the same
+_ROUNDING = 1.1  # of such a share: halves of odd lengths are rounded up
+_LARGEST_CHUNK = 1 << 21  # numbers: of many variants a tile has fewer cells
+_LONGEST_BIRTH = 100  # characters: of a lock file that somebody wrote over no more are read
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Study:
+    """A store that holds a plane, or will.
+
+    Attributes:
+        path: Of the store.
+        planned: The whole plane.
+        dims: Dimensions of every variable.
+        extents: Length of a tile along every dynamic dimension; the last ones may be shorter.
+        birth: Of the store: no other has the same.
+    """
+
+    path: Path
+    planned: Plan
+    dims: dict[str, tuple[str, ...]]
+    extents: dict[str, int]
+    birth: str
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of tiles along every dynamic dimension."""
+        sizes = self.planned.cells.sizes
+        return tuple(-(-sizes[dim] // extent) for dim, extent in self.extents.items())
+
+    @property
+    def tiles(self) -> range:
+        """The tiles by number, the last dimension running first."""
+        return range(math.prod(self.counts))
+
+    @property
+    def most(self) -> int:
+        """Cells of the largest tile."""
+        return math.prod(self.extents.values())
+
+    def place(self, tile: int) -> dict[str, int]:
+        """Number of a tile along every dynamic dimension."""
+        numbers = np.unravel_index(tile, self.counts) if self.extents else ()
+        return {dim: int(number) for dim, number in zip(self.extents, numbers, strict=True)}
+
+    def block(self, tile: int) -> dict[str, slice]:
+        """Where a tile lies in the plane."""
+        sizes, place = self.planned.cells.sizes, self.place(tile)
+        return {
+            dim: slice(place[dim] * extent, min((place[dim] + 1) * extent, sizes[dim]))
+            for dim, extent in self.extents.items()
+        }
+
+    def count(self, tile: int) -> int:
+        """Cells of a tile."""
+        return math.prod(part.stop - part.start for part in self.block(tile).values())
+
+    def tile(self, number: int) -> "Tile":
+        """A tile alone."""
+        block, path = self.block(number), self.path.absolute()
+        chunk = {**self.planned.cells.sizes, **self.extents}
+        shapes = {name: tuple(chunk[dim] for dim in along) for name, along in self.dims.items()}
+        return Tile(number, path, self.birth, self.planned.cut(block), self.dims, shapes, self.place(number))
+
+    def record(self, tile: int) -> Path:
+        """Where it is written that a tile is done."""
+        return _record(self.path, tile)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One tile, as light as its cells: all that who runs and writes it must know, on whatever machine.
+
+    Attributes:
+        number: Which of the study's.
+        path: Of the store, from the root: workers start elsewhere.
+        birth: Of the store.
+        planned: The cells of the tile alone.
+        dims: Dimensions of every variable.
+        shapes: Of a chunk of every variable; the tile may be smaller.
+        place: Its number along every dynamic dimension.
+    """
+
+    number: int
+    path: Path
+    birth: str
+    planned: Plan
+    dims: dict[str, tuple[str, ...]]
+    shapes: dict[str, tuple[int, ...]]
+    place: dict[str, int]
+
+
+def _record(path: Path, tile: int) -> Path:
+    return path / inventory.TILES / f"{tile}.json"
+
+
+def extents(sizes: dict[str, int], most: int) -> dict[str, int]:
+    """Lengths of blocks of at most so many cells, by halving the longest dimension."""
+    found = dict(sizes)
+    while math.prod(found.values()) > most:
+        longest = max(found, key=lambda dim: found[dim])
+        found[longest] = -(-found[longest] // 2)
+    return found
+
+
+def blocks(of: Cells) -> dict[str, int]:
+    """Lengths of the tiles of a new store."""
+    return extents({dim: of.sizes[dim] for dim in of.dynamic}, _most(of))
+
+
+# --- who may write ---------------------------------------------------------------------------------------------------
+
+
+def check(planned: Plan, path: str | Path, overwrite: bool = False) -> None:
+    """Raise unless the plane can be written there, or goes on there; makes nothing, and mends what is damaged.
+
+    Raises:
+        ValueError: If there is what is no name of a store.
+        FileExistsError: If there is something else, or another plane, and it is not to be replaced.
+        BlockingIOError: If another run writes there.
+        FileNotFoundError, PermissionError: If the place cannot be written.
+    """
+    target = _target(path, overwrite)
+    if target.exists():
+        with _locked(target, overwrite):
+            if not overwrite:
+                _check_same(planned, target)
+
+
+def _target(path: str | Path, overwrite: bool) -> Path:
+    """Where to write: nothing is there, or a store, or what may be replaced."""
+    target = check_place("out", path)
+    return target if inventory.is_store(target) and not overwrite else check_store("out", path, overwrite)
+
+
+@contextmanager
+def opened(planned: Plan, path: str | Path, overwrite: bool = False) -> Iterator[Study]:
+    """The study of a plane, made or found, which no one else may write meanwhile.
+
+    Raises:
+        As `check`.
+    """
+    target = _target(path, overwrite)
+    if not target.exists():
+        _make(planned, target)
+    elif overwrite:
+        with _locked(target, overwrite), replacing_folder(target) as part:
+            _write_blank(planned, part)
+    with _locked(target):
+        _check_same(planned, target)
+        yield _found(planned, target)
+
+
+def _make(planned: Plan, target: Path) -> None:
+    """A store without any tile, unless another run was faster."""
+    part = beside(target, "part")
+    try:
+        _write_blank(planned, part)
+        part.rename(target)
+    except OSError:
+        if not target.exists():
+            raise
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_blank(planned: Plan, path: Path) -> None:
+    birth = uuid.uuid4().hex
+    store_metadata.write(planned, blocks(planned.cells), birth, path)
+    _lock(path).parent.mkdir()
+    _lock(path).write_text(birth, encoding="utf-8")
+
+
+def _lock(path: Path) -> Path:
+    """The file that a writer of the store locks; within, the birth of the store."""
+    return path / inventory.TILES / "lock"
+
+
+def _birth(path: Path) -> str:
+    with _lock(path).open("rb") as lock:
+        return lock.read(_LONGEST_BIRTH).decode(errors="replace")
+
+
+def _most(of: Cells) -> int:
+    """Cells of a tile, at most."""
+    share = max(int(_ROUNDING * of.count / (_SHARES * len(places()))), SMALLEST_TILE)
+    room = _LARGEST_CHUNK // math.prod(of.sizes[dim] for dim in of.variant)
+    return min(share, LARGEST_TILE, max(room, 1))
+
+
+def _found(planned: Plan, path: Path) -> Study:
+    """The study that a store is, its tiles as long as they were when it was made."""
+    with view(path) as store:
+        dims = {name: tuple(map(str, store[name].dims)) for name in planned.outputs}
+        chunks = store["status"].encoding["chunks"]
+    return Study(path, planned, dims, dict(zip(planned.cells.dynamic, chunks, strict=True)), _birth(path))
+
+
+@contextmanager
+def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
+    """Alone with a store; the lock ends with its process, however that ends. What was saved whole nobody writes."""
+    import fcntl
+
+    if not inventory.is_study(path):
+        if not overwrite:
+            raise FileExistsError(
+                f"out must be new or the store of a run that can go on; got {path}, which was saved whole; "
+                "allow overwriting, or take another name"
+            )
+        yield
+        return
+    lock = _lock(path)
+    odd = inventory.fault(lock, None) in ("is missing", "is no regular file")
+    try:
+        if odd:
+            lock.unlink(missing_ok=True)
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            lock.touch()
+        file = lock.open("r+")
+    except OSError as error:
+        raise PermissionError(f"out must be a store that can be written; got {path} ({error.strerror})") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(f"out must not be in use; got {path}, which another run is writing") from None
+        if (listed := inventory.read(path)) and listed["birth"] != _birth(path):
+            file.truncate(0)
+            file.write(listed["birth"])
+            file.flush()
+        yield
+
+
+def _check_same(planned: Plan, path: Path) -> None:
+    """Raise unless a store holds this plane; what is damaged of it, but for its tiles, is mended."""
+    store_metadata.mend(planned, blocks(planned.cells), _birth(path), path, _LOG.warning)
+    store_metadata.check_same(planned, path)
+
+
+# --- what is done, what is left --------------------------------------------------------------------------------------
+
+
+def left(study: Study, say: Callable[[str], None]) -> list[int]:
+    """Tiles that are not done, and those whose files are no longer what was written; of these is said why."""
+    for file in inventory.half_written(study.path):
+        file.unlink(missing_ok=True)  # a worker that lost its driver may still be writing
+    found = []
+    for tile in study.tiles:
+        record = study.record(tile)
+        if not os.path.lexists(record):
+            found.append(tile)
+        elif reason := _damage(study, tile):
+            record.unlink()
+            found.append(tile)
+            say(f"tile {tile} of {study.path} is run again: {reason}")
+    return found
+
+
+def _damage(study: Study, tile: int) -> str:
+    """What is wrong with the files of a tile, nothing if all are as they were written."""
+    record = inventory.content(study.record(tile))
+    if record is None or not isinstance(record.get("files"), dict):
+        inventory.fault(study.record(tile), None)
+        return "its record cannot be read"
+    if record.get("birth") != study.birth:
+        return "its record is of another store"
+    for name, file in _files(study.path, study.dims, study.place(tile)):
+        relative = file.relative_to(study.path).as_posix()
+        # Earlier versions wrote fingerprints under the names of variables.
+        if reason := inventory.fault(file, record["files"].get(relative, record["files"].get(name))):
+            return f"{relative} {reason}"
+    return ""
+
+
+def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, int]) -> Iterator[tuple[str, Path]]:
+    """The chunk of every variable of a tile."""
+    for name, along in dims.items():
+        yield name, path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in along))
+
+
+def write(tile: Tile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
+    """Write the variables of a tile, then its record.
+
+    Args:
+        tile: Which.
+        found: Of its plan; see `dataset.variables`.
+        seconds: That it took.
+
+    Raises:
+        OSError: If the store cannot be written, or is no longer the one that the tile is of.
+    """
+    _check_born(tile)
+    prints = {}
+    for name, file in _files(tile.path, tile.dims, tile.place):
+        content = encoded(_filled(name, found[name].values, tile.shapes[name]))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as part:
+            part.write_bytes(content)
+        prints[file.relative_to(tile.path).as_posix()] = inventory.fingerprint(content)
+    record = {
+        "cells": tile.planned.count,
+        "seconds": round(seconds, 3),
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        **made_by(),
+        "birth": tile.birth,
+        "files": prints,
+    }
+    _check_born(tile)
+    write_json(record, _record(tile.path, tile.number))
+
+
+def _filled(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A chunk of a variable, void where it reaches beyond the plane."""
+    chunk = np.full(shape, store_metadata.void(name, values.dtype), values.dtype)
+    chunk[tuple(slice(size) for size in values.shape)] = values
+    return chunk
+
+
+def _check_born(tile: Tile) -> None:
+    """Raise if another store has taken the place of the tile's.
+
+    The lock is the driver's, and a worker may outlive it: it then writes what the next driver has run again, the same
+    bits if on the same kind of device. Whatever mixture of both is left, no file is half of each, and one that the
+    record does not fit is found and run again. But the next driver may have begun another plane there.
+    """
+    if _birth(tile.path) != tile.birth:
+        raise FileExistsError(f"{tile.path} is no longer the store that tile {tile.number} was run for")

@@ -1,0 +1,230 @@
+"""Pictures of designs: P along an axis with its cliff, the ascent and the optimum; designs along an axis."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vijax.design.report import amount, factors
+from vijax.design.variables import LINEAR, constant
+from vijax.model.units import UNITS
+from vijax.plots.style import STYLE, axis_label, check_format, save_figure, symbol
+from vijax.runtime import checks
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Colours of points that are admissible and that are not, and their size: the rising ones lie over the falling ones.
+_WAYS = {"down": ("#1f77b4", "#aec7e8", 3.4, "falling"), "up": ("#ff7f0e", "#ffbb78", 1.7, "rising")}
+_VEIL: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "0.75", "hatch": "////", "linewidth": 0, "zorder": 0}
+_BAND: dict[str, Any] = {"color": "#2ca02c", "alpha": 0.25, "linewidth": 0, "zorder": 1}
+_STAR: dict[str, Any] = {"marker": "*", "markersize": 13, "color": "#2ca02c", "markeredgecolor": "black", "mew": 0.6}
+_PATH: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 2.6,
+    "color": "black",
+    "linewidth": 0.7,
+    "markerfacecolor": "white",
+}
+_NAIVE: dict[str, Any] = {"marker": "X", "markersize": 8, "color": "#d62728", "linestyle": "none", "mew": 0}
+_EDGE: dict[str, Any] = {"color": "black", "linestyle": ":", "linewidth": 0.9}
+_WIDE = 4.0  # ratio of the bounds from which on an axis is logarithmic
+_DECADES = 6  # of P below the largest
+_NEAR, _TILT = 0.25, 0.05  # the close view, to either side: in parts of the optimum; of an inclination
+_HEADROOM = 1.25
+_JOULES = ("P", "mean", "worst")
+
+
+def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | None = None) -> Figure:
+    """P along an axis, falling and rising, under the ascent, the optimum, its tolerance band and what is not physical.
+
+    Args:
+        diagram: `vijax.orbit_diagram` in both directions, at the optimum.
+        report: What `vijax.design.report.describe` returned, with the same diagram.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: If the path does not end as a picture does.
+    """
+    checks.record("report", report, ("best",), "vijax.design.report.describe")
+    checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
+    if path is not None:
+        check_format(path)
+    along, best = str(diagram.attrs["along"]), report["best"]
+    near = None if best is None else close_view(along, _here(best, along))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 4.2 if near is None else 6.6), layout="constrained")
+        panels = figure.subplots(1 if near is None else 2, squeeze=False)[:, 0]
+        for axes in panels:
+            _draw(axes, diagram, report)
+        _whole(panels[0], diagram)
+        panels[0].set_title(_title(diagram, report), fontsize="medium")
+        if near is not None:
+            panels[1].set(xlim=near, ylim=(0, _HEADROOM * best["P"]), ylabel="$P$ [J per half period]")
+            panels[1].ticklabel_format(axis="y", scilimits=(0, 0))
+        panels[-1].set_xlabel(axis_label(diagram[along]))
+        handles, texts = panels[0].get_legend_handles_labels()
+        figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
+        if path is not None:
+            save_figure(figure, path)
+    return figure
+
+
+def close_view(along: str, here: float) -> tuple[float, float]:
+    """Ends of the part of an axis about an optimum that a picture shows closer by."""
+    return (here - _TILT, here + _TILT) if along in LINEAR else (here * (1 - _NEAR), here * (1 + _NEAR))
+
+
+def _draw(axes: Axes, diagram: "xr.Dataset", report: dict[str, Any]) -> None:
+    along = str(diagram.attrs["along"])
+    yields, good = diagram["P"] > 0, diagram["admissible"]
+    bad = (yields & ~good).any("direction") & ~(yields & good).any("direction")
+    ranges = _ranges(diagram[along].values, bad.values)
+    for index, (low, high) in enumerate(ranges):
+        axes.axvspan(low, high, label=None if index else "inadmissible", **_VEIL)
+    _curves(axes, diagram, diagram[along].values)
+    _unconstrained(axes, report)
+    if report["best"] is not None:
+        _mark(axes, report, along)
+
+
+def _whole(axes: Axes, diagram: "xr.Dataset") -> None:
+    """Limits and scales that show all of a diagram."""
+    x, power = diagram[diagram.attrs["along"]].values, diagram["P"]
+    most, least = float(power.max()), float(power.where(power > 0).min())
+    axes.set(yscale="log", xlim=(x.min(), x.max()), ylabel="$P$ [J per half period]")
+    if most > 0:
+        axes.set_ylim(max(least / 2, most / 10**_DECADES), 3 * most)
+    if x.min() > 0 and x.max() > _WIDE * x.min():
+        axes.set_xscale("log")
+
+
+def _ranges(x: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
+    """Ends of the stretches of `which`, half way to the points beside them."""
+    order = np.argsort(x)
+    x, which = x[order], which[order]
+    borders = np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1]), x[-1:]])
+    steps = np.diff(np.concatenate([[0], which.astype(int), [0]]))
+    return list(zip(borders[np.flatnonzero(steps == 1)], borders[np.flatnonzero(steps == -1)], strict=True))
+
+
+def _curves(axes: Axes, diagram: "xr.Dataset", x: np.ndarray) -> None:
+    for way, (colour, pale, size, name) in _WAYS.items():
+        one = diagram.sel(direction=way)
+        power, good = one["P"].values, one["admissible"].values
+        style: Any = {"linestyle": "none", "marker": ".", "mew": 0, "markersize": 2 * size}
+        axes.plot(x[~good], power[~good], color=pale, **style)
+        axes.plot(x[good], power[good], color=colour, label=f"{name} {symbol(diagram[one.attrs['along']])}", **style)
+
+
+def _unconstrained(axes: Axes, report: dict[str, Any]) -> None:
+    peak, best = report["highest"], report["best"]
+    if not peak["admissible"] and (best is None or peak["P"] > best["P"]):
+        text = f"what $P$ alone would choose: {_micro(peak['P'])}, {1e3 * peak['max_penetration']:.3g} mm deep"
+        axes.plot([peak["value"]], [peak["P"]], label=text, **_NAIVE)
+
+
+def _mark(axes: Axes, report: dict[str, Any], along: str) -> None:
+    """The optimum, how it was reached, how far it may be off, where its orbit ends."""
+    best = report["best"]
+    here = _here(best, along)
+    band = factors(along, report["tolerances"])
+    if band is not None:
+        axes.axvspan(here * band[0], here * band[1], label="tolerance", **_BAND)
+    if report["surroundings"]:
+        _edges(axes, report["surroundings"], best["omega0"], here, along)
+    if along in report["tune"] and report["objective"] in _JOULES:
+        column = np.asarray(best["path"])[:, report["tune"].index(along)]
+        axes.plot(column, best["heights"], zorder=4, label="ascent", **_PATH)
+    axes.plot([here], [best["P"]], zorder=5, linestyle="none", label=f"optimum: {_micro(best['P'])}", **_STAR)
+
+
+def _edges(axes: Axes, around: dict[str, Any], omega0: float, here: float, along: str) -> None:
+    """Where the optimum's orbit meets its first bifurcations."""
+    for side in ("below", "above"):
+        edge = around[side]
+        if constant(along) == "omega0" and edge["kind"] != "none":
+            power = 2 if along == "k" else 1
+            axes.axvline(here * (edge["omega0"] / omega0) ** power, label=edge["kind"], **_EDGE)
+
+
+def _here(best: dict[str, Any], along: str) -> float:
+    """Where the optimum is on an axis."""
+    known = best["values"] | best["pair"] | best["device"]
+    return float(known[along] if along in known else known["m_b"] * known["omega0"] ** 2)
+
+
+def _micro(energy: float) -> str:
+    return amount(energy, "J", 4).replace(" u", r" $\mu$")
+
+
+def _title(diagram: "xr.Dataset", report: dict[str, Any]) -> str:
+    names = [name for name in ("d", "r", "omega", "A") if name in diagram.coords and not diagram[name].ndim]
+    said = [f"{symbol(diagram[name])} = {float(diagram[name]):.4g}" for name in names]
+    return f"objective {report['objective']}; " + ", ".join(said)
+
+
+# --- along an axis --------------------------------------------------------------------------------
+
+_HELD = {  # what holds a design, by the words it begins with
+    "penetration": ("#1f77b4", "penetration limit"),
+    "energy": ("#9467bd", "energy given to the membrane"),
+    "lower": ("#8c564b", "a bound"),
+    "upper": ("#8c564b", "a bound"),
+    "supremum": ("#d62728", "end of the orbit"),
+    "unsettled": ("#7f7f7f", "a kink, or looks spent"),
+    "": ("#2ca02c", "nothing: interior"),
+}
+
+
+def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure:
+    """The best designs along an axis: what the first tuned quantity should be, and P; coloured by what holds them.
+
+    Args:
+        report: `over` (name and values of the axis) and `designs`, one of `vijax.design.report.describe` for
+            each value.
+        path: Where to write it, if anywhere; the ending chooses the format.
+
+    Raises:
+        ValueError: If the path does not end as a picture does.
+    """
+    if path is not None:
+        check_format(path)
+    checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
+    over, designs = report["over"], report["designs"]
+    tuned = designs[0]["tune"][0]
+    found = [(x, one) for x, one in zip(over["values"], designs, strict=True) if one["best"]]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 5.0), layout="constrained")
+        upper, lower = figure.subplots(2, sharex=True)
+        for held, (colour, name) in _HELD.items():
+            mine = [(x, one["best"]) for x, one in found if _holding(one["best"]) == held]
+            style: Any = {"linestyle": "none", "marker": "o", "markersize": 3, "color": colour}
+            upper.plot([x for x, _ in mine], [one["values"][tuned] for _, one in mine], **style)
+            known = any(text.get_label() == name for text in lower.get_lines())
+            label = None if known or not mine else name
+            lower.plot([x for x, _ in mine], [one["P"] for _, one in mine], label=label, **style)
+        if any(one["spread"] for _, one in found):
+            worst = [one["spread"]["worst"] for _, one in found]
+            lower.plot([x for x, _ in found], worst, "_", color="black", label="worst within the tolerances")
+        upper.set(yscale="linear" if tuned in LINEAR else "log", ylabel=f"best {_named(tuned)}")
+        lower.set(yscale="log", ylabel="$P$ [J per half period]", xlabel=_named(over["name"]))
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
+        if path is not None:
+            save_figure(figure, path)
+    return figure
+
+
+def _holding(best: dict[str, Any]) -> str:
+    if best["stopped"] == "supremum":
+        return "supremum"
+    if best["active"]:
+        return best["active"][0].split()[0]
+    return "" if best["stopped"] == "maximum" else "unsettled"
+
+
+def _named(name: str) -> str:
+    return f"{name} [{UNITS[name]}]" if name in UNITS else name

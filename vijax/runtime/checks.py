@@ -1,0 +1,270 @@
+"""What a door asks of its arguments, kind by kind: whole and real numbers, arrays, choices, records, paths, sizes.
+
+Whatever is wrong with an argument, its type as well as its value, is a ValueError of one line that names it: what must
+hold, what came, what to do. TypeError is left to arguments that a function does not take at all, as in Python, and
+OSError to files. Which values a quantity of the device may have is known to `model.quantities`.
+"""
+
+import math
+import os
+import reprlib
+from collections.abc import Callable, Collection, Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+T = TypeVar("T")
+
+MOST = 10**9
+"""Of whatever is counted: periods, impacts and cells are numbered by 32 bits inside compiled programs."""
+MOST_SEED = 2**64 - 1
+
+_WORDS = reprlib.Repr()
+_WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 60
+
+
+def shown(value: Any) -> str:
+    """A value as an error quotes it: on one line, and never long."""
+    # Python writes no number of thousands of digits.
+    text = f"{value.bit_length()} bits" if isinstance(value, int) and value.bit_length() > 500 else _WORDS.repr(value)
+    return " ".join(text.split())
+
+
+def _array(value: Any) -> np.ndarray:
+    """The value as an array, of objects where it is none of numbers."""
+    try:
+        return np.asarray(value)
+    except ValueError:  # a list of lists of several lengths
+        return np.asarray(None)
+
+
+def is_concrete(*values: Any) -> bool:
+    """Whether nothing in the values is traced, so that they may be looked at."""
+    return not any(isinstance(leaf, jax.core.Tracer) for value in values for leaf in jax.tree.leaves(value))
+
+
+def known(name: str, value: T) -> T:
+    """The value, unless JAX traces it, or a part of it, where nothing is differentiated."""
+    if not is_concrete(value):
+        raise ValueError(
+            f"{name} must not be traced, as this is not differentiated; got {shown(value)}; "
+            "use vijax.steady or vijax.trajectory under jit, grad and vmap"
+        )
+    return value
+
+
+def whole(name: str, value: Any, least: int, most: int = MOST) -> int:
+    """The value as an int between two bounds; True and 3.0 are no whole numbers."""
+    known(name, value)
+    number = np.asarray(value) if isinstance(value, int | np.integer | np.ndarray | jax.Array) else np.asarray(None)
+    if number.ndim or not _integral(number) or number < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}; got {shown(value)}")
+    if number > most:
+        raise ValueError(f"{name} must be a whole number of at most {most:,}; got {shown(value)}")
+    return int(number)
+
+
+def _integral(number: np.ndarray) -> bool:
+    # An int of more than 64 bits is an object to NumPy.
+    return number.dtype.kind in "iu" or (number.dtype.kind == "O" and isinstance(number.item(), int))
+
+
+def seed(value: Any) -> int | None:
+    """The seed of a random generator, or None."""
+    return None if value is None else whole("seed", value, 0, MOST_SEED)
+
+
+def real(name: str, value: Any, must: str, holds: Callable[[float], bool]) -> float:
+    """The value as a float for which something holds.
+
+    Args:
+        name: Of the argument.
+        value: What came.
+        must: What it must be, in words.
+        holds: The same in code; never asked about NaN.
+    """
+    known(name, value)
+    number = _array(value)
+    if number.ndim or number.dtype.kind not in "iuf" or np.isnan(number) or not holds(float(number)):
+        raise ValueError(f"{name} must be {must}; got {shown(value)}")
+    return float(number)
+
+
+def positive(name: str, value: Any) -> float:
+    """The value as a positive finite float."""
+    return real(name, value, "a positive finite number", lambda x: 0 < x < math.inf)
+
+
+def numbers(name: str, value: Any, advice: str = "", *, some: bool = True) -> np.ndarray:
+    """The value as an array of real numbers, NaN and infinity among them; of at least one unless not `some`."""
+    known(name, value)
+    array = _array(value)
+    hint = advice and f"; {advice}"
+    if some and array.size == 0:
+        raise ValueError(f"{name} must hold at least one number; got shape {array.shape}{hint}")
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must be a real number or an array of them; got {shown(value)}{hint}")
+    return array
+
+
+def bounds(name: str, value: Any) -> tuple[float, float]:
+    """The value as two finite numbers, the lower first."""
+    try:
+        low, high = map(float, finite(name, value))
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not low < high:
+        raise ValueError(f"{name} must be two finite bounds, the lower first; got {shown(known(name, value))}")
+    return low, high
+
+
+def finite(name: str, value: Any) -> np.ndarray:
+    """The value as an array of at least one finite real number."""
+    array = numbers(name, value)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite; got {first(array, np.isfinite(array))}")
+    return array
+
+
+def first(values: Any, good: Any) -> str:
+    """The first element that is not good, with its index where there is one."""
+    values, good = np.asarray(values), np.asarray(good)
+    index = tuple(int(i) for i in np.argwhere(~good)[0])
+    where = f" at index {index if len(index) > 1 else index[0]}" if index else ""
+    return f"{values[index]}{where}"
+
+
+def shapes(**arrays: Any) -> tuple[int, ...]:
+    """The shape to which arrays broadcast."""
+    each = {name: np.shape(array) for name, array in arrays.items()}
+    try:
+        return np.broadcast_shapes(*each.values())
+    except ValueError:
+        got = ", ".join(f"{name} {shape}" for name, shape in each.items())
+        raise ValueError(f"{joined(each)} must broadcast to one shape; got {got}") from None
+
+
+def joined(names: Iterable[str]) -> str:
+    """Names in a sentence: d, kappa and r."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def choice(name: str, value: Any, allowed: Collection[str], hint: str = "") -> str:
+    """The value, if it is one of some words."""
+    if not isinstance(value, str) or value not in allowed:
+        listed = " or ".join(f'"{word}"' for word in allowed) if len(allowed) < 4 else f"among {', '.join(allowed)}"
+        raise ValueError(f"{name} must be {listed}; got {shown(value)}{hint and f'; {hint}'}")
+    return value
+
+
+def words(name: str, value: Any, allowed: Collection[str]) -> tuple[str, ...]:
+    """The value as a tuple of words of which each is allowed; a single one need not stand in a list."""
+    listed = (value,) if isinstance(value, str) else sequence(name, value, str, "names")
+    if not listed:
+        raise ValueError(f"{name} must name at least one of {', '.join(allowed)}; got none")
+    return tuple(choice(name, word, allowed) for word in listed)
+
+
+def sequence(name: str, value: Any, kind: type[T], what: str) -> list[T]:
+    """The value as a list of records of a kind; `what` they are, in words."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise ValueError(f"{name} must be a list of {what}; got {shown(value)}")
+    listed = list(value)
+    for one in listed:
+        if not isinstance(one, kind):
+            raise ValueError(f"{name} must be a list of {what}; got {shown(one)} in it")
+    return listed
+
+
+def instance(name: str, value: Any, kind: type[T], made: str) -> T:
+    """The value, if it is a record of a kind.
+
+    Args:
+        name: Of the argument.
+        value: What came.
+        kind: Its class.
+        made: How such a record is had: "vijax.Harvester(...)".
+    """
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be of the kind {kind.__name__}; got {shown(value)}; {made} makes one")
+    return value
+
+
+def variables(name: str, value: Any, needed: Iterable[str], made: str, hint: str = "") -> Any:
+    """The value, if it is a dataset that holds some variables; `made` is the function that returns such."""
+    import xarray as xr  # here, as importing vijax must not load it
+
+    if not isinstance(value, xr.Dataset):
+        raise ValueError(f"{name} must be a dataset, as {made} returns it; got {shown(value)}")
+    missing = [one for one in needed if one not in value]
+    if missing:
+        hint = hint and f"; {hint}"
+        raise ValueError(f"{name} must hold {', '.join(needed)}; got a dataset without {', '.join(missing)}{hint}")
+    return value
+
+
+def record(name: str, value: Any, needed: Iterable[str], made: str) -> dict[str, Any]:
+    """The value, if it is a dict that holds some entries; `made` is what returns such."""
+    missing = list(needed) if not isinstance(value, dict) else [one for one in needed if one not in value]
+    if missing:
+        raise ValueError(f"{name} must be a dict with {joined(missing)}, as {made} gives it; got {shown(value)}")
+    return value
+
+
+def flag(name: str, value: Any) -> bool:
+    """The value, if it is True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False; got {shown(value)}")
+    return bool(value)
+
+
+def function(name: str, value: Any) -> Any:
+    """The value, if it can be called, or None."""
+    if value is not None and not callable(value):
+        raise ValueError(f"{name} must be a function, or left out; got {shown(value)}")
+    return value
+
+
+def path(name: str, value: Any) -> Path:
+    """The value as a path."""
+    if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
+        raise ValueError(f"{name} must be a path, as text or a pathlib.Path; got {shown(value)}")
+    return Path(value)
+
+
+def fits(names: Iterable[str], size: float, what: str, hint: str = "") -> None:
+    """Raise unless so much fits into this machine's memory.
+
+    Args:
+        names: Of the arguments that make it large.
+        size: Bytes, at least.
+        what: Takes them.
+        hint: What to do besides asking for less.
+    """
+    if size > memory():
+        room = gigabytes(memory())
+        raise ValueError(
+            f"{joined(names)} must be so few that {what} fit in memory, {room}; got {gigabytes(size)}{hint}"
+        )
+
+
+def gigabytes(size: float) -> str:
+    """Bytes in words."""
+    return f"{size / 1e9:,.3g} GB" if size < 1e14 else f"{size / 1e12:,.0f} TB"
+
+
+@cache
+def memory() -> float:
+    """Bytes of memory that this process may have: the machine's, or those of its control group where it has fewer."""
+    try:
+        most = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):  # not on every system
+        return math.inf
+    try:
+        return min(most, float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    except (OSError, ValueError):  # no such group, or "max"
+        return most

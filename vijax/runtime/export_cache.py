@@ -1,0 +1,114 @@
+"""Programs that are traced once: what tracing makes of them is kept on disk, beside what JAX keeps of compiling it.
+
+Tracing and lowering the program of a plane takes two seconds of every process, more than running a small plane. What
+comes of it depends on the program, on the shapes of its arguments, on these sources and on JAX alone.
+"""
+
+import hashlib
+from collections.abc import Callable
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import jax
+import numpy as np
+from jax import export
+
+from vijax.runtime import xla
+from vijax.runtime.files import replacing
+
+# Distributions whose code a trace goes through, down to those that jax and diffrax stand on.
+TRACED_BY = (
+    "diffrax",
+    "equinox",
+    "jax",
+    "jaxlib",
+    "jaxtyping",
+    "lineax",
+    "ml_dtypes",
+    "numpy",
+    "opt_einsum",
+    "optimistix",
+)
+_PACKAGE = Path(__file__).parents[1]
+_DIGEST = hashlib.sha256
+
+
+class Program:
+    """A function of pytrees of arrays to one array, compiled for every shape of its arguments, as `jax.jit` does.
+
+    Where JAX keeps compiled programs (`jax_compilation_cache_dir`), its traced form is kept, too.
+
+    Args:
+        work: The function.
+        name: What it depends on besides its arguments, as text that is the same in every process.
+    """
+
+    def __init__(self, work: Callable[..., jax.Array], name: str):
+        self._work, self._name = work, name
+        self._compiled: dict[Any, Callable[..., jax.Array]] = {}
+        self._lock = Lock()
+
+    def __call__(self, *args: Any) -> jax.Array:
+        """What the function returns, by the program for arguments of these shapes."""
+        leaves, tree = jax.tree.flatten(args)
+        platform = next(iter(leaves[0].devices())).platform
+        shapes = tuple((np.shape(x), str(x.dtype)) for x in leaves)
+        key = platform, tree, shapes
+        with self._lock:
+            if key not in self._compiled:
+                self._compiled[key] = self._jitted(platform, tree, leaves, f"{self._name} {key}")
+        return self._compiled[key](*leaves)
+
+    def _jitted(self, platform: str, tree: Any, leaves: list[Any], name: str) -> Callable[..., jax.Array]:
+        def flat(*leaves):
+            return self._work(*jax.tree.unflatten(tree, leaves))
+
+        options, folder = xla.compiler_options(), cache_folder()
+        if folder is None:
+            return jax.jit(flat, compiler_options=options)
+        path = folder / f"traced-{_DIGEST(f'{name} {_sources()}'.encode()).hexdigest()}"
+        known = _read(path)
+        if known is None:
+            known = export.export(jax.jit(flat), platforms=[platform])(*leaves)
+            _write(path, known.serialize())
+        return jax.jit(known.call, compiler_options=options)
+
+
+def cache_folder() -> Path | None:
+    """Where compiled programs are kept, if they are, on a disk."""
+    asked = jax.config.values
+    folder = asked["jax_compilation_cache_dir"] if asked["jax_enable_compilation_cache"] else None
+    return Path(folder) if folder and "://" not in folder else None
+
+
+@lru_cache(maxsize=1)
+def _sources(package: Path = _PACKAGE) -> str:
+    """Digest of what tracing depends on: this package with all its folders, and those that trace it."""
+    digest = _DIGEST(" ".join(map(version, TRACED_BY)).encode())
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> export.Exported | None:
+    """The program there, if it is there and whole."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    size = _DIGEST().digest_size
+    whole = _DIGEST(content[size:]).digest() == content[:size]
+    return export.deserialize(bytearray(content[size:])) if whole else None
+
+
+def _write(path: Path, content: bytes | bytearray) -> None:
+    """Keep a program; where nothing can be written, the next process traces it again."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as part:
+            part.write_bytes(_DIGEST(content).digest() + content)
+    except OSError:
+        return
