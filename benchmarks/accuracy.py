@@ -46,7 +46,7 @@ from vijax.orbits.steady import Steady, find, response
 from vijax.runtime import tiles
 
 TESTS = Path(__file__).parent.parent / "tests"
-sys.path.insert(0, str(TESTS))
+sys.path[:0] = [str(TESTS), str(TESTS / "engine"), str(TESTS / "batch")]
 
 import helpers  # noqa: E402  the tests' arithmetic
 import test_exact  # noqa: E402

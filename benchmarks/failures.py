@@ -6,8 +6,8 @@
     python benchmarks/failures.py --plot stability.png  # the stability map as a picture
 
 One block a scene: what goes wrong, each figure by the usual method and by vijax, and the answer. The test of a scene
-has its name: tests/test_failures.py::test_stability asserts of the quick figures that the usual method fails there and
-that vijax does not. Figures are measured by this command and by nothing else; timings are not among them.
+has its name: tests/benchmarks/test_failures.py::test_stability asserts of the quick figures that the usual method fails
+there and that vijax does not. Figures are measured by this command and by nothing else; timings are not among them.
 Printout for two scenes, usual method and vijax side by side:
 
     gradients: differentiating through `where` drops the jump: the error stays at any step

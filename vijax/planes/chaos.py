@@ -125,7 +125,7 @@ def survival(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
 
-    Source: `tests/test_chaos.py` recovers a known lifetime.
+    Source: `tests/planes/test_chaos.py` recovers a known lifetime.
     """
     import xarray as xr  # here, as importing vijax must not load it
 

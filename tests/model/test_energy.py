@@ -25,7 +25,7 @@ from vijax.model.energy import (
 )
 from vijax.model.pair import impact_pair
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 DEVICE = Harvester()  # one unit of u is a metre, one of u' a metre per second
 ORBITS = json.loads((DATA / "gradients.json").read_text())["orbits"]
 

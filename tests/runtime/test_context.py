@@ -23,7 +23,7 @@ from vijax.model import pair as pairs
 from vijax.model.pair import membrane_pair
 from vijax.orbits import continuation, motion, periodic
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SETTINGS = {
     "jax_enable_x64": False,
     "jax_debug_nans": True,

@@ -17,7 +17,7 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.planes.sweep import sweep
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 PLANE = json.loads((DATA / "plane_cells.json").read_text())["cells"]
 ORBITS = json.loads((DATA / "gradients.json").read_text())["orbits"]
 DEVICE = Harvester()

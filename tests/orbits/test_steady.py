@@ -140,7 +140,7 @@ def test_a_record_prints_its_status_by_name_and_what_to_do():
 @pytest.fixture(scope="module")
 def pressed():
     """Period-1 orbits that end a chatter pressed on a wall, through a contact of many turning points."""
-    rows = json.loads((Path(__file__).parent / "data" / "long_contacts.json").read_text())
+    rows = json.loads((Path(__file__).parents[1] / "data" / "long_contacts.json").read_text())
     width = 16
     pair = impact_pair(*(np.array([row[name] for row in rows]) for name in ("d", "kappa", "r", "gamma")))
     side, knots = np.zeros((len(rows), width), np.int32), np.zeros((len(rows), width, 3))

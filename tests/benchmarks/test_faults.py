@@ -60,7 +60,7 @@ def is_undisturbed(path):
     assert not list(Path(path).rglob("*.part*"))
 
 
-CHILD = "import sys; sys.path[:0] = sys.argv[1:3]; import test_faults; test_faults.child(sys.argv[3:])"
+CHILD = "import sys; sys.path[:0] = sys.argv[1:4]; import test_faults; test_faults.child(sys.argv[4:])"
 
 
 def child(arguments):
@@ -71,7 +71,7 @@ def child(arguments):
 
 
 def started(folder):
-    paths = [str(SCRIPTS), str(Path(__file__).parent)]
+    paths = [str(SCRIPTS), *map(str, Path(__file__).parents[:2])]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([sys.executable, "-c", CHILD, *paths, *ARGUMENTS], cwd=folder, **pipes)
 

@@ -4,12 +4,13 @@ import sys
 from functools import partial
 from io import StringIO
 from itertools import islice
-from pathlib import Path
 
 import command
+import doors
 import grid as script
 import jax
 import jax.numpy as jnp
+import malformed
 import numpy as np
 import pytest
 
@@ -17,11 +18,6 @@ import vijax
 from vijax.planes import estimate, sweep
 from vijax.planes.axes import parse_axis
 from vijax.runtime import checks
-
-sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))  # after the scripts, some of which it has too
-
-import doors
-import malformed
 
 CALLS = list(islice(doors.TABLES["calls"](), 7, None, 23))
 LINES = list(islice(doors.TABLES["lines"](), 5, None, 13))

@@ -10,7 +10,7 @@ from paper import claims, evidence, figures
 from paper.cached import diagram
 from paper.captions import RIGID, Source
 
-REFERENCE = {c["id"]: c for c in json.loads((Path(__file__).parent / "data" / "claims.json").read_text())}
+REFERENCE = {c["id"]: c for c in json.loads((Path(__file__).parents[1] / "data" / "claims.json").read_text())}
 
 
 def test_every_claim_of_reference_is_checked():

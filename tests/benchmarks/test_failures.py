@@ -1,19 +1,13 @@
 """Where methods fail: the quick figures of `benchmarks/failures.py`; the usual method is wrong, and vijax is not."""
 
 import math
-import sys
 from functools import cache
-from pathlib import Path
 
+import charts
+import failures
 import matplotlib.image
 import numpy as np
 import pytest
-
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-sys.path.insert(0, str(BENCHMARKS))
-
-import charts  # noqa: E402
-import failures  # noqa: E402
 
 
 @cache

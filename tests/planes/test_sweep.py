@@ -441,7 +441,7 @@ def test_a_transient_is_dropped_before_a_window_alone():
 
 
 def test_cells_of_the_reference_plane():
-    reference = json.loads((Path(__file__).parent / "data" / "plane_cells.json").read_text())["cells"]
+    reference = json.loads((Path(__file__).parents[1] / "data" / "plane_cells.json").read_text())["cells"]
     quick = [cell for cell in reference if cell["p"] > 0 and cell["converged_after"] < LONG / 2][:8]
     for cell in quick:
         found = sweep(periods=LONG, **{name: cell[name] for name in ("d", "kappa", "r", "gamma", "u0", "v0")})

@@ -15,7 +15,7 @@ from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 
-CLAIMS = {c["id"]: c for c in json.loads((Path(__file__).parent / "data" / "claims.json").read_text())}
+CLAIMS = {c["id"]: c for c in json.loads((Path(__file__).parents[1] / "data" / "claims.json").read_text())}
 TABLE_2 = Harvester()
 STARTS = [(u, v) for u in (-0.04, 0.0, 0.04) for v in (-0.6, -0.47898, -0.3, 0.3, 0.5)]
 TILE = 256

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from charts import work_precision
 
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 EXACT = 1e-14  # worst measured: 2e-16
 PER_STEP = 5.0  # least gain of a hundredth of the tolerance
 
