@@ -7,6 +7,7 @@ export PATH="$PWD/.venv/bin:$PATH"
 python -m pip install --quiet --constraint constraints.txt --editable '.[test]'
 ruff check .
 ruff format --check .
+lint-imports
 # Types are checked beside the tests, which leave a core idle as they begin and end; what mypy says comes last.
 (mypy && mypy benchmarks) >.venv/types.txt 2>&1 &
 types=$!

@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
@@ -17,9 +18,6 @@ FOLDERS = ("vijax", "scripts", "benchmarks", "tests")
 SOURCES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 PUBLIC = [path for path in SOURCES if ROOT / "tests" not in path.parents]
 PACKAGE = [path for path in SOURCES if ROOT / "vijax" in path.parents]
-
-# Folders from the bottom up; two on one floor do not know each other.
-FLOORS = (("runtime",), ("model",), ("engine",), ("batch",), ("planes", "orbits"), ("design",), ("plots",))
 
 # Heavy packages, and the files (or folders) that alone may import them.
 ONLY_IN = {
@@ -45,12 +43,17 @@ def name(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def test_folders_import_downwards():
-    floor = {f"vijax.{folder}": height for height, folders in enumerate(FLOORS) for folder in folders}
-    found = house.folders(house.rooms())
-    assert set(found) == set(floor)
-    upwards = [(folder, other) for folder, below in found.items() for other in below if floor[other] >= floor[folder]]
-    assert not upwards
+def test_the_readme_says_of_every_folder_what_it_says_itself():
+    """That imports point downwards is held by import-linter, by the contract in pyproject.toml."""
+    said = {}
+    for path in sorted((ROOT / "vijax").glob("*/__init__.py")):
+        parsed = tree(path)
+        assert not parsed.body[1:], f"{name(path)} must hold a docstring and nothing else"
+        said[path.parent.name] = " ".join((ast.get_docstring(parsed) or "").split())
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert dict(re.findall(r"^\| `vijax/(\w+)/` \| (.*) \|$", readme, re.M)) == said
+    layers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+    assert f"`{' > '.join(layer for layer in layers if layer[0] != '(')}`" in readme
 
 
 def test_the_house_is_small_enough_to_know():
