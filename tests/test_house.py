@@ -142,10 +142,10 @@ def test_no_file_names_a_path_of_one_machine():
     assert not [f"{name(path)}: {line.strip()}" for path, line in lines if MACHINE_PATH.search(line)]
 
 
-def fresh_import() -> tuple[float, list[str]]:
-    """Seconds of one core that `import vijax` takes in a new process, and the top-level packages it loads."""
+def fresh_import(what: str = "vijax") -> tuple[float, list[str]]:
+    """Seconds of one core that an import takes in a new process, and the top-level packages it loads."""
     code = (
-        "import json, sys, time; start = time.process_time(); import vijax; seconds = time.process_time() - start; "
+        f"import json, sys, time; start = time.process_time(); import {what}; seconds = time.process_time() - start; "
         "print(json.dumps([seconds, sorted({name.split('.')[0] for name in sys.modules})]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -157,6 +157,12 @@ def test_import_loads_nothing_heavy():
     _, packages = fresh_import()
     assert "vijax" in packages
     assert not set(NOT_AT_IMPORT) & set(packages)
+
+
+def test_what_a_picture_needs_is_known_without_matplotlib():
+    """A sweep asks before its run whether its map can be drawn."""
+    _, packages = fresh_import("vijax.plots.style")
+    assert "matplotlib" not in packages
 
 
 def test_import_is_quick():
