@@ -12,7 +12,7 @@ from vijax.batch.cell import Plan, Settings
 from vijax.model.device import Harvester
 from vijax.runtime import xla
 
-CELLS, TRIPS = 2048, 60
+CELLS, STEPS = 2048, 60
 PLAN = Plan(
     until="window",
     stepping=None,
@@ -36,7 +36,7 @@ SETTINGS = Settings(
 
 @pytest.fixture(scope="module")
 def declined():
-    """Cells after many trips and no service, of those that declined; the sampled and the careful answers to them."""
+    """Cells after many steps and no service, of those that declined; the sampled and the careful answers to them."""
     rng = np.random.default_rng(8)
     one = np.ones(CELLS)
     d, kappa = rng.uniform(0.05, 0.3, CELLS), np.exp(rng.uniform(np.log(3), np.log(400), CELLS))
@@ -45,7 +45,7 @@ def declined():
     @partial(jax.jit, compiler_options=xla.compiler_options())
     def work(rows):
         fresh = simulate._load(PLAN, SETTINGS, rows)
-        cell = jax.lax.fori_loop(0, TRIPS, lambda _, cell: advance.trip(PLAN, SETTINGS, cell), fresh)
+        cell = jax.lax.fori_loop(0, STEPS, lambda _, cell: advance.step(PLAN, SETTINGS, cell), fresh)
         request = advance.request(PLAN, SETTINGS, cell)
         return cell, advance.sampled_answer(PLAN, request), advance.careful_answer(PLAN, request)
 

@@ -44,7 +44,7 @@ def wants_care(left, kind):
     return ((kind == DECLINES) & (left % 3 == 0)) | ((kind == HARD) & (left % 5 == 0))
 
 
-def trip(toy):
+def step(toy):
     active = (toy.left > 0) & ~toy.declined & ~toy.done
     asks = active & wants_care(toy.left, toy.kind)
     moves = active & ~asks
@@ -95,7 +95,7 @@ def review(toy):
 
 PROGRAM = lanes.Program(
     load=load,
-    trip=trip,
+    step=step,
     review=review,
     stopped=lambda toy: toy.left <= 0,
     done=lambda toy: toy.done,

@@ -1,4 +1,4 @@
-"""One trip of every lane: the quick or the sampled step, with a service for what they decline; or a solver step."""
+"""One step of every lane: the quick or the sampled step, with a service for what they decline; or a solver step."""
 
 from functools import partial
 from importlib import import_module
@@ -24,7 +24,7 @@ _FOR_EVER = 1e7  # half periods
 _STEPS = 20_000  # steps per period before a cell of a stepping engine is stopped
 
 
-def trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """One impact of every lane: by the quick step on level cells, by certified sampling with gravity."""
     pair, ball = cell.pair, cell.ball
     arrival = None
@@ -41,7 +41,7 @@ def trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     hard = cell.hard | declined if not plan.level else cell.hard  # sampling will not do better a second time
     cell = eqx.tree_at(lambda c: (c.declined, c.hard), cell, (cell.declined | declined, hard))
     if knows_arrival(plan):
-        # A lane that is declined stays where it is: until it is served every trip finds the same arrival.
+        # A lane that is declined stays where it is: until it is served every step finds the same arrival.
         cell = eqx.tree_at(lambda c: c.arrival, cell, arrival)
     return fold(plan, settings, cell, event)
 
@@ -153,7 +153,7 @@ def set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Lanes, held:
     return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
 
 
-def stepping_trip(plan: Plan, settings: Settings, cell: Cell) -> Cell:
+def solver_step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """One solver step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
     old = cell.course
     step = partial(_stepping(plan).step, settings.method)

@@ -125,7 +125,7 @@ class Cell(eqx.Module):
     running: Mask
     declined: Mask
     hard: Mask  # declined by sampling too
-    arrival: Arrival | None  # the end of the flight as the last trip found it
+    arrival: Arrival | None  # the end of the flight as the last step found it
     done: Mask
     status: Int[Array, "lane"]
     count: Lane  # impacts so far

@@ -1,12 +1,15 @@
 """Run N independent cells on L lanes in one compiled loop of fixed shape; finished lanes take waiting cells.
 
-Knows no physics: a `Program` says what a cell is, what one quick trip does to every lane at once, and what the rare
-lane that declines needs instead. Memory is set by L and by the rows that go in and come out.
+Knows no physics: a `Program` says what a cell is, what one quick step does to every lane at once, and what the rare
+lane that declines it needs instead. Memory is set by L and by the rows that go in and come out.
+
+Begin with `run`: refill, round, until nothing is left. A round (`_round`) is some quick steps of all lanes (`_steps`),
+then the service of those that declined one (`_serve`), then the review of those that have stopped.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,19 +18,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.runtime.xla import in_blocks, kernel, put, share, whole_blocks
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
 
-Step = Callable[..., Any]
-"""A function of the loop, on arrays."""
-
-TRIPS = 8  # quick trips between two rounds of serving, reviewing and refilling
-_CHAIN_TRIPS = 4  # likewise, where lanes are few and a lane that waits holds up its chain
+STEPS = 8  # quick steps between two rounds of serving, reviewing and refilling
+_CHAIN_STEPS = 4  # likewise, where lanes are few and a lane that waits holds up its chain
 _SHARE, _FEWEST = 32, 16  # one lane in so many is served or refilled together: a larger batch keeps slow cells waiting
 
 
 class Service(NamedTuple):
-    """What becomes of lanes that a trip declined; every function works on a whole batch of lanes, row by row.
+    """What becomes of lanes that declined a step; every function works on a whole batch of lanes, row by row.
 
     Attributes:
         declined, hard: Carry -> which lanes are; a hard lane needs the careful try.
@@ -50,16 +53,16 @@ class Program(NamedTuple):
 
     Attributes:
         load: Rows of the cell table -> fresh carry.
-        trip: Carry -> carry after one trip; it may decline lanes where there is a service.
-        review: Carry -> carry; what is too slow for every trip: decisions, ends.
+        step: Carry -> carry after one step; it may decline lanes where there is a service.
+        review: Carry -> carry; what is too slow for every step: decisions, ends.
         stopped, done: Carry -> which lanes are; a stopped lane waits for review.
         unload: Carry -> rows of the result table.
-        service: For the rare lane that a trip declines.
+        service: For the rare lane that declines a step.
         arithmetic: Whether all of it may be put in kernels, see `xla.kernel`.
     """
 
     load: Callable[[Float[Array, "row in"]], Carry]
-    trip: Callable[[Carry], Carry]
+    step: Callable[[Carry], Carry]
     review: Callable[[Carry], Carry]
     stopped: Callable[[Carry], Bool[Array, "lane"]]
     done: Callable[[Carry], Bool[Array, "lane"]]
@@ -67,13 +70,9 @@ class Program(NamedTuple):
     service: Service | None = None
     arithmetic: bool = True
 
-
-class _Queue(NamedTuple):
-    """The loop's state: lanes, the cell each one works on (-1: idle), the next cell to start."""
-
-    carry: Carry
-    cell: Int[Array, "lane"]
-    waiting: Int[Array, ""]
+    def kernel(self, work: Callable[P, T]) -> Callable[P, T]:
+        """The function as one kernel, if all of the program may be put in kernels."""
+        return kernel(work) if self.arithmetic else work
 
 
 class _Batch(NamedTuple):
@@ -113,80 +112,108 @@ def choose(mask: Bool[Array, "lane"], new: Carry, old: Carry) -> Carry:
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
-def _maker(program: Program) -> Callable[[Step], Step]:
-    """What every step of the loop goes through before it is called."""
-    return kernel if program.arithmetic else lambda step: step
+class _AtWork(NamedTuple):
+    """The lanes: the cell each one works on (-1: idle), and where that cell is."""
+
+    cell: Int[Array, "lane"]
+    carry: Carry
 
 
-def _worker(program: Program, width: int, trips: int) -> Callable[[Int[Array, "lane"], Carry], Carry]:
-    """One round of trips, service and review, of the lanes that have a cell.
+def _declined(program: Program, at: _AtWork) -> Bool[Array, "lane"]:
+    return program.service.declined(at.carry) & (at.cell >= 0) if program.service else jnp.zeros_like(at.cell, bool)
+
+
+def _able(program: Program, at: _AtWork) -> Int[Array, ""]:
+    """How many lanes the next step would move."""
+    return ((at.cell >= 0) & ~_declined(program, at) & ~program.stopped(at.carry)).sum()
+
+
+def _round(program: Program, width: int, steps: int, at: _AtWork) -> Carry:
+    """One round of the lanes that have a cell: steps, service, review.
 
     Args:
         program: What a cell is.
         width: How many lanes are served together.
-        trips: Most trips of a round.
+        steps: Most steps of a round.
+        at: The lanes.
     """
-    service, made = program.service, _maker(program)
+    carry = program.kernel(partial(_steps, program, steps))(*at)
+    if service := program.service:
+        due = program.kernel(partial(_service_due, program, service, width))
+        serve = partial(_serve, program, service, width)
+        carry = lax.while_loop(partial(due, at.cell), partial(serve, at.cell), carry)
+    return program.kernel(program.review)(carry)
 
-    def declined(cell, carry):
-        return service.declined(carry) & (cell >= 0) if service else jnp.zeros_like(cell, bool)
 
-    def able(cell, carry):
-        return ((cell >= 0) & ~declined(cell, carry) & ~program.stopped(carry)).sum()
+def _steps(program: Program, most: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+    """Up to so many steps; fewer once half the lanes that set out wait for something else."""
 
-    @made
-    def to_serve(cell, carry):
-        """Whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
-        asking, hard = declined(cell, carry), service.hard(carry)
-        full = ((asking & ~hard).sum() >= width) | ((asking & hard).sum() >= width)
-        return full | (asking.any() & (asking.sum() >= able(cell, carry)))
+    def some_steps(at: _AtWork) -> _AtWork:
+        at_first = _able(program, at)
 
-    @made
-    def ask(cell, carry):
-        """Whose turn it is, easy lanes or hard ones, and their requests."""
-        asking, hard = declined(cell, carry), service.hard(carry)
-        easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
-        batch = _first(asking & (hard != easy), width)
-        return easy, batch, _take(service.request(carry), batch.members)
+        def goes_on(state):
+            step, at = state
+            return (step < most) & (2 * _able(program, at) > at_first)
 
-    @made
-    def settle(carry, answers, batch):
-        blank = jax.tree.map(lambda leaf: jnp.zeros((batch.chosen.size, *leaf.shape[1:]), leaf.dtype), answers)
-        return service.settle(carry, put(blank, answers, batch.members, batch.real), batch.chosen)
+        def one(state):
+            step, at = state
+            return step + 1, at._replace(carry=program.step(at.carry))
 
-    def serve(cell, carry):
-        """A second try for easy lanes together, or the careful one for hard lanes."""
-        easy, batch, requests = ask(cell, carry)
-        if service.second is None:
-            answers = made(service.careful)(requests)
-        else:
-            answers = lax.cond(easy, made(service.second), made(service.careful), requests)
-        return settle(carry, answers, batch)
+        return lax.while_loop(goes_on, one, (0, at))[1]
 
-    def keeps_on(at_first, state):
-        """Up to so many trips, fewer once half the lanes that set out wait for something else."""
-        trip, (cell, carry) = state
-        return (trip < trips) & (2 * able(cell, carry) > at_first)
+    return in_blocks(some_steps, _AtWork(cell, carry)).carry
 
-    def one_trip(state):
-        trip, (cell, carry) = state
-        return trip + 1, (cell, program.trip(carry))
 
-    def some_trips(at_work):
-        going = partial(keeps_on, able(*at_work))
-        return lax.while_loop(going, one_trip, (0, at_work))[1]
+def _service_due(
+    program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
+) -> Bool[Array, ""]:
+    """Whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
+    at = _AtWork(cell, carry)
+    asking, hard = _declined(program, at), service.hard(carry)
+    full = ((asking & ~hard).sum() >= width) | ((asking & hard).sum() >= width)
+    return full | (asking.any() & (asking.sum() >= _able(program, at)))
 
-    @made
-    def all_trips(cell, carry):
-        return in_blocks(some_trips, (cell, carry))[1]
 
-    def round_trip(cell, carry):
-        carry = all_trips(cell, carry)
-        if service:
-            carry = lax.while_loop(partial(to_serve, cell), partial(serve, cell), carry)
-        return made(program.review)(carry)
+def _serve(program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+    """Give a batch of easy lanes their second try, or a batch of hard ones the careful try."""
+    easy, batch, requests = program.kernel(partial(_ask, program, service, width))(cell, carry)
+    careful = program.kernel(service.careful)
+    if service.second is None:
+        answers = careful(requests)
+    else:
+        answers = lax.cond(easy, program.kernel(service.second), careful, requests)
+    return program.kernel(partial(_settle, service))(carry, answers, batch)
 
-    return round_trip
+
+def _ask(
+    program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
+) -> tuple[Bool[Array, ""], _Batch, Any]:
+    """Whose turn it is, easy lanes or hard ones, and their requests."""
+    asking, hard = _declined(program, _AtWork(cell, carry)), service.hard(carry)
+    easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
+    batch = _first(asking & (hard != easy), width)
+    return easy, batch, _take(service.request(carry), batch.members)
+
+
+def _settle(service: Service, carry: Carry, answers: Any, batch: _Batch) -> Carry:
+    """The lanes with the answers of those that were served."""
+    blank = jax.tree.map(lambda leaf: jnp.zeros((batch.chosen.size, *leaf.shape[1:]), leaf.dtype), answers)
+    return service.settle(carry, put(blank, answers, batch.members, batch.real), batch.chosen)
+
+
+class _Queue(NamedTuple):
+    """The loop's state: the lanes, the next cell to start, the results so far."""
+
+    at: _AtWork
+    waiting: Int[Array, ""]
+    results: Float[Array, "cell out"]
+
+
+class _Table(NamedTuple):
+    """The cells of a run, one row of parameters each, and how many of them are real."""
+
+    cells: Float[Array, "cell in"]
+    real: Int[Array, ""]
 
 
 def run(
@@ -206,53 +233,62 @@ def run(
     LLVM makes several loops of one, of whole vectors and of what is left, and fuses multiplications and additions in
     each as it sees fit.
     """
-    lanes, made = whole_blocks(lanes), _maker(program)
+    lanes, table = whole_blocks(lanes), _Table(cells, count)
     width = min(max(lanes // _SHARE, _FEWEST), lanes)
-    round_trip = _worker(program, width, TRIPS)
 
-    def free(queue: _Queue) -> Bool[Array, "lane"]:
-        """Lanes whose cell is done, or that wait for their first."""
-        return jnp.where(queue.cell >= 0, program.done(queue.carry), queue.waiting < count)
+    def refill_and_round(queue: _Queue) -> _Queue:
+        queue = _refill(program, table, width, queue)
+        return queue._replace(at=queue.at._replace(carry=_round(program, width, STEPS, queue.at)))
 
-    @made
-    def exchange(queue: _Queue) -> tuple[_Queue, Int[Array, "width"], Float[Array, "width out"]]:
-        """Lanes with new cells, and rows of the result table for those that were done; no cell: past its end."""
-        batch = _first(free(queue), width)
-        rows = queue.cell[batch.members]
-        rows = jnp.where((jnp.arange(width, dtype=jnp.int32) < batch.real) & (rows >= 0), rows, cells.shape[0])
-        found = program.unload(_take(queue.carry, batch.members))
-        start = queue.waiting + jnp.arange(width, dtype=jnp.int32)
-        fresh = program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]), jnp.where(start < count, start, -1)
-        carry, cell = put((queue.carry, queue.cell), fresh, batch.members, batch.real)
-        return _Queue(carry, cell, queue.waiting + batch.real), rows, found
+    def goes_on(queue: _Queue) -> Bool[Array, ""]:
+        return (queue.at.cell >= 0).any() | (queue.waiting < count)
 
-    def refill(state: tuple[_Queue, Float[Array, "cell out"]]) -> tuple[_Queue, Float[Array, "cell out"]]:
-        queue, results = state
-        queue, rows, found = exchange(queue)
-        return queue, results.at[rows].set(found, mode="drop")
+    return lax.while_loop(goes_on, refill_and_round, _all_waiting(program, table, outputs, lanes)).results
 
-    @made
-    def to_refill(queue: _Queue) -> Bool[Array, ""]:
-        # With cells waiting a refill is worth its price only for several lanes; at the end nobody waits for it.
-        enough = jnp.where(queue.waiting < count, width, 1)
-        return free(queue).sum() >= enough
 
-    def advance(state: tuple[_Queue, Float[Array, "cell out"]]) -> tuple[_Queue, Float[Array, "cell out"]]:
-        queue, results = lax.while_loop(lambda s: to_refill(s[0]), refill, state)
-        return queue._replace(carry=round_trip(queue.cell, queue.carry)), results
-
-    def goes_on(state):
-        queue, _ = state
-        return (queue.cell >= 0).any() | (queue.waiting < count)
-
-    # Every cell is loaded by `refill`, the first ones too; until then its lane holds zeros.
-    fresh = jax.eval_shape(program.load, jax.ShapeDtypeStruct((lanes, cells.shape[1]), cells.dtype))
-    queue = _Queue(
-        carry=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh),
-        cell=jnp.full(lanes, -1, jnp.int32),
+def _all_waiting(program: Program, table: _Table, outputs: int, lanes: int) -> _Queue:
+    """The queue before the first cell is loaded: `_refill` loads the first ones too, until then lanes hold zeros."""
+    fresh = jax.eval_shape(program.load, jax.ShapeDtypeStruct((lanes, table.cells.shape[1]), table.cells.dtype))
+    return _Queue(
+        _AtWork(jnp.full(lanes, -1, jnp.int32), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh)),
         waiting=jnp.asarray(0, jnp.int32),
+        results=jnp.zeros((table.cells.shape[0], outputs), table.cells.dtype),
     )
-    return lax.while_loop(goes_on, advance, (queue, jnp.zeros((cells.shape[0], outputs), cells.dtype)))[1]
+
+
+def _refill(program: Program, table: _Table, width: int, queue: _Queue) -> _Queue:
+    """Write down the cells that are done and load waiting ones, a batch at a time, while that is worth its price."""
+    due = program.kernel(partial(_refill_due, program, table, width))
+    exchange = program.kernel(partial(_exchange, program, table, width))
+
+    def one_batch(queue: _Queue) -> _Queue:
+        at, waiting, rows, found = exchange(queue.at, queue.waiting)
+        return _Queue(at, waiting, queue.results.at[rows].set(found, mode="drop"))
+
+    return lax.while_loop(lambda queue: due(queue.at, queue.waiting), one_batch, queue)
+
+
+def _free(program: Program, table: _Table, at: _AtWork, waiting: Int[Array, ""]) -> Bool[Array, "lane"]:
+    """Lanes whose cell is done, or that wait for their first."""
+    return jnp.where(at.cell >= 0, program.done(at.carry), waiting < table.real)
+
+
+def _refill_due(program: Program, table: _Table, width: int, at: _AtWork, waiting: Int[Array, ""]) -> Bool[Array, ""]:
+    # With cells waiting a refill is worth its price only for several lanes; at the end nobody waits for it.
+    enough = jnp.where(waiting < table.real, width, 1)
+    return _free(program, table, at, waiting).sum() >= enough
+
+
+def _exchange(program: Program, table: _Table, width: int, at: _AtWork, waiting: Int[Array, ""]):
+    """Lanes with new cells, and rows of the result table for those that were done; no cell: past its end."""
+    cells, count = table.cells, table.real
+    batch = _first(_free(program, table, at, waiting), width)
+    rows = at.cell[batch.members]
+    rows = jnp.where((jnp.arange(width, dtype=jnp.int32) < batch.real) & (rows >= 0), rows, cells.shape[0])
+    found = program.unload(_take(at.carry, batch.members))
+    start = waiting + jnp.arange(width, dtype=jnp.int32)
+    fresh = _AtWork(jnp.where(start < count, start, -1), program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]))
+    return put(at, fresh, batch.members, batch.real), waiting + batch.real, rows, found
 
 
 class _Chains(NamedTuple):
@@ -284,7 +320,6 @@ def chain(
     at it: all that decline are served together, and at once.
     """
     lanes, most, _ = links.shape
-    round_trip = _worker(program, lanes, _CHAIN_TRIPS)
     lane = jnp.arange(lanes, dtype=jnp.int32)
 
     def ended(state: _Chains) -> Bool[Array, "lane"]:
@@ -304,7 +339,7 @@ def chain(
     def advance(state: _Chains) -> _Chains:
         due = ended(state).any()
         state = lax.cond(due, pass_on, lambda state: state, state)
-        return state._replace(carry=round_trip(state.link, state.carry))
+        return state._replace(carry=_round(program, lanes, _CHAIN_STEPS, _AtWork(state.link, state.carry)))
 
     start = _Chains(
         carry=program.load(links[:, 0]),

@@ -80,7 +80,7 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
     program = lanes.Program(
         load=partial(_load, plan, settings),
-        trip=partial(advance.stepping_trip if plan.stepping else advance.trip, plan, settings),
+        step=partial(advance.solver_step if plan.stepping else advance.step, plan, settings),
         review=partial(advance.stepping_review if plan.stepping else review, plan, settings),
         stopped=lambda cell: ~cell.running,
         done=lambda cell: cell.done,

@@ -29,7 +29,7 @@ _CPU_OPTIONS = {
 }
 _STAYS = {"inlineable": "false"}  # a call that XLA does not see through
 _ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
-_BLOCK = 64  # lanes: what a trip stores of them stays in the first cache; with 32 LLVM runs out of registers
+_BLOCK = 64  # lanes: what a step stores of them stays in the first cache; with 32 LLVM runs out of registers
 
 once = jax.jit
 """Marks a building block that one program contains many times: tracing it once and reusing the trace cuts the time
