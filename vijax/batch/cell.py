@@ -53,6 +53,25 @@ class Settings(eqx.Module):
     keep: Float[Array, ""] | None = None  # chained: periods at the end whose impacts are wanted
 
 
+class Entry(eqx.Module):
+    """What a run is told of a cell.
+
+    Attributes:
+        pair: Its parameters.
+        length, speed: SI sizes of its units.
+        u, v: Its start; of a chained cell how displacement and velocity grow from the last cell's units to its own,
+            until the state that it is handed stands there.
+        t: Phase of the start; None where every cell starts at phase 0.
+    """
+
+    pair: ImpactPair
+    length: Lane
+    speed: Lane
+    u: Lane
+    v: Lane
+    t: Lane | None
+
+
 class Tally(eqx.Module):
     """Sums over the impacts of a window or of one round of a candidate orbit."""
 

@@ -8,12 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from vijax.batch import advance, chain, lanes
+from vijax.batch import advance, chain, lanes, rows
 from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence, review, settled
-from vijax.batch.cell import TRANSIENT_SHARE, Cell, Plan, Settings, blank_tally
-from vijax.batch.summary import Summary, columns, pack, unload, unpack
+from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
+from vijax.batch.summary import Summary, shapes, unload
 from vijax.engine import exact, quick
 from vijax.engine.method import Method, Ode
 from vijax.engine.quick import Lanes
@@ -41,13 +41,12 @@ class Scale(eqx.Module):
     speed_variant: Float[Array, "variant"]
 
 
-def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell:
-    """Fresh cells from rows (d, kappa, r, gamma, length, speed, u0, v0) and, of chained cells, the phase t0."""
-    d, kappa, r, gamma, length, speed, u, v, *phase = rows.T
-    pair = ImpactPair(d, None if plan.rigid else kappa, r, gamma)
+def _load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
+    """Fresh cells."""
+    pair, d = entry.pair, entry.pair.d
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
-    ball = Lanes(u, v, phase[0] if phase else zero, zero)
-    held = exact.start_mode(pair, u, v, ball.t)
+    ball = Lanes(entry.u, entry.v, zero if entry.t is None else entry.t, zero)
+    held = exact.start_mode(pair, ball.u, ball.v, ball.t)
     start = settings.transient + zero
     eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None
     attractor = plan.until == "attractor"
@@ -55,8 +54,8 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
         pair=pair,
         wall=quick.prepare(pair) if plan.level and plan.stepping is None else None,
         course=advance.set_off(plan, settings, pair, ball, held) if plan.stepping else None,
-        length=length,
-        speed=speed,
+        length=entry.length,
+        speed=entry.speed,
         ball=ball,
         held=held,
         running=~no,
@@ -77,14 +76,22 @@ def _load(plan: Plan, settings: Settings, rows: Float[Array, "lane in"]) -> Cell
     )
 
 
+def _entry(plan: Plan, dtype: Any) -> Entry:
+    """What a run is told of a cell, as shapes."""
+    one: Any = jax.ShapeDtypeStruct((1,), dtype)
+    pair = ImpactPair(one, None if plan.rigid else one, one, one)
+    return Entry(pair, length=one, speed=one, u=one, v=one, t=one if plan.chained else None)
+
+
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
+    entry = _entry(plan, settings.periods.dtype)
     program = lanes.Program(
-        load=partial(_load, plan, settings),
+        load=lambda table: _load(plan, settings, rows.unpack(table, entry)),
         step=partial(advance.solver_step if plan.stepping else advance.step, plan, settings),
         review=partial(advance.stepping_review if plan.stepping else review, plan, settings),
         stopped=lambda cell: ~cell.running,
         done=lambda cell: cell.done,
-        unload=lambda cell: pack(unload(plan, settings, cell)),
+        unload=lambda cell: rows.pack(unload(plan, settings, cell)),
         arithmetic=settings.method is None or settings.method.arithmetic,
     )
     if plan.stepping:
@@ -106,7 +113,8 @@ def _compiled(plan: Plan, width: int) -> export_cache.Program:
     """The program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
-        return lanes.run(_program(plan, settings), cells, count, columns(plan), width)
+        outputs = rows.width(shapes(plan, cells.dtype))
+        return lanes.run(_program(plan, settings), cells, count, outputs, width)
 
     return export_cache.Program(tile, f"{tile.__qualname__} {plan} {width}")
 
@@ -203,8 +211,7 @@ def summarise(
         tangent=until == "attractor" or "lyapunov" in outputs,
         variants=scale.length_variant.shape[0],
     )
-    kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
-    cells = jnp.stack([pair.d, kappa, pair.r, pair.gamma, scale.length, scale.speed, u0, v0], axis=1)
+    cells = rows.pack(Entry(pair, scale.length, scale.speed, u0, v0, None))
     settings = Settings(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
@@ -215,7 +222,13 @@ def summarise(
     )
     given = cells, jnp.asarray(count, jnp.int32), settings
     given = given if on is None else jax.device_put(given, on)
-    return unpack(plan, np.asarray(_compiled(plan, _width(pair.d.shape[0], plan.level))(*given)))
+    return _run(plan, *given)
+
+
+def _run(plan: Plan, cells: Float[Array, "cell in"], count: Int[Array, ""], settings: Settings) -> Summary:
+    """The summary of a tile, of NumPy's arrays."""
+    table = _compiled(plan, _width(cells.shape[0], plan.level))(cells, count, settings)
+    return rows.unpack(np.asarray(table), shapes(plan, cells.dtype))
 
 
 def blank(count: int, variants: int, dtype: str) -> Summary:
@@ -231,7 +244,8 @@ def blank(count: int, variants: int, dtype: str) -> Summary:
         tangent=True,
         variants=variants,
     )
-    return unpack(plan, np.zeros((count, columns(plan)), dtype))
+    like = shapes(plan, np.dtype(dtype))
+    return rows.unpack(np.zeros((count, rows.width(like)), dtype), like)
 
 
 @door
@@ -257,11 +271,11 @@ def attractors(
         The summary, in the units of `pair`, with its `handover`.
     """
     one, zero = jnp.ones_like(pair.d), jnp.zeros_like(pair.d)
-    cells = jnp.stack([pair.d, pair.kappa, pair.r, pair.gamma, one, one, u0, v0, zero], axis=1)
+    cells = rows.pack(Entry(pair, one, one, u0, v0, zero))
     plan = _chained(pair)
     number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
     settings = _chained_settings(pair, Harvester(), periods, keep)
-    return unpack(plan, np.asarray(_compiled(plan, _width(pair.d.shape[0], plan.level))(cells, number, settings)))
+    return _run(plan, cells, number, settings)
 
 
 def _chained(pair: ImpactPair) -> Plan:
@@ -309,16 +323,17 @@ class Growth(eqx.Module):
     v: Float[Array, "chain link"]
 
 
-def _succeed(plan: Plan, settings: Settings, cell: Cell, rows: Float[Array, "lane in"]) -> Float[Array, "lane in"]:
+def _succeed(plan: Plan, settings: Settings, cell: Cell, table: Float[Array, "lane in"]) -> Float[Array, "lane in"]:
     """Rows of the next cells, with the start that the last ones hand on in the place of their growth."""
     end = unload(plan, settings, cell).handover
-    return _start(plan, rows, end.u, end.v, end.t)
+    return _start(plan, table, end.u, end.v, end.t)
 
 
-def _start(plan: Plan, rows: Float[Array, "lane in"], u, v, t) -> Float[Array, "lane in"]:
+def _start(plan: Plan, table: Float[Array, "lane in"], u: Lane, v: Lane, t: Lane) -> Float[Array, "lane in"]:
     """Rows that hold a growth, with the start that it makes of a state."""
-    u = chain.within(None if plan.rigid else 1.0, rows[:, 0], u * rows[:, -3])
-    return jnp.concatenate([rows[:, :-3], jnp.stack([u, v * rows[:, -2], t], axis=1)], axis=1)
+    entry = rows.unpack(table, _entry(plan, table.dtype))
+    u = chain.within(entry.pair.kappa, entry.pair.d, u * entry.u)
+    return rows.pack(dataclasses.replace(entry, u=u, v=v * entry.v, t=t))
 
 
 @lru_cache(maxsize=32)
@@ -329,7 +344,8 @@ def _compiled_chains(plan: Plan) -> export_cache.Program:
         first = _start(plan, links[:, 0], starts.u, starts.v, starts.t)
         links = links.at[:, 0].set(first)
         succeed = partial(_succeed, plan, settings)
-        return lanes.chain(_program(plan, settings), succeed, links, count, length, columns(plan))
+        outputs = rows.width(shapes(plan, links.dtype))
+        return lanes.chain(_program(plan, settings), succeed, links, count, length, outputs)
 
     return export_cache.Program(follow, f"{follow.__qualname__} {plan}")
 
@@ -363,12 +379,9 @@ def follow(
     Returns:
         The summary of every cell, with its `handover`.
     """
-    kappa = jnp.ones_like(pair.d) if pair.kappa is None else pair.kappa
-    zero = jnp.zeros_like(pair.d)
-    rows = jnp.stack([pair.d, kappa, pair.r, pair.gamma, length, speed, growth.u, growth.v, zero], axis=2)
+    cells = rows.pack(Entry(pair, length, speed, growth.u, growth.v, jnp.zeros_like(pair.d)), leading=2)
     chains, most = pair.d.shape
     number, long = (jnp.asarray(x, jnp.int32) for x in (count or chains, links or most))
     settings, plan = _chained_settings(pair, device, periods, keep), _chained(pair)
-    table = np.asarray(_compiled_chains(plan)(rows, starts, number, long, settings))
-    flat = unpack(plan, table.reshape(-1, table.shape[-1]))
-    return jax.tree.map(lambda x: x.reshape(table.shape[:2] + x.shape[1:]), flat)
+    table = np.asarray(_compiled_chains(plan)(cells, starts, number, long, settings))
+    return rows.unpack(table, shapes(plan, cells.dtype))

@@ -1,0 +1,72 @@
+"""Rows of a table hold a record whole, and the shapes that a summary is said to have are those it has."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vijax.batch import rows, simulate
+from vijax.batch.cell import Plan, Settings
+from vijax.batch.summary import shapes, unload
+from vijax.model.device import Harvester
+
+LEAST = Plan(
+    until="attractor",
+    stepping=None,
+    rigid=False,
+    level=True,
+    deep=False,
+    energies=False,
+    asymmetry=False,
+    tangent=True,
+    variants=3,
+)
+
+
+@pytest.mark.parametrize("leading", [1, 2])
+def test_a_record_comes_out_as_it_went_in(leading):
+    shape = (4, 5)[:leading]
+    number = np.arange(np.prod(shape), dtype=float).reshape(shape)
+    record = {"x": number + 0.5, "wide": np.stack([number, -number], -1), "none": None, "code": number.astype(np.int32)}
+    found = rows.unpack(
+        np.asarray(rows.pack(record, leading)), jax.tree.map(lambda x: x.reshape(-1, *x.shape[leading:]), record)
+    )
+    for name, values in record.items():
+        np.testing.assert_array_equal(found[name], values)
+    assert found["code"].dtype == np.int32
+
+
+def test_a_table_of_another_width_is_no_record():
+    record = {"x": np.ones(3), "y": np.ones(3)}
+    with pytest.raises((TypeError, ValueError)):
+        rows.unpack(np.ones((3, 1)), record)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {},
+        {"rigid": True},
+        {"until": "window", "tangent": False},
+        {"until": "window", "asymmetry": True, "deep": True},
+        {"level": False, "deep": True, "energies": True},
+        {"deep": True, "energies": True, "chained": True},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_summary_has_the_shapes_that_are_said(asked, dtype):
+    plan = dataclasses.replace(LEAST, **asked)
+    number, variants = jnp.zeros((), dtype), jnp.zeros(plan.variants, dtype)
+    device = jax.tree.map(lambda _: number, Harvester())
+    settings = Settings(number, number, device, None, variants, variants, number if plan.chained else None)
+
+    def end(settings, entry):
+        return unload(plan, settings, simulate._load(plan, settings, entry))
+
+    said, found = shapes(plan, jnp.dtype(dtype)), jax.eval_shape(end, settings, simulate._entry(plan, dtype))
+    assert jax.tree.structure(said) == jax.tree.structure(found)
+    for one, other in zip(jax.tree.leaves(said), jax.tree.leaves(found), strict=True):
+        assert (one.shape, one.dtype) == (other.shape, other.dtype)
