@@ -13,7 +13,7 @@ from vijax.batch.cell import Cell, Course, Event, Lane, Mask, Plan, Settings, la
 from vijax.batch.lanes import choose
 from vijax.batch.tally import fold
 from vijax.engine import exact, quick, sampled
-from vijax.engine.quick import Arrival, Hit, Lanes
+from vijax.engine.impact import Arrival, Hit, Lanes
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status

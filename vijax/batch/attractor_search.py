@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally
 from vijax.batch.chain import depart
 from vijax.batch.lanes import choose
+from vijax.engine.impact import Hit, Lanes
 from vijax.engine.method import Ode
-from vijax.engine.quick import Hit, Lanes
 from vijax.model import flow
 from vijax.model.records import Status
 from vijax.runtime.xla import share

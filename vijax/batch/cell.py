@@ -13,8 +13,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vijax.engine.impact import Arrival, Hit, Lanes
 from vijax.engine.method import Method, Passage
-from vijax.engine.quick import Arrival, Hit, Lanes, Wall
+from vijax.engine.quick_contact import Wall
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from vijax.batch.cell import Cell, Lane, Mask, Relay, Settings
 from vijax.batch.lanes import choose
-from vijax.engine.quick import Hit, Lanes
+from vijax.engine.impact import Hit, Lanes
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status

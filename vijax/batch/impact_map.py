@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 
 from vijax.batch import advance
 from vijax.batch.cell import Event, Plan
-from vijax.engine import quick
-from vijax.engine.quick import Lanes
+from vijax.engine import quick, quick_contact
+from vijax.engine.impact import Lanes
 from vijax.model.pair import ImpactPair
 from vijax.runtime import tiles, xla
 
@@ -36,7 +36,8 @@ class Next(eqx.Module):
 
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """By the quick step, of level cells."""
-    hit, _, sure, never = quick.quick_step(quick.prepare(request.pair), request.pair.gamma, request.ball, deep=True)
+    wall = quick_contact.prepare(request.pair)
+    hit, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
     no = jnp.zeros_like(sure)
     return advance.Answer(Event(hit, sure, never, no, no), no, sure | never)
 
@@ -44,7 +45,7 @@ def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
 def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """By certified sampling; of a contact alone where the quick step knows the flight."""
     if advance.knows_arrival(plan):
-        known = quick.quick_step(quick.prepare(request.pair), request.pair.gamma, request.ball).arrival
+        known = quick.quick_step(quick_contact.prepare(request.pair), request.pair.gamma, request.ball).arrival
         request = eqx.tree_at(lambda r: r.arrival, request, known, is_leaf=lambda x: x is None)
     return advance.sampled_answer(plan, request)
 

@@ -14,9 +14,9 @@ from vijax.batch import advance, chain, lanes, rows
 from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence, review, settled
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
 from vijax.batch.summary import Summary, shapes, unload
-from vijax.engine import exact, quick
+from vijax.engine import exact, quick_contact
+from vijax.engine.impact import Arrival, Lanes
 from vijax.engine.method import Method, Ode
-from vijax.engine.quick import Lanes
 from vijax.model.device import Harvester, check_device
 from vijax.model.membrane import HuntCrossley
 from vijax.model.pair import ImpactPair, check_pair
@@ -52,7 +52,7 @@ def _load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     attractor = plan.until == "attractor"
     return Cell(
         pair=pair,
-        wall=quick.prepare(pair) if plan.level and plan.stepping is None else None,
+        wall=quick_contact.prepare(pair) if plan.level and plan.stepping is None else None,
         course=advance.set_off(plan, settings, pair, ball, held) if plan.stepping else None,
         length=entry.length,
         speed=entry.speed,
@@ -61,7 +61,7 @@ def _load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
         running=~no,
         declined=no,
         hard=no,
-        arrival=quick.Arrival(zero, zero, zero, no) if advance.knows_arrival(plan) else None,
+        arrival=Arrival(zero, zero, zero, no) if advance.knows_arrival(plan) else None,
         done=no,
         status=jnp.zeros(d.shape, jnp.int32),
         count=zero,

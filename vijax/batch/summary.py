@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from vijax.batch.cell import TANGENT_SCALE, Cell, Lane, Mask, Plan, Settings, batch_length, last_period
 from vijax.batch.chain import Handover, hand_over
-from vijax.engine.quick import Lanes
+from vijax.engine.impact import Lanes
 from vijax.model.records import Status
 
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach

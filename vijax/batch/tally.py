@@ -7,7 +7,7 @@ from vijax.batch.attractor_search import recur
 from vijax.batch.cell import TANGENT_SCALE, Cell, Event, Lane, Mask, Plan, Settings, Tally, batch_length, last_period
 from vijax.batch.chain import note
 from vijax.batch.lanes import choose
-from vijax.engine.quick import Hit
+from vijax.engine.impact import Hit
 from vijax.model import energy
 from vijax.model.records import Status
 from vijax.runtime.xla import share

@@ -1,0 +1,365 @@
+"""The quick contact: one membrane contact in straight-line arithmetic, certified or declined."""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from vijax.engine.impact import Lane
+from vijax.engine.polynomial import EXP_REACH, REACH, exp, sine_cosine
+from vijax.engine.quick_flight import Flight
+from vijax.engine.root_step import converged_step, householder, single
+from vijax.model import energy
+from vijax.model.flow import PI, horner, membrane
+from vijax.model.pair import ImpactPair
+from vijax.runtime.xla import once, share
+
+_EXIT_ROUNDS = 2
+_CREST_ROUNDS = 2
+_DOUBT = 1e-3  # a sign or a bound that is closer is not trusted to single precision
+_DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
+
+
+class Wall(eqx.Module):
+    """What the contact of a cell needs and no impact changes."""
+
+    half: Lane
+    r: Lane
+    chi: Lane | None = None  # rigid: greatest depth per speed
+    kappa: Lane | None = None
+    zeta: Lane | None = None
+    omega1: Lane | None = None
+    gain_in: Lane | None = None  # steady response per forcing, in phase
+    gain_out: Lane | None = None  # and a quarter turn behind
+    span: Lane | None = None  # pi/omega1: the free contact
+    cos_span: Lane | None = None
+    sin_span: Lane | None = None
+    cos_middle: Lane | None = None
+    sin_middle: Lane | None = None
+    root_r: Lane | None = None
+    hop: Lane | None = None  # a contact whose cubic Taylor polynomial ends before this is expanded about half the span
+    crest: Lane | None = None  # free time of greatest depth
+    cos_crest: Lane | None = None
+    sin_crest: Lane | None = None
+    crest_decay: Lane | None = None
+    steep: Lane | None = None  # least speed at which w' is sure to have its first zero near the free crest
+    lift: Lane | None = None  # least -w'' at the crest, per bound of f', that keeps w' negative until the exit
+    usable: Bool[Array, "lane"] | None = None
+
+
+def prepare(pair: ImpactPair) -> Wall:
+    """Constants of the quick step for every cell.
+
+    The size certificates, for a forcing of at most 1: while v h'(s) > h(s), up to half the free time of greatest depth
+    s_a, w' stays positive (Duhamel with h' > 0), and once kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From
+    there -w' starts with slope V = -w'' and is driven by at most max f': it stays positive while V h > max f' H, H the
+    integral of h ("lift"); h/H falls with time since h is log-concave.
+    """
+    if pair.kappa is None:
+        return Wall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r))
+    wall = membrane(pair)
+    kappa, zeta, omega1 = wall.kappa, wall.zeta, wall.omega1
+    square = kappa * kappa
+    stiffness, loss = square - PI**2, 2 * zeta * PI
+    size = stiffness * stiffness + loss * loss
+    span, theta = PI / omega1, jnp.arctan2(omega1, zeta)
+    crest = theta / omega1
+    bend = zeta * zeta - (2 / 3) * (4 * zeta * zeta - square)
+
+    def response(x):  # h, h' and H at omega1 s = x
+        decay = jnp.exp(-zeta / omega1 * x)
+        h, slope = decay * jnp.sin(x) / omega1, decay * (jnp.cos(x) - zeta / omega1 * jnp.sin(x))
+        return h, slope, (1 - slope - 2 * zeta * h) / square
+
+    h_a, slope_a, static_a = response(0.5 * theta)
+    h_d, _, static_d = response(jnp.full_like(theta, _DEEP_REACH))
+    return Wall(
+        half=0.5 * pair.d,
+        r=pair.r,
+        kappa=kappa,
+        zeta=zeta,
+        omega1=omega1,
+        gain_in=stiffness / size,
+        gain_out=loss / size,
+        span=span,
+        cos_span=jnp.cos(PI * span),
+        sin_span=jnp.sin(PI * span),
+        cos_middle=jnp.cos(0.5 * PI * span),
+        sin_middle=jnp.sin(0.5 * PI * span),
+        root_r=jnp.sqrt(pair.r),
+        hop=jnp.where(bend > 0, 1.6 / (jnp.sqrt(jnp.maximum(bend, 0.0)) + zeta), 0.0),  # 0.8 of the free contact's
+        crest=crest,
+        cos_crest=jnp.cos(PI * crest),
+        sin_crest=jnp.sin(PI * crest),
+        crest_decay=jnp.exp(-zeta * crest),
+        steep=(1 + _DOUBT) * jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a),
+        lift=(1 + _DOUBT) * static_d / h_d,
+        # Near the resonance the steady response is large and cancels.
+        usable=(size > 1.0) & (pair.r > 1e-2),
+    )
+
+
+class _Motion(eqx.Module):
+    """Penetration w and its derivatives at one time of the contact, with the parts they were made of."""
+
+    w: Lane
+    rate: Lane
+    force: Lane
+    push: Lane  # w''
+    jerk: Lane  # w'''
+    drive: Lane  # derivative of the forcing
+    sine: Lane
+    cosine: Lane
+    decay: Lane
+
+
+class _Course(eqx.Module):
+    """A contact as seen from one reference time: steady part, forcing and free part rotated to it."""
+
+    steady_cos: Lane
+    steady_sin: Lane
+    force_cos: Lane
+    force_sin: Lane
+    free_cos: Lane
+    free_sin: Lane
+    decay: Lane
+
+
+@once
+def _motion(wall: Wall, course: _Course, s: Lane) -> _Motion:
+    """The contact at time s from the course's reference."""
+    sine, cosine = sine_cosine(wall.omega1 * s)
+    drive_sine, drive_cosine = sine_cosine(PI * s)
+    decay = course.decay * exp(-wall.zeta * s)
+    along = course.free_cos * cosine + course.free_sin * sine
+    across = course.free_sin * cosine - course.free_cos * sine
+    steady = course.steady_cos * drive_cosine + course.steady_sin * drive_sine
+    steady_rate = PI * (course.steady_sin * drive_cosine - course.steady_cos * drive_sine)
+    force = course.force_cos * drive_cosine - course.force_sin * drive_sine
+    drive = -PI * (course.force_sin * drive_cosine + course.force_cos * drive_sine)
+    w = steady + decay * along
+    rate = steady_rate + decay * (wall.omega1 * across - wall.zeta * along)
+    return _derivatives(wall, w, rate, force, drive, sine, cosine, decay)
+
+
+def _derivatives(wall, w, rate, force, drive, sine, cosine, decay) -> _Motion:
+    push = force - 2 * wall.zeta * rate - wall.kappa * wall.kappa * w
+    jerk = drive - 2 * wall.zeta * push - wall.kappa * wall.kappa * rate
+    return _Motion(w, rate, force, push, jerk, drive, sine, cosine, decay)
+
+
+def _at_reference(wall: Wall, course: _Course) -> _Motion:
+    """The contact at the course's reference: no sine and no exponential is needed there."""
+    one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
+    w = course.steady_cos + course.decay * course.free_cos
+    rate = PI * course.steady_sin + course.decay * (wall.omega1 * course.free_sin - wall.zeta * course.free_cos)
+    return _derivatives(wall, w, rate, course.force_cos, -PI * course.force_sin, zero, one, course.decay)
+
+
+def _in_reach(wall: Wall, s: Lane) -> Bool[Array, "lane"]:
+    """Whether the polynomials of `_motion` hold at s."""
+    return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
+
+
+def _course(parts: tuple[Lane, ...], cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> _Course:
+    """The contact rotated to a reference time with the given cos and sin of pi s; `free` is its free part there."""
+    steady_cos, steady_sin, force_cos, force_sin = parts
+    return _Course(
+        steady_cos * cosine + steady_sin * sine,
+        steady_sin * cosine - steady_cos * sine,
+        force_cos * cosine - force_sin * sine,
+        force_cos * sine + force_sin * cosine,
+        *free,
+        decay,
+    )
+
+
+def _taylor(derivatives: tuple[Lane, ...], order: int, s: Lane) -> Lane:
+    """Sum of derivatives[k] s^k/(k + order)!."""
+    return horner(tuple(d * (1 / math.factorial(k + order)) for k, d in enumerate(derivatives)), s)
+
+
+def _either(short: Bool[Array, "lane"], near: _Course, far: _Course) -> _Course:
+    return share(jax.tree.map(lambda a, b: jnp.where(short, a, b), near, far))
+
+
+class Exit(eqx.Module):
+    """The end of a contact: duration and outward speed; sin, cos of omega1 s and exp(-zeta s) there."""
+
+    duration: Lane
+    speed: Lane
+    sine: Lane
+    cosine: Lane
+    decay: Lane
+
+
+class _Entry(eqx.Module):
+    """A contact at its onset: speed into the wall, forcing and steady response in phase and a quarter turn behind."""
+
+    speed: Lane
+    force_cos: Lane
+    force_sin: Lane
+    steady_cos: Lane
+    steady_sin: Lane
+    free_cos: Lane
+    free_sin: Lane
+
+    @property
+    def parts(self) -> tuple[Lane, ...]:
+        """What `_course` rotates."""
+        return self.steady_cos, self.steady_sin, self.force_cos, self.force_sin
+
+
+def _entry(wall: Wall, flight: Flight) -> _Entry:
+    """The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin."""
+    force_cos, force_sin = -flight.sine, flight.cosine
+    steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
+    steady_sin = wall.gain_out * force_cos - wall.gain_in * force_sin
+    free_sin = (flight.speed - PI * steady_sin - wall.zeta * steady_cos) / wall.omega1
+    return share(_Entry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady_cos, free_sin))
+
+
+class _Guess(eqx.Module):
+    """Where to look for crest and exit of a contact that ends long before pi/omega1."""
+
+    short: Bool[Array, "lane"]
+    hop: Lane
+    rise: Lane
+
+
+def _guess(wall: Wall, entry: _Entry) -> _Guess:
+    """From the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
+    speed, square = entry.speed, wall.kappa * wall.kappa
+    push = entry.force_cos - 2 * wall.zeta * speed
+    jerk = -PI * entry.force_sin - 2 * wall.zeta * push - square * speed
+    bend = 0.25 * push * push - (2 / 3) * jerk * speed
+    hop = 2 * speed / (jnp.sqrt(jnp.maximum(bend, 0.0)) - 0.5 * push)
+    short = (bend > 0) & (hop > 0) & (hop < wall.hop)
+    snap = -(PI**2) * entry.force_cos - 2 * wall.zeta * jerk - square * push
+    fifth = PI**3 * entry.force_sin - 2 * wall.zeta * snap - square * jerk
+    sixth = PI**4 * entry.force_cos - 2 * wall.zeta * fifth - square * snap
+    derivatives = (speed, push, jerk, snap, fifth, sixth)
+    value = _taylor(derivatives, 1, hop) * hop
+    slope = _taylor(derivatives, 0, hop)
+    hop = jnp.where(slope < 0, hop - value / slope, hop)
+    rise = 2 * speed / (jnp.sqrt(jnp.maximum(push * push - 2 * jerk * speed, 0.0)) - push)
+    rise = rise - _taylor(derivatives, 0, rise) / _taylor(derivatives[1:], 0, rise)
+    return share(_Guess(short, hop, rise))
+
+
+def touch(wall: Wall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
+    """Exit of the contact, its greatest depth if asked for, and certainty that w rises once and falls once until then.
+
+    The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
+    nothing has to be evaluated there; that of a slow entry against the forcing, from the root of its cubic Taylor
+    polynomial, about half of pi/omega1.
+    """
+    eps = jnp.finfo(wall.half.dtype).eps
+    entry = _entry(wall, flight)
+    rough, begun = single((wall, entry))
+    guess = _guess(rough, begun)
+    middle = _course(entry.parts, wall.cos_middle, wall.sin_middle, (entry.free_sin, -entry.free_cos), wall.root_r)
+    far = _course(entry.parts, wall.cos_span, wall.sin_span, (-entry.free_cos, -entry.free_sin), wall.r)
+    course = _either(guess.short, middle, far)
+    reference = jnp.where(guess.short, 0.5 * wall.span, wall.span)
+    s, reached = _rough_exit(rough, begun, guess, single(course))
+    s = share(s.astype(reference.dtype))
+    at = share(_motion(wall, course, s))
+    step = share(householder(at.w, at.rate, at.push, at.jerk))
+    out = -(at.rate + step * (at.push + step * (0.5 * at.jerk)))
+    duration = reference + s + step
+    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.push / at.rate))
+    # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
+    converged = reached & (stiffness * jnp.abs(step) < converged_step(eps)) & (wall.omega1 * duration > 0.25)
+    crest, certain = _rough_crest(rough, begun, guess, single((duration, at.drive, at.force)))
+    depth = None
+    if deep:
+        depth, exact = _deepest(wall, entry, crest)
+        certain = certain & exact
+    sure = wall.usable & converged & (out > 0) & certain
+    turn = wall.omega1 * step
+    twist = turn * turn
+    turn_sine, turn_cosine = turn * (1 - twist * (1 / 6)), 1 - twist * (0.5 - twist * (1 / 24))
+    sine, cosine = at.sine * turn_cosine + at.cosine * turn_sine, at.cosine * turn_cosine - at.sine * turn_sine
+    short = guess.short
+    sine, cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)  # from the reference to the onset
+    rot = wall.zeta * step
+    decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
+    return share((Exit(duration, out, sine, cosine, decay), depth, sure))
+
+
+def _rough_exit(wall: Wall, entry: _Entry, guess: _Guess, course: _Course) -> tuple[Lane, Bool[Array, "lane"]]:
+    """Time of the exit from the course's reference in single precision, and whether the polynomials held on the way."""
+    free = _at_reference(wall, course)
+    near = guess.hop - 0.5 * wall.span
+    s = share(jnp.where(guess.short, near, householder(free.w, free.rate, free.push, free.jerk)))
+    reached = _in_reach(wall, s)
+    for _ in range(_EXIT_ROUNDS):
+        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
+        s = share(s + householder(at.w, at.rate, at.push, at.jerk))
+        reached = reached & _in_reach(wall, s)
+    return share((jnp.where(reached, s, 0.0), reached))
+
+
+def _crest_course(wall: Wall, entry: _Entry) -> _Course:
+    """The contact rotated to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
+    cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
+    free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
+    return share(_course(entry.parts, wall.cos_crest, wall.sin_crest, free, wall.crest_decay))
+
+
+def _snap(wall: Wall, at: _Motion) -> Lane:
+    """Fourth derivative of w."""
+    return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
+
+
+def _rough_crest(
+    wall: Wall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]
+) -> tuple[Lane, Bool[Array, "lane"]]:
+    """Time of greatest depth from the free contact's, and certainty that w has no other extremum before the exit.
+
+    In single precision, with what is close called uncertain. `end` holds the duration and f' and f at the exit.
+
+    w' is an oscillator too, driven by the derivative f' of the forcing. Write e^(zeta s) w' = phi q with phi the free
+    solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero.
+    Beyond it -w' > 0 has no zero while f' < 0, and where f' ends positive at most one, so none if -w' > 0 at the exit.
+    Moreover a minimum of w needs a positive forcing. Else by size: `Wall.steep` and `Wall.lift`.
+    """
+    duration, exit_drive, exit_force = end
+    course = _crest_course(wall, entry)
+    free = _at_reference(wall, course)
+    near = guess.rise - wall.crest
+    s = share(jnp.where(guess.short, near, householder(free.rate, free.push, free.jerk, _snap(wall, free))))
+    reached = _in_reach(wall, s)
+    for _ in range(_CREST_ROUNDS):
+        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
+        step = householder(at.rate, at.push, at.jerk, _snap(wall, at))
+        s, step = share((s + step, step))
+        reached = reached & _in_reach(wall, s)
+    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
+    converged = reached & (stiffness * jnp.abs(step) < _DOUBT) & (at.push < 0)
+    when = wall.crest + s
+    way = duration - when
+    falls, pulled, one_change = at.drive <= -_DOUBT, at.force <= -_DOUBT, duration < 1 - _DOUBT
+    first = falls & ((entry.force_sin >= 0) | ((entry.force_cos > 0) & (course.force_sin >= _DOUBT)))
+    first = (one_change & (first | ((entry.force_cos <= 0) & pulled))) | (entry.speed > wall.steep)
+    only = one_change & (falls | (exit_drive > _DOUBT) | (pulled & (exit_force <= -_DOUBT)))
+    # While the forcing is positive f' falls, so its value at the crest bounds it.
+    positive = (at.force > _DOUBT) & (exit_force > _DOUBT) & one_change
+    most = jnp.where(positive, jnp.maximum(at.drive, 0.0) + _DOUBT, PI)
+    only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < _DEEP_REACH))
+    inside = (wall.omega1 * when > _DOUBT) & (wall.omega1 * way > _DOUBT) & (way < (1 - _DOUBT) * wall.span)
+    return share((jnp.where(reached, s, 0.0), converged & first & only & inside))
+
+
+def _deepest(wall: Wall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
+    """Greatest depth, and whether `crest`, its rough time from the free contact's, was close enough to tell."""
+    at = share(_motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
+    fourth = _snap(wall, at)
+    step = share(householder(at.rate, at.push, at.jerk, fourth))
+    depth = at.w + step * (at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth)))
+    # The depth is stationary, and its Taylor polynomial of fifth order: a coarser time than the exit's will do.
+    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
+    return depth, stiffness * jnp.abs(step) < 16 * converged_step(jnp.finfo(depth.dtype).eps)
