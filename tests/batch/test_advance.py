@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from vijax.batch import advance, simulate
-from vijax.batch.cell import Plan, Settings
+from vijax.batch.cell import Entry, Plan, Settings
 from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
 from vijax.runtime import xla
 
 CELLS, STEPS = 2048, 60
@@ -38,18 +39,20 @@ SETTINGS = Settings(
 def declined():
     """Cells after many steps and no service, of those that declined; the sampled and the careful answers to them."""
     rng = np.random.default_rng(8)
-    one = np.ones(CELLS)
+    one = jnp.ones(CELLS)
     d, kappa = rng.uniform(0.05, 0.3, CELLS), np.exp(rng.uniform(np.log(3), np.log(400), CELLS))
-    rows = jnp.asarray(np.stack([d, kappa, 0.5 * one, 0 * one, one, one, 0 * one, 0.4 * one], axis=1))
+    pair = ImpactPair(jnp.asarray(d), jnp.asarray(kappa), 0.5 * one, 0 * one)
 
     @partial(jax.jit, compiler_options=xla.compiler_options())
-    def work(rows):
-        fresh = simulate._load(PLAN, SETTINGS, rows)
+    def work(entry):
+        fresh = simulate.load(PLAN, SETTINGS, entry)
         cell = jax.lax.fori_loop(0, STEPS, lambda _, cell: advance.step(PLAN, SETTINGS, cell), fresh)
         request = advance.request(PLAN, SETTINGS, cell)
         return cell, advance.sampled_answer(PLAN, request), advance.careful_answer(PLAN, request)
 
-    cell, sampled, careful = jax.tree.map(np.asarray, work(rows))
+    cell, sampled, careful = jax.tree.map(
+        np.asarray, work(Entry(pair, length=one, speed=one, u=0 * one, v=0.4 * one, t=None))
+    )
     # Of some the flight is not certain; these are for the careful step.
     some = cell.declined & sampled.sure
     assert 100 < some.sum() < CELLS

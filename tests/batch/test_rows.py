@@ -64,9 +64,9 @@ def test_a_summary_has_the_shapes_that_are_said(asked, dtype):
     settings = Settings(number, number, device, None, variants, variants, number if plan.chained else None)
 
     def end(settings, entry):
-        return unload(plan, settings, simulate._load(plan, settings, entry))
+        return unload(plan, settings, simulate.load(plan, settings, entry))
 
-    said, found = shapes(plan, jnp.dtype(dtype)), jax.eval_shape(end, settings, simulate._entry(plan, dtype))
+    said, found = shapes(plan, jnp.dtype(dtype)), jax.eval_shape(end, settings, simulate.entry_shapes(plan, dtype))
     assert jax.tree.structure(said) == jax.tree.structure(found)
     for one, other in zip(jax.tree.leaves(said), jax.tree.leaves(found), strict=True):
         assert (one.shape, one.dtype) == (other.shape, other.dtype)

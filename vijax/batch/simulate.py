@@ -41,7 +41,7 @@ class Scale(eqx.Module):
     speed_variant: Float[Array, "variant"]
 
 
-def _load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
+def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     """Fresh cells."""
     pair, d = entry.pair, entry.pair.d
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
@@ -76,7 +76,7 @@ def _load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     )
 
 
-def _entry(plan: Plan, dtype: Any) -> Entry:
+def entry_shapes(plan: Plan, dtype: Any) -> Entry:
     """What a run is told of a cell, as shapes."""
     one: Any = jax.ShapeDtypeStruct((1,), dtype)
     pair = ImpactPair(one, None if plan.rigid else one, one, one)
@@ -84,9 +84,9 @@ def _entry(plan: Plan, dtype: Any) -> Entry:
 
 
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
-    entry = _entry(plan, settings.periods.dtype)
+    entry = entry_shapes(plan, settings.periods.dtype)
     program = lanes.Program(
-        load=lambda table: _load(plan, settings, rows.unpack(table, entry)),
+        load=lambda table: load(plan, settings, rows.unpack(table, entry)),
         step=partial(advance.solver_step if plan.stepping else advance.step, plan, settings),
         review=partial(advance.stepping_review if plan.stepping else review, plan, settings),
         stopped=lambda cell: ~cell.running,
@@ -331,7 +331,7 @@ def _succeed(plan: Plan, settings: Settings, cell: Cell, table: Float[Array, "la
 
 def _start(plan: Plan, table: Float[Array, "lane in"], u: Lane, v: Lane, t: Lane) -> Float[Array, "lane in"]:
     """Rows that hold a growth, with the start that it makes of a state."""
-    entry = rows.unpack(table, _entry(plan, table.dtype))
+    entry = rows.unpack(table, entry_shapes(plan, table.dtype))
     u = chain.within(entry.pair.kappa, entry.pair.d, u * entry.u)
     return rows.pack(dataclasses.replace(entry, u=u, v=v * entry.v, t=t))
 
