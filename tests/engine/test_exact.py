@@ -23,7 +23,7 @@ from helpers import (
     start,
 )
 
-from vijax.engine import exact
+from vijax.engine import contact_search
 from vijax.model import flow
 from vijax.model.records import State
 
@@ -372,7 +372,7 @@ def test_turning_points_are_those_of_a_dense_scan():
     @jax.vmap
     def turns(pair, side, t, speed, length):
         wall, force = flow.membrane(pair), flow.contact_force(pair.gamma, side, t)
-        return exact.turning_points(wall, force, 0 * t, speed, length > 0, length=length)
+        return contact_search.turning_points(wall, force, 0 * t, speed, length > 0, length=length)
 
     got = jax.tree.map(np.asarray, turns(pairs(np.ones(TILE), kappa, r, gamma), side, t, speed, length))
     s = length * np.linspace(0, 1, 8192)[:, None] ** 2  # a slow impact turns at once

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import EPS, HORIZON, TILE, both_ways, march, pairs, start
 
-from vijax.engine import exact, quick, quick_contact
+from vijax.engine import contact_search, exact, quick, quick_contact
 from vijax.engine.impact import Lanes
 
 COUNT = 16 * TILE
@@ -108,7 +108,7 @@ def test_patience_decides_or_says_that_it_did_not():
     def step(patience):
         return jax.vmap(lambda p, s: exact.step(p, s, jnp.asarray(HORIZON), patience=patience))(pair, state)
 
-    short, full = step(jnp.int32(6)), step(jnp.int32(exact.PATIENCE))
+    short, full = step(jnp.int32(6)), step(jnp.int32(contact_search.PATIENCE))
     stay, depth = np.asarray(short.stay), np.asarray(short.impact.depth)
     decided = np.isfinite(stay) & np.isfinite(depth)
     assert 0.3 * count < decided.sum() < count

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 from vijax.engine.impact import Lane
 from vijax.engine.polynomial import EXP_REACH, REACH, exp, sine_cosine
 from vijax.engine.quick_flight import Flight
-from vijax.engine.root_step import converged_step, householder, single
+from vijax.engine.roots import converged_step, householder, single
 from vijax.model import energy
 from vijax.model.flow import PI, horner, membrane
 from vijax.model.pair import ImpactPair

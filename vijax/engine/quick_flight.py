@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool
 
 from vijax.engine.impact import Lane, Lanes
 from vijax.engine.polynomial import arcsine, phase, sine_cosine
-from vijax.engine.root_step import converged_step, householder, single
+from vijax.engine.roots import converged_step, householder, single
 from vijax.model.flow import PI
 from vijax.runtime.xla import share
 

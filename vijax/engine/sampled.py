@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from vijax.engine.exact import stick_speed
 from vijax.engine.impact import Arrival, Hit, Lanes
 from vijax.engine.quick import through
-from vijax.engine.root_step import converged_step, householder
+from vijax.engine.roots import converged_step, householder
 from vijax.model import energy, flow
 from vijax.model.flow import PI, Force, Membrane
 from vijax.model.pair import ImpactPair

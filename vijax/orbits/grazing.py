@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from vijax.engine import exact
+from vijax.engine import contact_search, flight_search
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.orbits import shooting
@@ -42,8 +42,8 @@ def _flight_room(pair: ImpactPair, side, speed, t, length, real):
     force, v0 = flow.flight_force(pair.gamma, t), -side * speed
 
     def onward(at: _Flight) -> _Flight:
-        end = jnp.minimum(jnp.minimum(exact.next_turn(force, at.s), at.s + exact.LONGEST_PIECE), length)
-        v_end, turns, turn = exact.monotone_piece(pair.gamma, force, t, v0, at.s, at.v, end, real)
+        end = jnp.minimum(jnp.minimum(flight_search.next_turn(force, at.s), at.s + flight_search.LONGEST_PIECE), length)
+        v_end, turns, turn = flight_search.monotone_piece(pair.gamma, force, t, v0, at.s, at.v, end, real)
         rise, _ = flow.flight(pair.gamma, t, v0, turn)
         # Where the velocity changes from rising to falling the wall ahead is the right one.
         room = 0.5 * pair.d - jnp.sign(at.v) * (0.5 * side * pair.d + rise)
@@ -65,7 +65,7 @@ def _contact(pair: ImpactPair, side, knot, real):
     t, speed, stay = knot
     zero, wanted = jnp.zeros_like(t), real & (stay > 0)
     force = flow.contact_force(pair.gamma, side, t)
-    turns = exact.turning_points(flow.membrane(pair, rolled=True), force, zero, speed, wanted, length=stay)
+    turns = contact_search.turning_points(flow.membrane(pair, rolled=True), force, zero, speed, wanted, length=stay)
     deepest = jnp.where(turns.lost | (turns.crest == 0), jnp.nan, turns.crest)
     shallow = jnp.where(jnp.isfinite(turns.lowest), turns.lowest, _NOTHING)
     return deepest, jnp.where(turns.lost, jnp.nan, shallow)

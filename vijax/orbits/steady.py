@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax.engine.exact import implicit_root
+from vijax.engine.roots import implicit_root
 from vijax.model import energy, flow
 from vijax.model.device import Harvester, check_device
 from vijax.model.pair import ImpactPair, check_pair

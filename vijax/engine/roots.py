@@ -1,0 +1,87 @@
+"""Roots: inside a bracket, their derivatives by the equation they solve, and the step that all quick searches share."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from vijax.runtime.xla import share
+
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+Lane = Float[Array, "lane"]
+
+_MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def implicit_root(residual: Callable, root: Scalar, args: Any) -> Scalar:
+    """`root` as a function of `args` by residual(root, args) = 0: value unchanged, derivatives of every order right.
+
+    The tangent rule calls itself on the root, so second derivatives are right too (one Newton step would not do).
+    """
+    return root
+
+
+@implicit_root.defjvp
+def _implicit_root_jvp(residual, primals, tangents):
+    root, args = primals
+    root = implicit_root(residual, root, args)
+    _, moved = jax.jvp(lambda a: residual(root, a), (args,), (tangents[1],))
+    _, slope = jax.jvp(lambda x: residual(x, args), (root,), (jnp.ones_like(root),))
+    return root, -moved / slope
+
+
+def bracketed_root(function: Callable, low: Scalar, high: Scalar, guess: Scalar, wanted: Flag) -> Scalar:
+    """The root in [low, high] of a function positive at low, not positive at high: Newton inside a bracket.
+
+    A Newton step that leaves the bracket, or a bracket that does not halve in two rounds, falls back to bisection.
+    `function(x)` returns value and derivative. `low` itself may be a root (a flight or contact begins there).
+    """
+    eps = jnp.finfo(low.dtype).eps
+
+    def unfinished(carry):
+        done, low, high, x, step, _ = carry
+        return wanted & (done < _MOST_ROUNDS) & (jnp.abs(step) > eps * jnp.abs(x)) & (high - low > eps * jnp.abs(high))
+
+    def shrink(carry):
+        done, low, high, x, _, width = carry
+        value, slope = share(function(x))
+        low, high = jnp.where(value > 0, x, low), jnp.where(value > 0, high, x)
+        steep = slope != 0
+        newton = x - value / jnp.where(steep, slope, 1.0)
+        # A Newton step of a few roundings has arrived: the next one would only follow the rounding of the function.
+        arrived = (value == 0) | (steep & (jnp.abs(newton - x) <= 8 * eps * jnp.abs(x)))
+        check = done % 3 == 2
+        inside = steep & (newton > low) & (newton < high) & ~(check & (high - low > 0.5 * width))
+        ahead = jnp.where(inside | arrived, newton, 0.5 * (low + high))
+        ahead = jnp.where(value == 0, x, ahead)
+        step = jnp.where(arrived, 0.0, ahead - x)
+        return done + 1, low, high, ahead, step, jnp.where(check, high - low, width)
+
+    guess = jnp.where((guess > low) & (guess < high), guess, 0.5 * (low + high))
+    start = (jnp.int32(0), low, high, guess, high - low, high - low)
+    return lax.while_loop(unfinished, shrink, start)[3]
+
+
+def converged_step(eps: Any) -> float:
+    """Largest last step, times the stiffness, after which a fourth-order iteration is off by eps."""
+    return float(eps) ** 0.25
+
+
+def householder(f: Lane, f1: Lane, f2: Lane, f3: Lane) -> Lane:
+    """Step of the fourth-order root iteration from f and its first three derivatives; one division."""
+    slope, bent = f1 * f1, f * f2
+    return -f * (6 * slope - 3 * bent) / (6 * f1 * (slope - bent) + f * f * f3)
+
+
+def single(tree: Any) -> Any:
+    """Floating leaves in single precision.
+
+    An iteration of fourth order needs double precision in its last trip alone: the others cost a quarter as much.
+    """
+    return share(jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != jnp.bool_ else x, tree))
