@@ -7,7 +7,7 @@ import pytest
 from helpers import EPS, HORIZON, TILE, both_ways, march, pairs, start
 
 from vijax.engine import contact_search, exact, quick, quick_contact
-from vijax.engine.impact import Lanes
+from vijax.engine.impact import Ball
 
 COUNT = 16 * TILE
 
@@ -27,7 +27,7 @@ def both(request):
     ran = march(pair, start(u, v, rng.uniform(0, 2, TILE)))
     pair = jax.tree.map(lambda x: jnp.asarray(np.repeat(x, ran.out.flight.shape[1])), pair)
     flat = jax.tree.map(lambda x: x.reshape(COUNT, *x.shape[2:]), ran)
-    lane = Lanes(*(jnp.asarray(getattr(flat.before, name), float) for name in ("u", "v", "t", "n")))
+    lane = Ball(*(jnp.asarray(getattr(flat.before, name), float) for name in ("u", "v", "t", "n")))
 
     def program(pair, lane):
         return quick.quick_step(quick_contact.prepare(pair), jnp.zeros_like(lane.u), lane, deep=True, tangent=True)
@@ -82,7 +82,7 @@ def near_grazes(rng, count):
 def test_no_crossing_is_missed_beside_a_graze():
     d, u, v, t = (x[:4096] for x in near_grazes(np.random.default_rng(8), 40_000))
     pair = jax.tree.map(jnp.asarray, pairs(d, None, 0.5, 0.0))
-    lane = Lanes(*map(jnp.asarray, (u, v, t, np.zeros_like(t))))
+    lane = Ball(*map(jnp.asarray, (u, v, t, np.zeros_like(t))))
     step = jax.jit(lambda pair, lane: quick.quick_step(quick_contact.prepare(pair), jnp.zeros_like(lane.u), lane))
     careful = jax.jit(jax.vmap(exact.step, in_axes=(0, 0, None)))
     hit, _, sure, never = jax.tree.map(np.asarray, step(pair, lane))

@@ -7,7 +7,7 @@ import pytest
 from helpers import TILE, both_ways, march, pairs, start
 
 from vijax.engine import sampled
-from vijax.engine.impact import Lanes
+from vijax.engine.impact import Ball
 
 RESTITUTIONS, SLOPES = [0.05, 0.2, 0.5, 0.9, 0.99, 1.0], [0.0, 0.1, -0.5, 1.2]
 SURE = {"plane": 0.97, "wide": 0.65, "rigid": 0.65}  # least share of the impacts, a few per cent below the measured
@@ -34,7 +34,7 @@ def both(request):
     parts = []
     # In batches as small as the lanes serve: a sampled step holds some dozens of samples a lane.
     for k in range(many):
-        lane = Lanes(*(jnp.asarray(getattr(ran.before, name)[:, k], float) for name in ("u", "v", "t", "n")))
+        lane = Ball(*(jnp.asarray(getattr(ran.before, name)[:, k], float) for name in ("u", "v", "t", "n")))
         parts.append(jax.tree.map(np.asarray, program(jax.tree.map(jnp.asarray, pair), lane)))
     hit, sure = jax.tree.map(lambda *x: np.stack(x, axis=1).reshape(TILE * many), *parts)
     return request.param, flat, hit, sure

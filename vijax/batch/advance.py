@@ -1,5 +1,6 @@
 """One step of every lane: the quick or the sampled step, with a service for what they decline; or a solver step."""
 
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from types import ModuleType
@@ -11,9 +12,9 @@ import jax.numpy as jnp
 from vijax.batch.attractor_search import review
 from vijax.batch.cell import Cell, Course, Event, Lane, Mask, Plan, Settings, last_period
 from vijax.batch.lanes import choose
-from vijax.batch.tally import fold
+from vijax.batch.tally import add_event
 from vijax.engine import exact, quick, sampled
-from vijax.engine.impact import Arrival, Hit, Lanes
+from vijax.engine.impact import Arrival, Ball, Hit
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
@@ -39,11 +40,11 @@ def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     event = Event(hit, free & sure, free & never, no, no)
     declined = active & ~(free & (sure | never))
     hard = cell.hard | declined if not plan.level else cell.hard  # sampling will not do better a second time
-    cell = eqx.tree_at(lambda c: (c.declined, c.hard), cell, (cell.declined | declined, hard))
+    cell = replace(cell, declined=cell.declined | declined, hard=hard)
     if knows_arrival(plan):
         # A lane that is declined stays where it is: until it is served every step finds the same arrival.
-        cell = eqx.tree_at(lambda c: c.arrival, cell, arrival)
-    return fold(plan, settings, cell, event)
+        cell = replace(cell, arrival=arrival)
+    return add_event(plan, settings, cell, event)
 
 
 def knows_arrival(plan: Plan) -> bool:
@@ -55,7 +56,7 @@ class Request(eqx.Module):
     """What a lane that the quick step declined hands over to be served."""
 
     pair: ImpactPair
-    ball: Lanes
+    ball: Ball
     held: Lane
     end: Lane  # last period
     arrival: Arrival | None = None  # where the flight ends, if that is known
@@ -103,7 +104,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
         v_out=out.impact.v_out,
         flight=out.flight,
         duration=out.stay,
-        after=Lanes(after.u, after.v, after.t, ball.n + after.n.astype(ball.n.dtype)),
+        after=Ball(after.u, after.v, after.t, ball.n + after.n.astype(ball.n.dtype)),
         depth=out.impact.depth if plan.deep else None,
         work=out.impact.work if plan.deep else None,
         tangent=matrix,
@@ -112,7 +113,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
     return Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
 
 
-def _neutral(pair: ImpactPair, ball: Lanes) -> Mask:
+def _neutral(pair: ImpactPair, ball: Ball) -> Mask:
     """Whether a flight that nothing stops stays within the gap for as good as ever."""
     drift = ball.v - jnp.sin(flow.PI * ball.t) / flow.PI
     return jnp.abs(drift) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
@@ -123,17 +124,14 @@ def settle(plan: Plan, settings: Settings, cell: Cell, answer: Answer, served: M
     event, left = answer.event, answer.left & served
     ours = served & answer.sure
     event = Event(event.hit, event.real & ours, event.quiet & ours, event.permanent & ours, event.stuck & ours)
-    cell = eqx.tree_at(
-        lambda c: (c.declined, c.hard, c.ball, c.held),
+    cell = replace(
         cell,
-        (
-            cell.declined & ~ours,
-            (cell.hard | served) & ~ours,
-            choose(left, event.hit.after, cell.ball),
-            jnp.where(left, 0.0, cell.held),
-        ),
+        declined=cell.declined & ~ours,
+        hard=(cell.hard | served) & ~ours,
+        ball=choose(left, event.hit.after, cell.ball),
+        held=jnp.where(left, 0.0, cell.held),
     )
-    return fold(plan, settings, cell, event)
+    return add_event(plan, settings, cell, event)
 
 
 def _stepping(plan: Plan) -> ModuleType:
@@ -141,7 +139,7 @@ def _stepping(plan: Plan) -> ModuleType:
     return import_module(f"vijax.engine.{plan.stepping}")
 
 
-def set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Lanes, held: Lane) -> Course:
+def set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Ball, held: Lane) -> Course:
     """Lanes of a stepping engine at the start of a run or of a round."""
     engine, method = _stepping(plan), settings.method
     whole = ball.n.astype(jnp.int32)
@@ -165,7 +163,7 @@ def solver_step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
         old.waits | finished,
         choose(finished & ~blocked, passage, old.passage),
     )
-    return eqx.tree_at(lambda c: c.course, cell, new)
+    return replace(cell, course=new)
 
 
 def stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
@@ -188,18 +186,18 @@ def stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
         v_out=impact.v_out,
         flight=passage.flight,
         duration=impact.duration,
-        after=Lanes(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
+        after=Ball(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
         depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
         work=impact.work if plan.deep else None,
         tangent=passage.tangent,
     )
-    cell = fold(plan, settings, cell, Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
+    cell = add_event(plan, settings, cell, Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
     if plan.stepping == "ode":  # the steps of the other are counted by its clock
         spent = cell.running & (carry.steps.astype(cell.count.dtype) > _STEPS * (end + 1))
         status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
-        cell = eqx.tree_at(lambda c: (c.running, c.status), cell, (cell.running & ~spent, status))
+        cell = replace(cell, running=cell.running & ~spent, status=status)
     stopped = ~cell.running
     cell = review(plan, settings, cell)
     again = set_off(plan, settings, cell.pair, cell.ball, jnp.zeros_like(cell.count))
-    course = eqx.tree_at(lambda c: c.waits, course, jnp.zeros_like(waits))
-    return eqx.tree_at(lambda c: c.course, cell, choose(stopped & cell.running, again, course))
+    course = replace(course, waits=jnp.zeros_like(waits))
+    return replace(cell, course=choose(stopped & cell.running, again, course))

@@ -1,6 +1,8 @@
 """The attractor of a cell: an impact that recurs, then rounds of Newton on the tangent map that confirm it or not."""
 
-import equinox as eqx
+from dataclasses import replace
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,7 +10,7 @@ from jaxtyping import Array, Float
 from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally
 from vijax.batch.chain import depart
 from vijax.batch.lanes import choose
-from vijax.engine.impact import Hit, Lanes
+from vijax.engine.impact import Ball, Hit
 from vijax.engine.method import Ode
 from vijax.model import flow
 from vijax.model.records import Status
@@ -40,12 +42,29 @@ def settled(dtype, grain=0.0):
     return (1e4 if dtype == jnp.float64 else 30.0) * float(jnp.finfo(dtype).eps) + grain
 
 
-def blank_candidate(settings: Settings, like: Lane, ball: Lanes) -> Candidate:
+def blank_candidate(settings: Settings, like: Lane, ball: Ball) -> Candidate:
     """A search that has seen no impact yet."""
     zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
     inf = jnp.full_like(like, jnp.inf)
-    near = jnp.full_like(like, recurrence(like.dtype, grain(settings)))
-    return Candidate(zero, zero, inf, zero, zero, near, no, no, zero, zero, zero, zero, ball, ball, zero, inf, zero)
+    return Candidate(
+        anchor_t=zero,
+        anchor_n=zero,
+        anchor_v=inf,
+        anchor_count=zero,
+        next_anchor=zero,
+        tolerance=jnp.full_like(like, recurrence(like.dtype, grain(settings))),
+        found=no,
+        tracing=no,
+        left=zero,
+        length=zero,
+        period=zero,
+        prime=zero,
+        base=ball,
+        origin=ball,
+        moved=zero,
+        last=inf,
+        rounds=zero,
+    )
 
 
 def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
@@ -66,28 +85,20 @@ def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
     same = 1e-2 * recurrence(lag.dtype, 100 * grain(settings))
     again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < same)
     fresh, again, found = share((fresh | opening, again, found))
-    return (
-        Candidate(
-            anchor_t=jnp.where(fresh, hit.onset_t, c.anchor_t),
-            anchor_n=jnp.where(fresh, hit.onset_n, c.anchor_n),
-            anchor_v=jnp.where(fresh, hit.v_in, c.anchor_v),
-            anchor_count=jnp.where(fresh, count, c.anchor_count),
-            next_anchor=jnp.where(fresh, count + 8 + jnp.floor(0.25 * count), c.next_anchor),
-            tolerance=c.tolerance,
-            found=c.found | found,
-            tracing=c.tracing,
-            left=left,
-            length=jnp.where(found, count - c.anchor_count, c.length),
-            period=jnp.where(found, period, c.period),
-            prime=jnp.where(again, period, c.prime),
-            base=c.base,
-            origin=c.origin,
-            moved=c.moved,
-            last=c.last,
-            rounds=c.rounds,
-        ),
-        found | finished,
+    candidate = replace(
+        c,
+        anchor_t=jnp.where(fresh, hit.onset_t, c.anchor_t),
+        anchor_n=jnp.where(fresh, hit.onset_n, c.anchor_n),
+        anchor_v=jnp.where(fresh, hit.v_in, c.anchor_v),
+        anchor_count=jnp.where(fresh, count, c.anchor_count),
+        next_anchor=jnp.where(fresh, count + 8 + jnp.floor(0.25 * count), c.next_anchor),
+        found=c.found | found,
+        left=left,
+        length=jnp.where(found, count - c.anchor_count, c.length),
+        period=jnp.where(found, period, c.period),
+        prime=jnp.where(again, period, c.prime),
     )
+    return candidate, found | finished
 
 
 def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
@@ -95,31 +106,49 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     stopped = ~cell.running & ~cell.done
     failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
     if cell.candidate is None:
-        return eqx.tree_at(lambda c: c.done, cell, cell.done | stopped)
+        return replace(cell, done=cell.done | stopped)
     c = cell.candidate
     start = stopped & c.found & ~failed
     judged = stopped & c.tracing & (c.left <= 0) & ~failed
-    size, nudge_u, nudge_v, largest, gain = _newton(plan, cell)
+    newton = _newton(cell)
+    size = newton.size
     least = grain(settings)
     close, far = settled(size.dtype, least), 1e3 * recurrence(size.dtype, least)
     # Rounding leaves of a step what it gains in solving. A step that shrinks slowly for any other reason is not there
     # yet: near a flip, where the motion after two turns is nearly what it was, Newton gains but a third a round.
-    arrived = (size < close) | ((size < close * jnp.clip(gain, 1.0, _GAIN)) & (size > 0.25 * c.last))
+    arrived = (size < close) | ((size < close * jnp.clip(newton.gain, 1.0, _GAIN)) & (size > 0.25 * c.last))
     # A long orbit attracts from so near that chaos may pass it within the recurrence and go on. There Newton's second
     # step is no shorter than the first: the orbit is a real one, but the ball is not on its way to it.
     astray = judged & (c.period > _SHORT) & (c.rounds == 1) & (size > jnp.maximum(_WITHIN * c.last, close))
-    good = judged & arrived & (largest < 1 + 1e-6) & ~astray
+    good = judged & arrived & (newton.largest < 1 + 1e-6) & ~astray
     # Where a bounded, contracting Newton step leads nowhere near, the recurrence was a coincidence.
     bad = judged & ~good & (arrived | astray | ~(size + c.moved < far) | (c.rounds >= _ROUNDS))
     again = judged & ~good & ~bad
-    cell = _begin_round(plan, cell, start | again, start, nudge_u, nudge_v, size)
+    cell = _begin_round(plan, cell, newton, start | again, start)
     cell = _back_to_search(plan, cell, bad, 10 * least)
     done = cell.done | (stopped & ~start & ~again & ~bad)
-    return eqx.tree_at(lambda x: (x.done, x.multiplier), cell, (done, jnp.where(good, largest, cell.multiplier)))
+    return replace(cell, done=done, multiplier=jnp.where(good, newton.largest, cell.multiplier))
 
 
-def _newton(plan: Plan, cell: Cell):
-    """Size and components of Newton's correction of the round's start, the largest multiplier, what rounding gains."""
+class _Newton(NamedTuple):
+    """What a finished round says of the orbit that it followed.
+
+    Attributes:
+        size: Newton's correction of the round's start, |u| + |v|; inf where the round tells nothing.
+        u, v: Its components.
+        largest: Modulus of the largest Floquet multiplier.
+        gain: How many times larger a rounding of the round's end is in the correction.
+    """
+
+    size: Lane
+    u: Lane
+    v: Lane
+    largest: Lane
+    gain: Lane
+
+
+def _newton(cell: Cell) -> _Newton:
+    """Newton's correction of the round's start, by the tangent map of the round."""
     c = cell.candidate
     grown = jnp.exp(cell.exponent * jnp.log(TANGENT_SCALE))
     m = jnp.stack([jnp.stack(cell.tangent[:2], -1), jnp.stack(cell.tangent[2:], -1)], -2) * grown[:, None, None]
@@ -140,26 +169,20 @@ def _newton(plan: Plan, cell: Cell):
         spread > 0, jnp.abs(half_trace) + jnp.sqrt(jnp.maximum(spread, 0.0)), jnp.sqrt(jnp.maximum(product, 0.0))
     )
     size = jnp.abs(nudge_u) + jnp.abs(nudge_v) + jnp.where(jnp.abs(rest) < 0.05, 0.0, jnp.inf)
-    return jnp.where(jnp.isfinite(size), size, jnp.inf), nudge_u, nudge_v, largest, gain
+    return _Newton(jnp.where(jnp.isfinite(size), size, jnp.inf), nudge_u, nudge_v, largest, gain)
 
 
-def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane, nudge_v: Lane, size: Lane) -> Cell:
+def _begin_round(plan: Plan, cell: Cell, newton: _Newton, begin: Mask, first: Mask) -> Cell:
     """Set lanes off on a round: from where they are, or from the last round's start, corrected."""
-    c = cell.candidate
-    corrected = Lanes(c.base.u + nudge_u, c.base.v + nudge_v, c.base.t, c.base.n)
+    c, size = cell.candidate, newton.size
+    corrected = Ball(c.base.u + newton.u, c.base.v + newton.v, c.base.t, c.base.n)
     base = choose(begin, choose(first, cell.ball, corrected), c.base)
-    new = Candidate(
-        anchor_t=c.anchor_t,
-        anchor_n=c.anchor_n,
-        anchor_v=c.anchor_v,
-        anchor_count=c.anchor_count,
-        next_anchor=c.next_anchor,
-        tolerance=c.tolerance,
+    one, zero = jnp.ones_like(size), jnp.zeros_like(size)
+    candidate = replace(
+        c,
         found=c.found & ~begin,
         tracing=c.tracing | begin,
         left=jnp.where(begin, c.length, c.left),
-        length=c.length,
-        period=c.period,
         prime=jnp.where(begin, c.period, c.prime),
         base=base,
         origin=choose(first, cell.ball, c.origin),
@@ -167,20 +190,15 @@ def _begin_round(plan: Plan, cell: Cell, begin: Mask, first: Mask, nudge_u: Lane
         last=jnp.where(begin, jnp.where(first, jnp.inf, size), c.last),
         rounds=jnp.where(begin, jnp.where(first, 0.0, c.rounds + 1), c.rounds),
     )
-    one, zero = jnp.ones_like(size), jnp.zeros_like(size)
-    return eqx.tree_at(
-        lambda x: (x.candidate, x.ball, x.tally, x.tangent, x.exponent, x.running, x.relay),
+    return replace(
         cell,
-        (
-            new,
-            choose(begin, base, cell.ball),
-            choose(begin, blank_tally(plan, size), cell.tally),
-            choose(begin, (one, zero, zero, one), cell.tangent),
-            choose(begin, zero, cell.exponent),
-            cell.running | begin,
-            depart(cell, begin),
-        ),
-        is_leaf=lambda x: x is None,
+        candidate=candidate,
+        ball=choose(begin, base, cell.ball),
+        tally=choose(begin, blank_tally(plan, size), cell.tally),
+        tangent=choose(begin, (one, zero, zero, one), cell.tangent),
+        exponent=choose(begin, zero, cell.exponent),
+        running=cell.running | begin,
+        relay=depart(cell, begin),
     )
 
 
@@ -196,26 +214,20 @@ def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] |
     ball = choose(bad, c.origin, cell.ball)
     rounding = jnp.finfo(zero.dtype).eps
     tighter = jnp.where(c.tolerance > rounding, jnp.maximum(1e-2 * c.tolerance, jnp.maximum(least, rounding)), 0.0)
-    new = eqx.tree_at(
-        lambda x: (x.tracing, x.tolerance, x.anchor_v, x.next_anchor),
+    candidate = replace(
         c,
-        (
-            c.tracing & ~bad,
-            jnp.where(bad, tighter, c.tolerance),
-            jnp.where(bad, jnp.inf, c.anchor_v),
-            jnp.where(bad, cell.count, c.next_anchor),
-        ),
+        tracing=c.tracing & ~bad,
+        tolerance=jnp.where(bad, tighter, c.tolerance),
+        anchor_v=jnp.where(bad, jnp.inf, c.anchor_v),
+        next_anchor=jnp.where(bad, cell.count, c.next_anchor),
     )
-    return eqx.tree_at(
-        lambda x: (x.candidate, x.ball, x.tally, x.since, x.batch, x.running),
+    return replace(
         cell,
-        (
-            new,
-            ball,
-            choose(bad, blank_tally(plan, zero), cell.tally),
-            # The round spoiled the window's sums: it starts again here.
-            jnp.where(bad, jnp.maximum(cell.since, ball.n + 1), cell.since),
-            jnp.where(bad, -1.0, cell.batch),
-            cell.running | bad,
-        ),
+        candidate=candidate,
+        ball=ball,
+        tally=choose(bad, blank_tally(plan, zero), cell.tally),
+        # The round spoiled the window's sums: it starts again here.
+        since=jnp.where(bad, jnp.maximum(cell.since, ball.n + 1), cell.since),
+        batch=jnp.where(bad, -1.0, cell.batch),
+        running=cell.running | bad,
     )

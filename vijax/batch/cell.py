@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.engine.impact import Arrival, Hit, Lanes
+from vijax.engine.impact import Arrival, Ball, Hit
 from vijax.engine.method import Method, Passage
 from vijax.engine.quick_contact import Wall
 from vijax.model.device import Harvester
@@ -106,8 +106,8 @@ class Candidate(eqx.Module):
     length: Lane  # impacts of a round
     period: Lane
     prime: Lane  # smallest recurrence seen on this round: a flip's slow decay recurs sooner after two turns than one
-    base: Lanes
-    origin: Lanes  # where the search stood when the first round began
+    base: Ball
+    origin: Ball  # where the search stood when the first round began
     moved: Lane
     last: Lane
     rounds: Lane
@@ -125,10 +125,10 @@ class Course(eqx.Module):
 class Relay(eqx.Module):
     """What a chained cell needs to be handed on."""
 
-    start: Lanes
-    mark: Lanes  # the last exit before the kept periods
+    start: Ball
+    mark: Ball  # the last exit before the kept periods
     held: Lane  # mode at the mark
-    last: Lanes  # exit of the latest impact before the end, if the round were repeated until then
+    last: Ball  # exit of the latest impact before the end, if the round were repeated until then
     latest: Lane  # the onset of that impact, in periods
 
 
@@ -140,7 +140,7 @@ class Cell(eqx.Module):
     course: Course | None
     length: Lane
     speed: Lane
-    ball: Lanes
+    ball: Ball
     held: Lane  # mode of a start in contact
     running: Mask
     declined: Mask

@@ -3,13 +3,15 @@
 A cell on a certified orbit ends there, in the state in which the orbit would be after all of its periods.
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from vijax.batch.cell import Cell, Lane, Mask, Relay, Settings
 from vijax.batch.lanes import choose
-from vijax.engine.impact import Hit, Lanes
+from vijax.engine.impact import Ball, Hit
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
@@ -30,13 +32,13 @@ class Handover(eqx.Module):
     u: Lane
     v: Lane
     t: Lane
-    mark: Lanes
+    mark: Ball
     held: Lane
 
 
-def begin(ball: Lanes, held: Lane) -> Relay:
+def begin(ball: Ball, held: Lane) -> Relay:
     """The record of a cell that has just started."""
-    return Relay(ball, ball, held, ball, jnp.full_like(held, -jnp.inf))
+    return Relay(start=ball, mark=ball, held=held, last=ball, latest=jnp.full_like(held, -jnp.inf))
 
 
 def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Relay | None:
@@ -49,8 +51,8 @@ def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Rel
     ahead = _ahead(hit.onset_n, end, period)
     onset = hit.onset_n + ahead + 0.5 * hit.onset_t
     later = kept & tracing & (onset > old.latest)
-    return Relay(
-        start=old.start,
+    return replace(
+        old,
         mark=choose(early, hit.after, old.mark),
         held=jnp.where(early, 0.0, old.held),
         last=choose(later, _moved(hit.after, ahead), old.last),
@@ -63,8 +65,8 @@ def _ahead(n: Lane, end: Lane, period: Lane) -> Lane:
     return period * (jnp.ceil((end - n) / period) - 1)
 
 
-def _moved(ball: Lanes, periods: Lane) -> Lanes:
-    return Lanes(ball.u, ball.v, ball.t, ball.n + periods)
+def _moved(ball: Ball, periods: Lane) -> Ball:
+    return Ball(ball.u, ball.v, ball.t, ball.n + periods)
 
 
 def depart(cell: Cell, begins: Mask) -> Relay | None:
@@ -72,8 +74,7 @@ def depart(cell: Cell, begins: Mask) -> Relay | None:
     old = cell.relay
     if old is None:
         return None
-    latest = jnp.where(begins, -jnp.inf, old.latest)
-    return Relay(old.start, old.mark, old.held, old.last, latest)
+    return replace(old, latest=jnp.where(begins, -jnp.inf, old.latest))
 
 
 def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end: Lane) -> Handover:
@@ -84,28 +85,28 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     aloft = last.n < end
     left = jnp.where(aloft, 2 * (end - last.n) - last.t, 0.0)
     rise, v = jax.vmap(flow.flight)(pair.gamma, last.t, last.v, left)
-    ball = Lanes(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
+    ball = Ball(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
     ball = choose(permanent, _resting(pair, end), ball)
     first = end - settings.keep
     mark = choose(periodic, _moved(last, _ahead(last.n, first, cell.candidate.period)), old.mark)
-    mark = choose(quiet | permanent, Lanes(ball.u, ball.v, ball.t, first), mark)
+    mark = choose(quiet | permanent, Ball(ball.u, ball.v, ball.t, first), mark)
     held = jnp.where(permanent, jnp.sign(ball.u), jnp.where(periodic | quiet, 0.0, old.held))
     ball = choose(failed, old.start, ball)
     return Handover(ball.u, ball.v, ball.t, _moved(mark, -first), held)
 
 
-def _resting(pair: ImpactPair, end: Lane) -> Lanes:
+def _resting(pair: ImpactPair, end: Lane) -> Ball:
     """A ball that never leaves the wall on which it lies, at phase 0, when all but its steady motion has decayed."""
     side, zero = -jnp.sign(pair.gamma), jnp.zeros_like(end)
     if pair.kappa is None:
-        return Lanes(0.5 * side * pair.d, zero, zero, end)
+        return Ball(0.5 * side * pair.d, zero, zero, end)
 
     def steady(pair, side):
         response = flow.steady_response(flow.membrane(pair), flow.contact_force(pair.gamma, side, jnp.zeros_like(side)))
         return response.at(jnp.zeros_like(side)), response.slope().at(jnp.zeros_like(side))
 
     w, z = jax.vmap(steady)(pair, side)
-    return Lanes(side * (0.5 * pair.d + w), side * z, zero, end)
+    return Ball(side * (0.5 * pair.d + w), side * z, zero, end)
 
 
 def within(kappa: Lane | float | None, d: Lane, u: Lane) -> Lane:

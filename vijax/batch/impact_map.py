@@ -1,6 +1,7 @@
 """The impact map applied once to any number of balls: quick, sampled or careful, as each needs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from vijax.batch import advance
 from vijax.batch.cell import Event, Plan
 from vijax.engine import quick, quick_contact
-from vijax.engine.impact import Lanes
+from vijax.engine.impact import Ball
 from vijax.model.pair import ImpactPair
 from vijax.runtime import tiles, xla
 
@@ -46,7 +47,7 @@ def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """By certified sampling; of a contact alone where the quick step knows the flight."""
     if advance.knows_arrival(plan):
         known = quick.quick_step(quick_contact.prepare(request.pair), request.pair.gamma, request.ball).arrival
-        request = eqx.tree_at(lambda r: r.arrival, request, known, is_leaf=lambda x: x is None)
+        request = replace(request, arrival=known)
     return advance.sampled_answer(plan, request)
 
 
@@ -100,7 +101,7 @@ def next_impacts(
     )
     pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
     zero: Any = np.zeros_like(t)
-    ball = Lanes(0.5 * side * pair.d, -side * speed, t, zero)
+    ball = Ball(0.5 * side * pair.d, -side * speed, t, zero)
     requests = advance.Request(pair, ball, zero, zero + _HORIZON)
     # What one step is not sure of is left to the next, which costs several times as much.
     steps = [_sampled_answer, advance.careful_answer]

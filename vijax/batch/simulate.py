@@ -15,7 +15,7 @@ from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
 from vijax.batch.summary import Summary, shapes, unload
 from vijax.engine import exact, quick_contact
-from vijax.engine.impact import Arrival, Lanes
+from vijax.engine.impact import Arrival, Ball
 from vijax.engine.method import Method, Ode
 from vijax.model.device import Harvester, check_device
 from vijax.model.membrane import HuntCrossley
@@ -45,7 +45,7 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     """Fresh cells."""
     pair, d = entry.pair, entry.pair.d
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
-    ball = Lanes(entry.u, entry.v, zero if entry.t is None else entry.t, zero)
+    ball = Ball(entry.u, entry.v, zero if entry.t is None else entry.t, zero)
     held = exact.start_mode(pair, ball.u, ball.v, ball.t)
     start = settings.transient + zero
     eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from vijax.batch.cell import TANGENT_SCALE, Cell, Lane, Mask, Plan, Settings, batch_length, last_period
 from vijax.batch.chain import Handover, hand_over
-from vijax.engine.impact import Lanes
+from vijax.engine.impact import Ball
 from vijax.model.records import Status
 
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
@@ -46,7 +46,7 @@ def shapes(plan: Plan, dtype: Any) -> Any:
     energies = ("P", "P_stderr", "energy_ratio")
     kinds: dict[str, Any] = dict.fromkeys(energies, jax.ShapeDtypeStruct((1, plan.variants), dtype))
     kinds |= dict.fromkeys(("period", "impacts_left", "impacts_right", "status"), whole)
-    kinds |= {"handover": Handover(number, number, number, Lanes(*[number] * 4), number)}
+    kinds |= {"handover": Handover(number, number, number, Ball(*[number] * 4), number)}
     asked = dict.fromkeys(energies, plan.energies)
     asked |= {"deepest": plan.deep, "asymmetry": plan.asymmetry, "lyapunov": plan.tangent, "handover": plan.chained}
     fields = Summary.__dataclass_fields__

@@ -1,6 +1,7 @@
 """Adding an impact to a cell: its sums, its tangent map, its recurrence, and whether the cell stops there."""
 
-import equinox as eqx
+from dataclasses import replace
+
 import jax.numpy as jnp
 
 from vijax.batch.attractor_search import recur
@@ -15,7 +16,7 @@ from vijax.runtime.xla import share
 _BUDGET = 512  # impacts per period before a cell is stopped
 
 
-def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
+def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     """Add one event to a cell."""
     hit = event.hit
     ended = event.quiet | event.permanent
@@ -38,36 +39,21 @@ def fold(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     if plan.deep:
         # A contact for ever has a depth although no impact ends it.
         held = event.permanent & (hit.depth > tally.deepest)
-        tally = eqx.tree_at(lambda t: t.deepest, tally, jnp.where(held, hit.depth, tally.deepest))
+        tally = replace(tally, deepest=jnp.where(held, hit.depth, tally.deepest))
     candidate, found = recur(settings, cell, hit, kept, count)
     stop = over | ended | spent | broken | found
-    return eqx.tree_at(
-        lambda c: (
-            c.ball,
-            c.running,
-            c.status,
-            c.count,
-            c.batch,
-            c.tally,
-            c.candidate,
-            c.tangent,
-            c.exponent,
-            c.relay,
-        ),
+    return replace(
         cell,
-        (
-            choose(kept, hit.after, cell.ball),
-            cell.running & ~stop,
-            status.astype(cell.status.dtype),
-            count,
-            batch,
-            tally,
-            candidate,
-            tangent,
-            exponent,
-            note(settings, cell, hit, kept, end),
-        ),
-        is_leaf=lambda x: x is None,
+        ball=choose(kept, hit.after, cell.ball),
+        running=cell.running & ~stop,
+        status=status.astype(cell.status.dtype),
+        count=count,
+        batch=batch,
+        tally=tally,
+        candidate=candidate,
+        tangent=tangent,
+        exponent=exponent,
+        relay=note(settings, cell, hit, kept, end),
     )
 
 

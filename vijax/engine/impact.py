@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 Lane = Float[Array, "lane"]
 
 
-class Lanes(eqx.Module):
+class Ball(eqx.Module):
     """The state between impacts, all floating point: displacement, velocity, phase in [0, 2), periods completed."""
 
     u: Lane
@@ -27,7 +27,7 @@ class Hit(eqx.Module):
     v_out: Lane
     flight: Lane
     duration: Lane
-    after: Lanes
+    after: Ball
     depth: Lane | None = None
     work: Lane | None = None
     tangent: tuple[Lane, Lane, Lane, Lane] | None = None

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from vijax.engine.exact import stick_speed
-from vijax.engine.impact import Arrival, Hit, Lane, Lanes
+from vijax.engine.impact import Arrival, Ball, Hit, Lane
 from vijax.engine.quick_contact import Wall, touch
 from vijax.engine.quick_flight import fly
 from vijax.model import energy
@@ -31,7 +31,7 @@ class Quick(NamedTuple):
     never: Bool[Array, "lane"]  # will meet no wall again
 
 
-def quick_step(wall: Wall, gamma: Lane, lane: Lanes, *, deep: bool = False, tangent: bool = False) -> Quick:
+def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tangent: bool = False) -> Quick:
     """One impact of every lane by the regular path; gamma must be 0.
 
     Args:
@@ -68,6 +68,6 @@ def quick_step(wall: Wall, gamma: Lane, lane: Lanes, *, deep: bool = False, tang
             slope = left.decay * left.cosine - wall.zeta * h
             contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)
     matrix = None if contact is None else through(contact, flight.elapsed)
-    after = Lanes(side * wall.half, -side * out, leave_t, leave_n)
+    after = Ball(side * wall.half, -side * out, leave_t, leave_n)
     hit = Hit(onset_t, onset_n, side, v_in, -side * out, flight.elapsed, duration, after, depth, work, matrix)
     return Quick(hit, arrival, sure & arrival.sure, flight.never & flight.sure)

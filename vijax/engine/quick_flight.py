@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from vijax.engine.impact import Lane, Lanes
+from vijax.engine.impact import Ball, Lane
 from vijax.engine.polynomial import arcsine, phase, sine_cosine
 from vijax.engine.roots import converged_step, householder, single
 from vijax.model.flow import PI
@@ -87,7 +87,7 @@ def _stretch(half: Lane, u: Lane, p: Lane, ahead: Lane, cosine: Lane) -> _Stretc
     return _Stretch(up, periods, ((near | before | passed) & ~falls) | flat)
 
 
-def fly(half: Lane, lane: Lanes) -> Flight:
+def fly(half: Lane, lane: Ball) -> Flight:
     """First wall crossing without gravity: pick the one monotone stretch that holds it, then Kepler's equation.
 
     u' = (p + sin pi t)/pi. For |p| < 1 the extrema are closed-form, and each period lifts them by 2p/pi, so comparing

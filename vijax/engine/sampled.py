@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vijax.engine.exact import stick_speed
-from vijax.engine.impact import Arrival, Hit, Lanes
+from vijax.engine.impact import Arrival, Ball, Hit
 from vijax.engine.quick import through
 from vijax.engine.roots import converged_step, householder
 from vijax.model import energy, flow
@@ -134,7 +134,7 @@ def _chord(found: _Pass) -> Lane:
     return share(found.s + found.h * found.start / (found.start - found.end))
 
 
-def _fly(pair: ImpactPair, lane: Lanes) -> Arrival:
+def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
     half, gamma = 0.5 * pair.d, pair.gamma
     eps = jnp.finfo(half.dtype).eps
     bend = 1 + jnp.abs(gamma)
@@ -309,7 +309,7 @@ def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: L
 
 
 def sampled_step(
-    pair: ImpactPair, lane: Lanes, arrival: Arrival | None = None, *, deep: bool = False, tangent: bool = False
+    pair: ImpactPair, lane: Ball, arrival: Arrival | None = None, *, deep: bool = False, tangent: bool = False
 ) -> tuple[Hit, Mask]:
     """One impact of every lane by certified sampling.
 
@@ -344,6 +344,6 @@ def sampled_step(
             h, slope = flow.free_response(m, duration)
             contact = (slope, h, -pair.kappa * pair.kappa * h, slope + m.mu * h)
     leave_t, passed = flow.wrap_phase(onset_t + duration)
-    after = Lanes(0.5 * side * pair.d, -side * out, leave_t, onset_n + passed)
+    after = Ball(0.5 * side * pair.d, -side * out, leave_t, onset_n + passed)
     matrix = None if contact is None else through(contact, flight)
     return Hit(onset_t, onset_n, side, v_in, -side * out, flight, duration, after, depth, work, matrix), sure
