@@ -167,15 +167,15 @@ def test_a_full_disk_is_one_line_and_what_is_done_stays(folder, capsys, monkeypa
 
 def test_a_store_that_became_read_only_is_named(folder, capsys, monkeypatch):
     sweep(**AXES, out="map.zarr")
-    opened = Path.open
+    opened = os.open
 
-    def refuse(self, mode="r", *args, **options):
-        if mode == "r+":
-            raise PermissionError(errno.EROFS, os.strerror(errno.EROFS), str(self))
-        return opened(self, mode, *args, **options)
+    def refuse(path, flags, *args, **options):
+        if "map.zarr" in os.fspath(path) and flags & (os.O_WRONLY | os.O_RDWR):
+            raise PermissionError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        return opened(path, flags, *args, **options)
 
     with monkeypatch.context() as disk:
-        disk.setattr(Path, "open", refuse)
+        disk.setattr(os, "open", refuse)
         assert script.main(ARGUMENTS) == 2
     said = "error: out must be a store that can be written; got map.zarr (Read-only file system)\n"
     assert capsys.readouterr().err == said

@@ -233,7 +233,7 @@ def _found(planned: Plan, path: Path) -> Study:
 @contextmanager
 def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
     """Alone with a store; the lock ends with its process, however that ends. What was saved whole nobody writes."""
-    import fcntl
+    from filelock import FileLock, Timeout  # here, as importing vijax would take a twentieth longer
 
     if not inventory.is_study(path):
         if not overwrite:
@@ -250,18 +250,15 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
             lock.unlink(missing_ok=True)
             lock.parent.mkdir(parents=True, exist_ok=True)
             lock.touch()
-        file = lock.open("r+")
+        # No file that merely exists may stand in for the lock where the disk knows none: a killed run would leave it.
+        alone = FileLock(lock, fallback_to_soft=False).acquire(blocking=False)
+    except Timeout:
+        raise BlockingIOError(f"out must not be in use; got {path}, which another run is writing") from None
     except OSError as error:
         raise PermissionError(f"out must be a store that can be written; got {path} ({error.strerror})") from None
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BlockingIOError(f"out must not be in use; got {path}, which another run is writing") from None
+    with alone:
         if (listed := inventory.read(path)) and listed["birth"] != _birth(path):
-            file.truncate(0)
-            file.write(listed["birth"])
-            file.flush()
+            lock.write_text(listed["birth"], encoding="utf-8")
         yield
 
 
