@@ -16,7 +16,7 @@ import pytest
 from jax import monitoring
 
 import vijax
-from vijax.runtime import export_cache
+from vijax.runtime import export_cache, xla
 
 PACKAGE = Path(vijax.__file__).parent
 X = jnp.linspace(0.1, 2.0, 7)
@@ -65,6 +65,13 @@ def test_another_program_or_shape_is_another_one(folder, changed):
     called()
     assert called(**changed)[1] == 1
     assert called(**changed)[1] == 0
+    assert len(list(folder.iterdir())) == 2
+
+
+def test_a_program_without_kernels_is_another_one(folder, monkeypatch):
+    called()
+    monkeypatch.setattr(xla, "KERNELS", not xla.KERNELS)
+    assert called()[1] == 1
     assert len(list(folder.iterdir())) == 2
 
 

@@ -1,11 +1,16 @@
 """Kernels and stored values change how a program is compiled, never what it computes."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export, lax
 
+import vijax
 from vijax.runtime import xla
 from vijax.runtime.xla import in_blocks, kernel, put, share, whole_blocks
 
@@ -110,3 +115,45 @@ def test_what_the_user_says_in_xla_flags_comes_first(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", f"--{name}=3")
     assert name not in xla.compiler_options()
     assert xla.compiler_options()
+
+
+PLANE = "d=np.linspace(0.12, 0.3, 7), kappa=np.geomspace(10, 400, 5), r=0.5, periods=200"
+WITHOUT_KERNELS = f"""
+import sys
+import jax
+import jax.numpy as jnp
+import numpy as np
+import vijax
+from vijax.runtime import xla
+x = jnp.linspace(0.1, 2.0, 192)
+rows, count = jnp.arange(3), jnp.asarray(2)
+work = lambda x: xla.put(x, xla.in_blocks(xla.kernel(lambda x: xla.share(jnp.tan(x))), x)[:3], rows, count)
+text = jax.jit(work).lower(x).as_text()
+assert "xla_cpu_small_call" not in text and "inlineable" not in text and "while" not in text, text
+assert xla.whole_blocks(65) == 65
+found = vijax.sweep({PLANE})
+np.savez(sys.argv[1], P=found.P, period=found.period, speed=found.max_impact_speed)
+"""
+
+
+def without_kernels(code: str, *arguments: str, switch: str = "0") -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"VIJAX_KERNELS": switch}
+    return subprocess.run([sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True)
+
+
+@ON_CPU
+def test_without_kernels_the_same_comes_out(tmp_path):
+    done = without_kernels(WITHOUT_KERNELS, str(tmp_path / "plain.npz"))
+    assert done.returncode == 0, done.stderr
+    plain, found = np.load(tmp_path / "plain.npz"), eval(f"vijax.sweep({PLANE})", {"vijax": vijax, "np": np})
+    settled = found.period.values > 0
+    assert settled.mean() > 0.6
+    np.testing.assert_array_equal(plain["period"][settled], found.period.values[settled])
+    for name, variable in (("P", "P"), ("speed", "max_impact_speed")):
+        np.testing.assert_allclose(plain[name][settled], found[variable].values[settled], rtol=1e-12)
+
+
+def test_a_misspelt_switch_is_named():
+    done = without_kernels("import vijax", switch="off")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == "ValueError: VIJAX_KERNELS must be 0 (no kernels) or 1; got 'off'"

@@ -1,7 +1,8 @@
 """Programs that are traced once: what tracing makes of them is kept on disk, beside what JAX keeps of compiling it.
 
 Tracing and lowering the program of a plane takes two seconds of every process, more than running a small plane. What
-comes of it depends on the program, on the shapes of its arguments, on these sources and on JAX alone.
+comes of it depends on the program, on the shapes of its arguments, on these sources, on JAX, and on whether kernels are
+wanted (`xla.KERNELS`), alone.
 """
 
 import hashlib
@@ -69,7 +70,7 @@ class Program:
         options, folder = xla.compiler_options(), cache_folder()
         if folder is None:
             return jax.jit(flat, compiler_options=options)
-        path = folder / f"traced-{_DIGEST(f'{name} {_sources()}'.encode()).hexdigest()}"
+        path = folder / f"traced-{_DIGEST(f'{name} {xla.KERNELS} {_sources()}'.encode()).hexdigest()}"
         known = _read(path)
         if known is None:
             known = export.export(jax.jit(flat), platforms=[platform])(*leaves)

@@ -4,6 +4,11 @@ On the CPU, XLA makes one kernel of each value that is stored and calls them one
 calls and memory cost as much as the arithmetic. It can emit a computation of many such values as one kernel, and does
 so by itself for loops of a few bytes; `kernel` asks for it by the same mark. An XLA that does not know the mark, and
 any accelerator, runs the same arithmetic without it.
+
+The mark is XLA's own and documented nowhere. Should an XLA stumble over it, set `VIJAX_KERNELS=0` in the environment
+before vijax is imported: `kernel`, `share`, `in_blocks` and `put` then say nothing that XLA's compiler for CPUs alone
+knows, as on an accelerator. Results agree to rounding (periodic cells to 1e-12), and planes take three to five times as
+long.
 """
 
 import os
@@ -36,8 +41,28 @@ once = jax.jit
 before a program compiles to a third. XLA sees through it."""
 
 
+def _asked_for() -> bool:
+    """Whether the environment leaves kernels on.
+
+    Raises:
+        ValueError: It says what is neither 0 nor 1.
+    """
+    said = os.environ.get("VIJAX_KERNELS", "1")
+    if said not in ("0", "1"):
+        raise ValueError(f"VIJAX_KERNELS must be 0 (no kernels) or 1; got {said[:20]!r}")
+    return said == "1"
+
+
+# Read once: programs that are compiled already would not follow.
+KERNELS = _asked_for()
+
+
 def _on_cpu() -> bool:
     return jax.default_backend() == "cpu"
+
+
+def _in_kernels() -> bool:
+    return KERNELS and _on_cpu()
 
 
 def compiler_options() -> dict[str, Any]:
@@ -59,14 +84,15 @@ def _kept(value: Any) -> Any:
 def share(value: Any) -> Any:
     """Store a value that several results need: XLA on CPU fuses one result at a time, and would compute it for each.
 
-    A call that does nothing and stays a call. (A barrier is taken away before fusion, and no kernel may contain one.)
+    A call that does nothing and stays a call. (A barrier is taken away before fusion, and no kernel may contain one;
+    without kernels, and on accelerators, it is what JAX offers.)
     """
-    return _kept(value) if _on_cpu() else lax.optimization_barrier(value)
+    return _kept(value) if _in_kernels() else lax.optimization_barrier(value)
 
 
 def kernel(work: Callable[P, T]) -> Callable[P, T]:
     """The function as one kernel: arithmetic, gathers, reductions and loops, no scatter, sort or library call."""
-    if not _on_cpu():
+    if not _in_kernels():
         return work
 
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -84,13 +110,13 @@ def kernel(work: Callable[P, T]) -> Callable[P, T]:
 
 def whole_blocks(count: int) -> int:
     """So many lanes or some more: what `in_blocks` parts evenly."""
-    return -(-count // _BLOCK) * _BLOCK if _on_cpu() else count
+    return -(-count // _BLOCK) * _BLOCK if _in_kernels() else count
 
 
 def in_blocks(work: Callable[[T], T], lanes: T) -> T:
     """`work` on all lanes, on the CPU block by block: lanes of one block do not wait for those of another."""
     count = jax.tree.leaves(lanes)[0].shape[0]
-    if not _on_cpu() or count <= _BLOCK:
+    if not _in_kernels() or count <= _BLOCK:
         return work(lanes)
     blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, _BLOCK, *leaf.shape[1:]), lanes)
     return jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[2:]), lax.map(work, blocks))
@@ -101,7 +127,7 @@ def put(lanes: T, part: T, rows: Int[Array, "row"], count: Int[Array, ""]) -> T:
 
     On the CPU one after another: a scatter cannot be in a kernel, and what is merged otherwise is read in every lane.
     """
-    if not _on_cpu():
+    if not _in_kernels():
         at = jnp.where(jnp.arange(rows.size, dtype=count.dtype) < count, rows, jax.tree.leaves(lanes)[0].shape[0])
         return jax.tree.map(lambda leaf, new: leaf.at[at].set(new, mode="drop"), lanes, part)
 
