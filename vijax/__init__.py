@@ -3,6 +3,9 @@
 Importing vijax switches JAX to 64 bits, before any array is made: impact times are worth little at less.
 """
 
+from importlib import metadata
+from typing import TYPE_CHECKING
+
 import jax
 
 jax.config.update("jax_enable_x64", True)
@@ -45,3 +48,13 @@ __all__ = [
     "sweep",
     "trajectory",
 ]
+
+
+if TYPE_CHECKING:
+    __version__: str
+else:
+
+    def __getattr__(name: str) -> str:
+        if name != "__version__":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return metadata.version("vijax")

@@ -7,12 +7,20 @@ converted at the door; pint is imported only where there is one.
 import math
 import re
 import sys
+from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
+from jaxtyping import ArrayLike
 
 from vijax.runtime import checks
+
+if TYPE_CHECKING:
+    from pint import Quantity
+
+Values = Union[ArrayLike, Sequence[float], "Quantity[Any]"]
+"""What an axis may be given as: a number, a 1-D array or list, or such a quantity of pint."""
 
 UNITS = {
     "omega": "rad/s",

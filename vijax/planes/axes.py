@@ -8,17 +8,35 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
 from vijax.model import units
 from vijax.model.device import Harvester
 from vijax.model.quantities import AXES, check
+from vijax.model.units import Values
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+class Axes(TypedDict, total=False):
+    """The axes of a sweep; `vijax.model.quantities.AXES` describes them."""
+
+    d: Values
+    kappa: Values
+    r: Values
+    gamma: Values
+    omega: Values
+    s: Values
+    omega0: Values
+    k: Values
+    A: Values
+    beta: Values
+    u0: Values
+    v0: Values
 
 
 # Different names of one quantity: a sweep takes at most one of each row.

@@ -15,8 +15,8 @@ from vijax.model.device import Harvester
 from vijax.model.label import ordered
 from vijax.model.records import Status
 from vijax.planes import sweep
+from vijax.planes.axes import Axes
 from vijax.planes.dataset import Plan
-from vijax.planes.sweep import Axes
 from vijax.runtime import checks
 from vijax.runtime.context import door
 

@@ -23,9 +23,9 @@ from vijax.model.pair import WALLS, ImpactPair
 from vijax.model.quantities import AXES
 from vijax.model.records import State, Status
 from vijax.planes import estimate
-from vijax.planes.axes import cells, check_axis
+from vijax.planes.axes import Axes, cells, check_axis
 from vijax.planes.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
-from vijax.planes.sweep import Axes, most_periods
+from vijax.planes.sweep import most_periods
 from vijax.runtime import checks, context
 from vijax.runtime.context import door
 from vijax.runtime.tiles import arrays, padded, workers

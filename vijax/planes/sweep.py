@@ -10,10 +10,9 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-from jaxtyping import ArrayLike
 
 from vijax.engine import method as methods
 from vijax.model.device import Harvester, one_device
@@ -21,7 +20,7 @@ from vijax.model.membrane import HuntCrossley, Law
 from vijax.model.pair import WALLS
 from vijax.planes import cluster, dispatch, estimate, tiled_store
 from vijax.planes import refine as refinement
-from vijax.planes.axes import Cells, cells
+from vijax.planes.axes import Axes, Cells, cells
 from vijax.planes.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
 from vijax.planes.dispatch import Call, Fields
 from vijax.planes.store import check_store, load, save, view
@@ -32,7 +31,7 @@ from vijax.runtime.tiles import places
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Axes", "load", "plan", "run", "save", "sweep"]
+__all__ = ["load", "plan", "run", "save", "sweep"]
 
 _CHOICES = {
     "until": ("attractor", "window"),
@@ -40,23 +39,6 @@ _CHOICES = {
     "dtype": ("float64", "float32"),
 }
 _LOG = logging.getLogger(__name__)
-
-
-class Axes(TypedDict, total=False):
-    """The axes of a sweep, each a number or a 1-D array; `vijax.model.quantities.AXES` describes them."""
-
-    d: ArrayLike
-    kappa: ArrayLike
-    r: ArrayLike
-    gamma: ArrayLike
-    omega: ArrayLike
-    s: ArrayLike
-    omega0: ArrayLike
-    k: ArrayLike
-    A: ArrayLike
-    beta: ArrayLike
-    u0: ArrayLike
-    v0: ArrayLike
 
 
 @door
