@@ -235,7 +235,7 @@ def rise_mp(d: float, near: tuple[float, float, float], kappa: Any) -> Any:
 
 def reference() -> None:
     """The small fast device, for P and for speed."""
-    settings = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
+    settings: dict[str, Any] = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
     best = optimise.optimise(small_and_fast(), **settings).optima[0]
     say("reference: small fast device, kappa (4.00713)", f"{best.values['kappa']:.5f}")
     say("reference: P, microjoule (57.75761)", f"{1e6 * best.height:.5f}")

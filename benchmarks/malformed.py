@@ -342,7 +342,7 @@ CALLS: Table = {
         {"u": (0.2, -0.11, [0.0, 5.0])},
     ),
     "summarise": (
-        vijax.summarise,
+        simulate.summarise,
         {
             "pair": vijax.impact_pair([0.2], [40.0], 0.5),
             "u0": jnp.zeros(1),

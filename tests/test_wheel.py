@@ -18,6 +18,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import vijax
+
 ROOT = Path(__file__).parent.parent
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 BESIDE = {"CHANGELOG.md", "CONTRIBUTING.md", "PKG-INFO", "README.md", "constraints.txt", "pyproject.toml", ".gitignore"}
@@ -42,6 +44,8 @@ vijax.sweep(d="wide")
 vijax.sweep(depth=0.2)
 vijax.swep(d=0.2)
 vijax.load(3)
+vijax.sweep(d=0.2, wall="hard")
+vijax.optimise(trips=3)
 """
 
 
@@ -141,7 +145,14 @@ def test_types_reach_a_user_of_the_wheel(installed, tmp_path):
     (tmp_path / "user.py").write_text(USER)
     (tmp_path / "mistakes.py").write_text(MISTAKES)
     command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", str(installed)]
-    done = alone([*command, "--cache-dir", str(tmp_path / "cache"), "user.py", "mistakes.py"], tmp_path)
+    (tmp_path / "names.py").write_text(
+        "import vijax\n" + "".join(f"reveal_type(vijax.{name})\n" for name in vijax.__all__)
+    )
+    files = ["user.py", "mistakes.py", "names.py"]
+    done = alone([*command, "--cache-dir", str(tmp_path / "cache"), *files], tmp_path)
     found = re.findall(r"^(\w+)\.py:(\d+): error", done.stdout, re.M)
     lines = [n for n, line in enumerate(MISTAKES.splitlines(), 1) if line.startswith("vijax.")]
     assert found == [("mistakes", str(line)) for line in lines], done.stdout + done.stderr
+    revealed = re.findall(r'^names.py:\d+: note: Revealed type is "(.*)"$', done.stdout, re.M)
+    assert len(revealed) == len(vijax.__all__)
+    assert not [kind for kind in revealed if re.search(r"^Any$|: Any( =|[,)])|-> Any$", kind)]

@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vijax.model.pair import Walls
+from vijax.planes.orbit_diagram import Direction
+
 PERIODS, KEEP = 400, 25  # of every point of a diagram: run, and drawn
 SECTION_PERIODS = 3000  # of a Poincare section of chaos, which 25 points do not show
 
@@ -43,8 +46,8 @@ class Run(NamedTuple):
     along: str
     values: tuple[float, ...]
     axes: tuple[tuple[str, Any], ...]
-    direction: str = "down"
-    wall: str = "soft"
+    direction: Direction = "down"
+    wall: Walls = "soft"
     periods: int = PERIODS
     keep: int = KEEP
 

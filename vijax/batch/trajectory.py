@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from vijax.engine import exact
-from vijax.engine.method import Method, Rk4, choose, repeated
+from vijax.engine.method import Method, MethodName, Rk4, SolverName, choose, repeated
 from vijax.model import flow
 from vijax.model.membrane import HuntCrossley, Law
 from vijax.model.pair import ImpactPair, check_pair, check_start
@@ -359,14 +359,14 @@ def _check_starts(pair: ImpactPair, periods: int, starts: Mapping[str, Any]) -> 
 @door
 def trajectory(
     pair: ImpactPair,
-    u0: Float[Array, "..."] | float,
-    v0: Float[Array, "..."] | float,
+    u0: ArrayLike,
+    v0: ArrayLike,
     periods: int,
-    t0: Float[Array, "..."] | float = 0.0,
+    t0: ArrayLike = 0.0,
     *,
     max_impacts: int | None = None,
-    method: str | Method = "exact",
-    solver: str | None = None,
+    method: MethodName | Method = "exact",
+    solver: SolverName | None = None,
     rtol: float | None = None,
     atol: float | None = None,
     membrane: Law | None = None,

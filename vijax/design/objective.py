@@ -1,7 +1,7 @@
 """What a design maximises, as an optimiser looks at it: the objective over all tolerances, the margins, derivatives."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,8 @@ from vijax.model.records import Status
 from vijax.orbits import shooting, steady
 from vijax.orbits.shooting import Sequence
 
-OBJECTIVES = {
+Objective = Literal["P", "power", "speed", "mean", "worst"]
+OBJECTIVES: dict[str, str] = {
     "P": "energy harvested per half forcing period [J]",
     "power": "harvested power [W]",
     "speed": "largest speed into a wall [m/s]",

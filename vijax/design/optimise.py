@@ -18,7 +18,7 @@ import numpy as np
 from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
 from vijax.design.multistart import Effort, Looked, Met, find
-from vijax.design.objective import OBJECTIVES, Batch, Scene
+from vijax.design.objective import OBJECTIVES, Batch, Objective, Scene
 from vijax.design.tolerance import Tolerance, check_tolerances, nodes
 from vijax.design.variables import NAMES, check_names, limits, tuned, values, variables
 from vijax.model.device import Harvester, one_device
@@ -105,16 +105,50 @@ class Design:
 
 
 @door
-def optimise(device: Harvester | None = None, **settings: Any) -> Design:
-    """The admissible design that harvests most; see `optimise_all`, which takes many devices at once."""
-    return optimise_all([one_device(device)], **settings)[0]
+def optimise(
+    device: Harvester | None = None,
+    *,
+    tune: str | Iterable[str] = ("omega0",),
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    objective: Objective = "P",
+    tolerances: Iterable[Tolerance] = (),
+    samples: int | None = None,
+    looks: int = 60,
+    steps: int = 256,
+    balls: int = 8,
+    impacts: int = 16,
+    periods: int = 200,
+) -> Design:
+    """Find the admissible designs of one device that harvest most, the best first.
+
+    Args:
+        device: Where quantities that are not tuned are taken from; Tables I and II unless given.
+        tune, bounds, objective, tolerances, samples, looks, steps, balls, impacts, periods: As in
+            `vijax.design.optimise.optimise_all`, which takes many devices at once.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
+    """
+    return optimise_all(
+        [one_device(device)],
+        tune=tune,
+        bounds=bounds,
+        objective=objective,
+        tolerances=tolerances,
+        samples=samples,
+        looks=looks,
+        steps=steps,
+        balls=balls,
+        impacts=impacts,
+        periods=periods,
+    )[0]
 
 
 @door
 def optimise_all(
     devices: Iterable[Harvester],
     *,
-    tune: Iterable[str] = ("omega0",),
+    tune: str | Iterable[str] = ("omega0",),
     bounds: Mapping[str, tuple[float, float]] | None = None,
     objective: str = "P",
     tolerances: Iterable[Tolerance] = (),

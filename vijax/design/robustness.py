@@ -14,6 +14,7 @@ from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.orbits import continuation
 from vijax.orbits import periodic as orbits
+from vijax.orbits.continuation import Direction
 from vijax.orbits.periodic import Orbit
 from vijax.planes.basins import MOST_STARTS, basin_fractions
 from vijax.runtime import checks
@@ -81,7 +82,7 @@ def surroundings(optimum: Optimum, *, starts: int = 2000, reach: float = 0.5, se
     attractors = _attractors(optimum.device, checks.whole("starts", starts, 1, MOST_STARTS), seed)
     own = float(orbits.power(optimum.orbit, optimum.device)[0])
     share = sum(one.share for one in attractors if math.isclose(one.P, own, rel_tol=_SAME))
-    return Surroundings(share, attractors, *(_edge(optimum, way, reach) for way in ("down", "up")))
+    return Surroundings(share, attractors, _edge(optimum, "down", reach), _edge(optimum, "up", reach))
 
 
 def _checked(reach: Any) -> float:
@@ -99,7 +100,7 @@ def _attractors(device: Harvester, starts: int, seed: int | None) -> tuple[Neigh
     return tuple(sorted(rows, key=lambda one: -one.share))
 
 
-def _edge(optimum: Optimum, way: str, reach: float) -> Edge:
+def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
     device = optimum.device
     kappa = float(device.omega0) * math.pi / float(device.omega)
     within = ((1 - reach) * kappa, (1 + reach) * kappa)

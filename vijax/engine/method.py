@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -16,8 +16,14 @@ from vijax.model.pair import Real
 from vijax.model.records import Impact, State
 from vijax.runtime import checks
 
-SOLVERS = ("Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5")
-OPTIONS = {"exact": (), "ode": ("solver", "rtol", "atol", "membrane"), "rk4": ("steps", "membrane")}
+MethodName = Literal["exact", "ode", "rk4"]
+SolverName = Literal["Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5"]
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+OPTIONS: dict[MethodName, tuple[str, ...]] = {
+    "exact": (),
+    "ode": ("solver", "rtol", "atol", "membrane"),
+    "rk4": ("steps", "membrane"),
+}
 _DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
 _STEPS = 1000
 _FEWEST_STEPS, _MOST_STEPS = 8, 10**6

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from vijax.model import units
 from vijax.model.device import Harvester, check_device
 from vijax.model.flow import half_turn
+from vijax.model.units import Given
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.tiles import elementwise
@@ -56,7 +57,7 @@ def capacitance(device: Harvester, depth: Values) -> Values:
 
 
 @door
-def harvested_energy(device: Harvester, depth: Values) -> Values:
+def harvested_energy(device: Harvester, depth: Given) -> Values:
     """Energy E_j [J] harvested from an impact whose largest penetration is `depth`, in metres or a quantity of pint.
 
     E = (C_max + C_T)/(C_min + C_T) (C_max - C_min) V^2/2, of full relative accuracy down to depth 0, where it and its

@@ -1,7 +1,7 @@
 """The vibro-impact pair in its two nondimensional scalings, and the checks of what a user gives."""
 
 import math
-from typing import Any
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from vijax.model import units
 from vijax.model.quantities import check
+from vijax.model.units import Given
 from vijax.runtime import checks
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
@@ -71,7 +72,8 @@ def damping_ratio(r: Real) -> Float[Array, "..."]:
     return decrement / jnp.sqrt(math.pi**2 + decrement * decrement)
 
 
-WALLS = ("soft", "rigid")
+Walls = Literal["soft", "rigid"]
+WALLS: tuple[Walls, ...] = get_args(Walls)
 
 
 class MembranePair(eqx.Module):
@@ -146,7 +148,7 @@ def check_start(pair: ImpactPair, name: str, u: Any) -> None:
 
 
 @door
-def impact_pair(d: Any, kappa: Any, r: Any, gamma: Any = 0.0) -> ImpactPair:
+def impact_pair(d: Given, kappa: Given | None, r: Given | None, gamma: Given = 0.0) -> ImpactPair:
     """A checked `ImpactPair`, its fields broadcast to one shape.
 
     Args:

@@ -19,8 +19,8 @@ from vijax.runtime import checks
 if TYPE_CHECKING:
     from pint import Quantity
 
-Values = Union[ArrayLike, Sequence[float], "Quantity[Any]"]
-"""What an axis may be given as: a number, a 1-D array or list, or such a quantity of pint."""
+Given = Union[ArrayLike, Sequence[float], "Quantity[Any]"]
+"""What may be given for a quantity: a number, an array or list of them, or such a quantity of pint."""
 
 UNITS = {
     "omega": "rad/s",

@@ -5,7 +5,7 @@ A sign change of a test function is located on the arc, and says what it was: a 
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -33,7 +33,8 @@ _EASY = 0.2  # share of that bend after which the next step is longer
 _ZERO = 1e-3  # part of a test function's ends that is zero
 _LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
 _AWAY = 20  # steps before a branch can have closed
-_WAYS = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
+Direction = Literal["up", "down", "both"]
+_WAYS: dict[Direction, tuple[float, ...]] = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
 _MOST_POINTS, MOST_GENERATIONS = 10**6, 64
 # An interval that holds an event is narrowed so often: by false position, with every third step a bisection.
 _NARROWINGS = 40
@@ -161,7 +162,7 @@ def follow(
     along: str,
     within: tuple[float, float],
     *,
-    direction: str = "both",
+    direction: Direction = "both",
     device: Harvester | None = None,
     points: int = 4000,
 ) -> list[Branch]:

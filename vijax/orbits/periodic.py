@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float, Int
 
 from vijax.batch.impact_map import Next, next_impacts
 from vijax.batch.trajectory import trajectory
@@ -218,7 +218,9 @@ def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) ->
 
 
 @door
-def from_state(pair: ImpactPair, u: Any, v: Any, t: Any = 0.0, *, period: int = 1, settle: int = 0) -> Orbit:
+def from_state(
+    pair: ImpactPair, u: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, *, period: int = 1, settle: int = 0
+) -> Orbit:
     """Periodic orbits near some states: each is flown once around to learn its impacts, then corrected by Newton.
 
     Args:

@@ -20,6 +20,7 @@ from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.orbits import shooting
 from vijax.orbits.grazing import Clearance, between
+from vijax.orbits.periodic import Orbit
 from vijax.orbits.shooting import Knots, Sequence
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
@@ -85,7 +86,7 @@ def _follows_jvp(primals, tangents):
 
 
 @door
-def steady(device: Harvester, orbit: Any, *, pair: ImpactPair | None = None) -> Steady:
+def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -> Steady:
     """The steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
 
     Args:

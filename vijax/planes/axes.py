@@ -8,35 +8,43 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 import numpy as np
 
 from vijax.model import units
 from vijax.model.device import Harvester
 from vijax.model.quantities import AXES, check
-from vijax.model.units import Values
+from vijax.model.units import Given
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-class Axes(TypedDict, total=False):
-    """The axes of a sweep; `vijax.model.quantities.AXES` describes them."""
+Precision = Literal["float64", "float32"]
 
-    d: Values
-    kappa: Values
-    r: Values
-    gamma: Values
-    omega: Values
-    s: Values
-    omega0: Values
-    k: Values
-    A: Values
-    beta: Values
-    u0: Values
-    v0: Values
+
+class Parameters(TypedDict, total=False):
+    """The axes of a sweep but for those of the start; `vijax.model.quantities.AXES` describes them."""
+
+    d: Given
+    kappa: Given
+    r: Given
+    gamma: Given
+    omega: Given
+    s: Given
+    omega0: Given
+    k: Given
+    A: Given
+    beta: Given
+
+
+class Axes(Parameters, total=False):
+    """The axes of a sweep."""
+
+    u0: Given
+    v0: Given
 
 
 # Different names of one quantity: a sweep takes at most one of each row.

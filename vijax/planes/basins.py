@@ -7,16 +7,17 @@ what was measured on it.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
-from jaxtyping import ArrayLike
 
 from vijax.model.device import Harvester, one_device
 from vijax.model.label import FAILED, label, ordered
+from vijax.model.pair import Walls
 from vijax.model.records import Status
+from vijax.model.units import Given
 from vijax.planes import sweep
-from vijax.planes.axes import cells, check_axis
+from vijax.planes.axes import Parameters, cells, check_axis
 from vijax.planes.dataset import Plan
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -52,14 +53,14 @@ _NONE = {"starts": 0, "fraction": 0.0, "fraction_stderr": 0.0}
 @door
 def basins(
     *,
-    u0: ArrayLike | None = None,
-    v0: ArrayLike | None = None,
+    u0: Given | None = None,
+    v0: Given | None = None,
     merge_mirrors: bool = False,
     periods: int = 400,
-    wall: str = "soft",
+    wall: Walls = "soft",
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **axes: Any,
+    **axes: Unpack[Parameters],
 ) -> "xr.Dataset":
     """Which attractor each start of a (u0, v0) plane ends on, and a table of the attractors.
 
@@ -90,7 +91,7 @@ def basins(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
     """
-    planned = plan_basins(axes | {"u0": u0, "v0": v0}, device, merge_mirrors=merge_mirrors, periods=periods, wall=wall)
+    planned = plan_basins({**axes, "u0": u0, "v0": v0}, device, merge_mirrors=merge_mirrors, periods=periods, wall=wall)
     return matched(sweep.run(planned, progress), merge_mirrors)
 
 
@@ -125,10 +126,10 @@ def basin_fractions(
     seed: int | None = None,
     merge_mirrors: bool = False,
     periods: int = 400,
-    wall: str = "soft",
+    wall: Walls = "soft",
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **axes: Any,
+    **axes: Unpack[Parameters],
 ) -> "xr.Dataset":
     """The share of starts that each coexisting attractor takes, for every parameter cell: multistability maps.
 

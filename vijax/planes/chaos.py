@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
 from vijax.model.device import Harvester
+from vijax.model.pair import Walls
 from vijax.planes import sweep
+from vijax.planes.axes import Axes, Parameters
 from vijax.planes.basins import MOST_STARTS, SPEED, check_starts, described, plan_fractions, spread, started
-from vijax.planes.sweep import Axes
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -33,7 +34,7 @@ def lyapunov(
     starts: int = 64,
     periods: int = 2000,
     transient: int = 500,
-    wall: str = "soft",
+    wall: Walls = "soft",
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
@@ -101,10 +102,10 @@ def survival(
     speed: float = SPEED,
     seed: int | None = None,
     periods: int = 10_000,
-    wall: str = "soft",
+    wall: Walls = "soft",
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **axes: Any,
+    **axes: Unpack[Parameters],
 ) -> "xr.Dataset":
     """How long chaos lasts: chaos that ends is a transient, however much it looked like an attractor.
 

@@ -15,8 +15,9 @@ from vijax.model.device import Harvester
 from vijax.model.label import ordered
 from vijax.model.records import Status
 from vijax.planes import sweep
-from vijax.planes.axes import Axes
+from vijax.planes.axes import Axes, Precision
 from vijax.planes.dataset import Plan
+from vijax.planes.sweep import Until
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -66,10 +67,10 @@ def compare(
     *,
     tolerance: float | None = None,
     periods: int = 400,
-    until: str = "attractor",
+    until: Until = "attractor",
     transient: int = 0,
     device: Harvester | None = None,
-    dtype: str = "float64",
+    dtype: Precision = "float64",
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":

@@ -8,22 +8,22 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import as_completed
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 
 from vijax.batch import simulate
 from vijax.batch.impact_log import Record, record
 from vijax.model import energy
 from vijax.model.device import Harvester, one_device
-from vijax.model.pair import WALLS, ImpactPair
+from vijax.model.pair import WALLS, ImpactPair, Walls
 from vijax.model.quantities import AXES
 from vijax.model.records import State, Status
+from vijax.model.units import Given
 from vijax.planes import estimate
-from vijax.planes.axes import Axes, cells, check_axis
+from vijax.planes.axes import Axes, Precision, cells, check_axis
 from vijax.planes.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
 from vijax.planes.sweep import most_periods
 from vijax.runtime import checks, context
@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _WAITING = logging.getLogger("vijax.waiting")  # see `dispatch`
-_WAYS = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
-_CHOICES = {"direction": tuple(_WAYS), "wall": WALLS, "dtype": ("float64", "float32")}
+Direction = Literal["down", "up", "both"]
+_WAYS: dict[Direction, tuple[str, ...]] = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
+_CHOICES: dict[str, tuple[str, ...]] = {"direction": tuple(_WAYS), "wall": WALLS, "dtype": get_args(Precision)}
 # A call takes chains so many points further: one compiled program for diagrams of every length.
 _LINKS = 64
 _FEWEST_LANES, _MOST_LANES = 8, 512
@@ -70,13 +71,13 @@ _STROBES = {
 def orbit_diagram(
     *,
     along: str,
-    values: ArrayLike,
-    direction: str = "down",
+    values: Given,
+    direction: Direction = "down",
     periods: int = 400,
     keep: int = 25,
-    wall: str = "soft",
+    wall: Walls = "soft",
     device: Harvester | None = None,
-    dtype: str = "float64",
+    dtype: Precision = "float64",
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":

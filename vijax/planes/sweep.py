@@ -10,17 +10,18 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import numpy as np
 
 from vijax.engine import method as methods
+from vijax.engine.method import MethodName, SolverName
 from vijax.model.device import Harvester, one_device
 from vijax.model.membrane import HuntCrossley, Law
-from vijax.model.pair import WALLS
+from vijax.model.pair import WALLS, Walls
 from vijax.planes import cluster, dispatch, estimate, tiled_store
 from vijax.planes import refine as refinement
-from vijax.planes.axes import Axes, Cells, cells
+from vijax.planes.axes import Axes, Cells, Precision, cells
 from vijax.planes.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
 from vijax.planes.dispatch import Call, Fields
 from vijax.planes.store import check_store, load, save, view
@@ -33,11 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = ["load", "plan", "run", "save", "sweep"]
 
-_CHOICES = {
-    "until": ("attractor", "window"),
-    "wall": WALLS,
-    "dtype": ("float64", "float32"),
-}
+Until = Literal["attractor", "window"]
+_CHOICES: dict[str, tuple[str, ...]] = {"until": get_args(Until), "wall": WALLS, "dtype": get_args(Precision)}
 _LOG = logging.getLogger(__name__)
 
 
@@ -45,18 +43,18 @@ _LOG = logging.getLogger(__name__)
 def sweep(
     *,
     periods: int = 400,
-    until: str = "attractor",
+    until: Until = "attractor",
     transient: int = 0,
-    wall: str = "soft",
-    method: str = "exact",
-    solver: str | None = None,
+    wall: Walls = "soft",
+    method: MethodName = "exact",
+    solver: SolverName | None = None,
     rtol: float | None = None,
     atol: float | None = None,
     membrane: Law | None = None,
     steps: int | None = None,
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
-    dtype: str = "float64",
+    dtype: Precision = "float64",
     refine: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     out: str | Path | None = None,
