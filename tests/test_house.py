@@ -142,7 +142,7 @@ def test_no_file_names_a_path_of_one_machine():
     assert not [f"{name(path)}: {line.strip()}" for path, line in lines if MACHINE_PATH.search(line)]
 
 
-def fresh_import(what: str = "vijax") -> tuple[float, list[str]]:
+def fresh_import(what: str = "vijax.public") -> tuple[float, list[str]]:
     """Seconds of one core that an import takes in a new process, and the top-level packages it loads."""
     code = (
         f"import json, sys, time; start = time.process_time(); import {what}; seconds = time.process_time() - start; "
@@ -168,3 +168,33 @@ def test_what_a_picture_needs_is_known_without_matplotlib():
 def test_import_is_quick():
     # Time of the process, as other tests hold the cores; the least of three, as the first import compiles bytecode.
     assert min(fresh_import()[0] for _ in range(3)) < IMPORT_SECONDS
+
+
+def said(code: str) -> str:
+    """What a new process prints."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+
+
+def test_importing_vijax_alone_does_not_load_jax():
+    assert said("import sys, vijax; print({'jax', 'numpy'} & set(sys.modules))") == "set()\n"
+
+
+@pytest.mark.parametrize("imports", ["import vijax, jax", "import jax, vijax", "from vijax import *; import jax"])
+def test_jax_has_64_bits_once_vijax_is_imported(imports):
+    assert said(f"{imports}; print(jax.numpy.ones(1).dtype)") == "float64\n"
+
+
+@pytest.mark.parametrize("said_before", [None, "0"])
+def test_the_environment_is_as_it_was_once_a_name_is_used(monkeypatch, said_before):
+    monkeypatch.delenv("JAX_ENABLE_X64", raising=False)
+    if said_before is not None:
+        monkeypatch.setenv("JAX_ENABLE_X64", said_before)
+    code = "import os, vijax, jax; vijax.sweep; print(os.environ.get('JAX_ENABLE_X64'), jax.numpy.ones(1).dtype)"
+    assert said(code) == f"{said_before} float64\n"
+
+
+def test_what_is_offered_can_be_listed_and_nothing_else_is_had():
+    offered = json.loads(said("import json, vijax; print(json.dumps(dir(vijax)))"))
+    assert "sweep" in offered
+    assert said(f"from vijax import *; print(all(name in globals() for name in {offered}))") == "True\n"
+    assert said("import vijax; print(hasattr(vijax, 'os_'), hasattr(vijax, 'OUTPUTS'))") == "False False\n"

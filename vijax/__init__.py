@@ -26,99 +26,54 @@ that harvests most; `under_tolerances` says what becomes of an `Optimum` when co
 Pictures: `plots`, which is loaded, and matplotlib with it, when it is first asked for.
 """
 
+import os
+import sys
 from importlib import import_module, metadata
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import jax
-
-jax.config.update("jax_enable_x64", True)
-
-from vijax.batch.trajectory import Trajectory, trajectory
-from vijax.design.optimise import Design, Optimum, optimise
-from vijax.design.optimise import under as under_tolerances
-from vijax.design.robustness import Surroundings, surroundings
-from vijax.design.robustness import weighted as weigh_basins
-from vijax.design.tolerance import Tolerance
-from vijax.model.device import Harvester
-from vijax.model.energy import harvested_energy
-from vijax.model.membrane import HuntCrossley
-from vijax.model.pair import ImpactPair, impact_pair
-from vijax.model.records import Impact, State, Status
-from vijax.orbits.continuation import Branch
-from vijax.orbits.continuation import dataset as branch_dataset
-from vijax.orbits.continuation import family as follow_families
-from vijax.orbits.continuation import follow as follow_orbits
-from vijax.orbits.periodic import Orbit
-from vijax.orbits.periodic import from_state as orbits_from_states
-from vijax.orbits.periodic import impacts as orbit_impacts
-from vijax.orbits.periodic import labels as orbit_labels
-from vijax.orbits.periodic import path as orbit_path
-from vijax.orbits.periodic import power as orbit_power
-from vijax.orbits.periodic import search as find_orbits
-from vijax.orbits.steady import Steady, steady
-from vijax.planes.basins import basin_fractions, basins
-from vijax.planes.chaos import lyapunov, survival
-from vijax.planes.compare import cheapest_model, compare, rigid_from
-from vijax.planes.orbit_diagram import orbit_diagram
-from vijax.planes.store import load, save
-from vijax.planes.sweep import sweep
+from vijax.runtime import forks  # noqa: F401, which watches them from now on
 
 if TYPE_CHECKING:
-    from vijax import plots
+    from vijax.public import *  # noqa: F403
 
     __version__: str
 else:
-
-    def __getattr__(name: str) -> Any:
-        if name == "plots":
-            return import_module("vijax.plots")
+    # The command `vijax` has to import this package before it can answer --help, or a shell that completes. With JAX
+    # that would take ten times as long, so what is offered is loaded when a name of it is first asked for.
+    def __getattr__(name):
         if name == "__version__":
             return metadata.version("vijax")
+        if name == "plots":
+            return import_module("vijax.plots")
+        public = _public()
+        if name == "__all__" or name in public.__all__:
+            return getattr(public, name)
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
+    def __dir__():
+        return _public().__all__
 
-__all__ = [
-    "Branch",
-    "Design",
-    "Harvester",
-    "HuntCrossley",
-    "Impact",
-    "ImpactPair",
-    "Optimum",
-    "Orbit",
-    "State",
-    "Status",
-    "Steady",
-    "Surroundings",
-    "Tolerance",
-    "Trajectory",
-    "basin_fractions",
-    "basins",
-    "branch_dataset",
-    "cheapest_model",
-    "compare",
-    "find_orbits",
-    "follow_families",
-    "follow_orbits",
-    "harvested_energy",
-    "impact_pair",
-    "load",
-    "lyapunov",
-    "optimise",
-    "orbit_diagram",
-    "orbit_impacts",
-    "orbit_labels",
-    "orbit_path",
-    "orbit_power",
-    "orbits_from_states",
-    "plots",
-    "rigid_from",
-    "save",
-    "steady",
-    "surroundings",
-    "survival",
-    "sweep",
-    "trajectory",
-    "under_tolerances",
-    "weigh_basins",
-]
+    def _public():
+        public = import_module("vijax.public")
+        _said_of_bits()
+        return public
+
+
+_X64 = "JAX_ENABLE_X64"
+_SAID = os.environ.get(_X64)
+
+
+def _said_of_bits() -> None:
+    """Leave the environment, which child processes inherit, as it was found: JAX has read it."""
+    if _SAID is None:
+        os.environ.pop(_X64, None)
+    else:
+        os.environ[_X64] = _SAID
+
+
+if "jax" in sys.modules:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+else:
+    os.environ[_X64] = "true"  # read as JAX is imported, by whomever

@@ -5,15 +5,15 @@ stand again when the function returns, or raises.
 """
 
 import functools
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Any, ParamSpec, TypeVar
 
 import jax
-from jax._src import xla_bridge
 from jax.extend import backend
+
+from vijax.runtime import forks
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -26,37 +26,12 @@ _HELD: dict[str, tuple[Callable[[Any], Any], Any]] = {
 }
 
 
-class _Process:
-    """What the doors know of this process.
-
-    Attributes:
-        started: Whether JAX ran here when a fork was last made.
-        orphaned: Whether it was forked from one where JAX ran: its threads are not here, and every call would hang.
-    """
-
-    started = False
-    orphaned = False
-
-
-def _forks() -> None:
-    # JAX has no public way to ask without starting it.
-    _Process.started = xla_bridge.backends_are_initialized()
-
-
-def _forked() -> None:
-    _Process.orphaned = _Process.orphaned or _Process.started
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_forks, after_in_child=_forked)
-
-
 def door(function: Callable[P, T]) -> Callable[P, T]:
     """A public function: it runs under the settings that vijax stands on, where JAX can run at all."""
 
     @functools.wraps(function)
     def through(*args: P.args, **kwargs: P.kwargs) -> T:
-        if _Process.orphaned:
+        if forks.Process.orphaned:
             raise RuntimeError(
                 "vijax must not be called in a process that was forked after JAX had started, where it would hang; "
                 'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep'

@@ -1,0 +1,82 @@
+"""What `import vijax` offers. It is loaded when the first of its names is asked for; see `vijax.__init__`."""
+
+from typing import TYPE_CHECKING
+
+from vijax.batch.trajectory import Trajectory, trajectory
+from vijax.design.optimise import Design, Optimum, optimise
+from vijax.design.optimise import under as under_tolerances
+from vijax.design.robustness import Surroundings, surroundings
+from vijax.design.robustness import weighted as weigh_basins
+from vijax.design.tolerance import Tolerance
+from vijax.model.device import Harvester
+from vijax.model.energy import harvested_energy
+from vijax.model.membrane import HuntCrossley
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.records import Impact, State, Status
+from vijax.orbits.continuation import Branch
+from vijax.orbits.continuation import dataset as branch_dataset
+from vijax.orbits.continuation import family as follow_families
+from vijax.orbits.continuation import follow as follow_orbits
+from vijax.orbits.periodic import Orbit
+from vijax.orbits.periodic import from_state as orbits_from_states
+from vijax.orbits.periodic import impacts as orbit_impacts
+from vijax.orbits.periodic import labels as orbit_labels
+from vijax.orbits.periodic import path as orbit_path
+from vijax.orbits.periodic import power as orbit_power
+from vijax.orbits.periodic import search as find_orbits
+from vijax.orbits.steady import Steady, steady
+from vijax.planes.basins import basin_fractions, basins
+from vijax.planes.chaos import lyapunov, survival
+from vijax.planes.compare import cheapest_model, compare, rigid_from
+from vijax.planes.orbit_diagram import orbit_diagram
+from vijax.planes.store import load, save
+from vijax.planes.sweep import sweep
+
+if TYPE_CHECKING:
+    from vijax import plots  # loaded, and matplotlib with it, by `vijax.__getattr__`
+
+__all__ = [
+    "Branch",
+    "Design",
+    "Harvester",
+    "HuntCrossley",
+    "Impact",
+    "ImpactPair",
+    "Optimum",
+    "Orbit",
+    "State",
+    "Status",
+    "Steady",
+    "Surroundings",
+    "Tolerance",
+    "Trajectory",
+    "basin_fractions",
+    "basins",
+    "branch_dataset",
+    "cheapest_model",
+    "compare",
+    "find_orbits",
+    "follow_families",
+    "follow_orbits",
+    "harvested_energy",
+    "impact_pair",
+    "load",
+    "lyapunov",
+    "optimise",
+    "orbit_diagram",
+    "orbit_impacts",
+    "orbit_labels",
+    "orbit_path",
+    "orbit_power",
+    "orbits_from_states",
+    "plots",
+    "rigid_from",
+    "save",
+    "steady",
+    "surroundings",
+    "survival",
+    "sweep",
+    "trajectory",
+    "under_tolerances",
+    "weigh_basins",
+]
