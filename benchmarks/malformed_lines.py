@@ -222,28 +222,67 @@ SHAPES = (
     ("paper", (), "figure"),
     ("paper", ("--figure",), "figure"),
 )
+# Script: the subcommand that it is a door to, which has to refuse the same.
+_PAGES = {"grid": "sweep", "orbit_diagram": "orbit-diagram", "basins": "basins", "branch": "branch", "design": "design"}
+# Lines of the command alone: its arguments, what the error must name.
+COMMANDS = (
+    (("swep",), "swep"),
+    (("grid",), "grid"),
+    (("--periods", "3"), "periods"),
+    (("--version=2",), "version"),
+    (("sweep", "compare"), "compare"),
+    (("sweep", "--compare", "rigid"), "compare"),
+    (("sweep", "--tolerance", "5%"), "tolerance"),
+    (("compare", "--method", "ode"), "method"),
+    (("compare", "--refine", "2"), "refine"),
+    (("compare", "--wall", "rigid"), "wall"),
+    (("compare", "--compare", "rigid"), "compare"),
+    (("orbit-diagram", "--direction"), "direction"),
+    (("orbit_diagram",), "orbit_diagram"),
+)
 # What a line needs besides, so that the option is looked at.
 _WITH = {"into": ("--figure", "3")}
 _MODULES = {"paper": "paper.__main__"}
-_COMMANDS = {"grid": "power_map"}
 
 
 def lines() -> Iterator[Case]:
     """The malformed command lines, each run in the folder of the moment."""
+    for script, arguments, name in (*_of_tables(), *SHAPES):
+        yield Case(_short(script, *arguments), (name,), partial(_run, script, arguments))
+    for arguments, name in (*_of_pages(), *COMMANDS):
+        yield Case(_short("vijax", *arguments), (name,), partial(_run, "vijax", arguments))
+
+
+def _short(*words: str) -> str:
+    """A line to read at a glance."""
+    line = " ".join(words)
+    return line if len(line) <= 100 else f"{line[:35]} ... {line[-60:]}"
+
+
+def _of_tables() -> Iterator[tuple[str, tuple[str, ...], str]]:
+    """A script, its arguments, what the error must name."""
     for door, (right, wrong) in LINES.items():
         for option, texts in wrong.items():
+            words = option.split()
             for text in texts:
-                words = option.split()
-                arguments = (*right, *_WITH.get(option, ()), f"--{words[0]}={text}")
-                yield Case(f"{door} {arguments[-1]}"[:100], (words[-1],), partial(_run, door.split()[0], arguments))
+                yield door.split()[0], (*right, *_WITH.get(option, ()), f"--{words[0]}={text}"), words[-1]
 
-    for script, given, name in SHAPES:
-        yield Case(f"{script} {' '.join(given)}", (name,), partial(_run, script, given))
+
+def _of_pages() -> Iterator[tuple[tuple[str, ...], str]]:
+    """The same of the command: a subcommand and its arguments, what the error must name."""
+    for script, arguments, name in (*_of_tables(), *SHAPES):
+        if "--compare" in arguments:  # a subcommand of its own
+            at = arguments.index("--compare")
+            yield ("compare", *arguments[:at], *arguments[at + 2 :]), name
+        elif script in _PAGES:
+            yield (_PAGES[script], *arguments), name
 
 
 def _run(script: str, arguments: tuple[str, ...]) -> int:
-    """Exit code of a script, in this process."""
-    import command
+    """Exit code of a script, or of the command, in this process."""
+    from vijax.cli import main, process
 
+    if script == "vijax":
+        return main.main(list(arguments))
     module = import_module(_MODULES.get(script, script))
-    return command.run(getattr(module, _COMMANDS.get(script, script)), list(arguments))
+    return process.run(getattr(module, script), list(arguments))

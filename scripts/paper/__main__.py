@@ -16,7 +16,7 @@ import click
 if not __package__:  # run as a folder: it is on the path itself, and not what stands beside it
     sys.path[0] = str(Path(__file__).resolve().parent.parent)
 
-import command
+from vijax.cli import process
 
 _STARTED = time.perf_counter()
 
@@ -33,13 +33,13 @@ def _options() -> list[click.Parameter]:
 @click.command(params=_options(), context_settings={"max_content_width": 120})
 def paper(figure: str | None, claims: bool, into: str, overwrite: bool) -> None:
     """Draw figures of the paper, and check its claims."""
-    with command.door():
+    with process.door():
         if figure is None and not claims:
             raise ValueError("figure must be given unless --claims is; got neither; try --figure 3")
         numbers = [] if figure is None else _numbers(figure)
         files = {number: _target(into, f"figure_{number}.png", overwrite) for number in numbers}
         table = _target(into, "claims.md", overwrite) if claims else None
-    command.keep_compiled()
+    process.keep_compiled()
     for number, file in files.items():
         _draw(number, file)
     if table is not None:
@@ -89,4 +89,4 @@ def _check(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(command.run(paper))
+    sys.exit(process.run(paper))

@@ -12,7 +12,6 @@ import sys
 import time
 from pathlib import Path
 
-import command
 import grid as script
 import jax
 import numpy as np
@@ -21,6 +20,7 @@ import xarray as xr
 from helpers import SCRIPTS, stand_in
 
 from vijax.batch import simulate
+from vijax.cli import process
 from vijax.planes import dispatch, tiled_store
 from vijax.planes import sweep as sweeps
 from vijax.planes.sweep import load, sweep
@@ -133,7 +133,7 @@ def test_a_second_process_is_refused_in_one_line(folder, capsys):
 def leaves(monkeypatch):
     """Exit codes that the script would have ended the process with."""
     codes = []
-    monkeypatch.setattr(command.os, "_exit", codes.append)
+    monkeypatch.setattr(process.os, "_exit", codes.append)
     return codes
 
 

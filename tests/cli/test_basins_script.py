@@ -6,6 +6,7 @@ import basins as script
 import numpy as np
 import pytest
 
+from vijax.cli import process
 from vijax.planes import sweep
 
 TINY = ["--d", "0.2", "--kappa", "3", "--periods", "200"]
@@ -14,7 +15,7 @@ TINY = ["--d", "0.2", "--kappa", "3", "--periods", "200"]
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     return tmp_path
 
 

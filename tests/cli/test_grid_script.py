@@ -7,13 +7,13 @@ import subprocess
 import sys
 import time
 
-import command
 import grid as script
 import numpy as np
 import pytest
 import xarray as xr
 from helpers import SCRIPTS
 
+from vijax.cli import closing, process, progress
 from vijax.model.records import Status
 from vijax.planes import dataset, sweep
 from vijax.plots import maps
@@ -151,7 +151,7 @@ def planned(monkeypatch, folder):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sweep, "run", run)
-    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     monkeypatch.setattr(os, "_exit", lambda code: None)
 
     def plan(*arguments):
@@ -215,7 +215,7 @@ def test_labels_are_shown_with_exponents(folder, monkeypatch):
         sweep, "run", lambda plan, *args: plans.append(plan) or args[0](0, 1) or xr.Dataset({"status": ok})
     )
     monkeypatch.setattr(maps, "label_map", lambda found, path: drawn.append(path.name))
-    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     assert script.main(["--show", "label", "--plot", "labels.png"]) == 0
     assert {"lyapunov", "P", "period"} < set(plans[0].outputs)
     assert "asymmetry" not in plans[0].outputs
@@ -237,7 +237,7 @@ def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
 
     monkeypatch.setattr(sweep, "run", run)
     monkeypatch.setattr(maps, "power_map", lambda found, path: None)
-    monkeypatch.setattr(script, "keep_compiled", lambda: None)
+    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     assert script.main(["--refine", "3", "--plot", "map.png"]) == 0
     assert plans[0].refine == 3
     out = capsys.readouterr().out
@@ -246,7 +246,7 @@ def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
 
 
 def test_the_progress_bar_follows_a_total_that_grows(capsys):
-    with command.progress(8) as show:
+    with progress.progress(8) as show:
         for done, total in ((0, 2), (2, 2), (2, 5), (5, 5)):
             show(done, total)
     assert "5/5" in capsys.readouterr().err
@@ -296,7 +296,7 @@ def test_the_bar_says_what_is_waited_for(folder, capsys):
     assert script.main([*TINY, "--out", "map.zarr"]) == 0
     err = capsys.readouterr().err
     assert err.index("starting") < err.index("compiling") < err.index("running 6 cells side by side") < err.index("6/6")
-    assert not command._WAITING.handlers
+    assert not progress._WAITING.handlers
 
 
 @pytest.mark.parametrize(
@@ -304,12 +304,12 @@ def test_the_bar_says_what_is_waited_for(folder, capsys):
     [(12, 35.0, "0.343 cells/s"), (3, 1.0, "3 cells/s"), (26395, 1.0, "26,395 cells/s"), (0, 1.0, "0 cells/s")],
 )
 def test_a_slow_rate_has_digits(count, seconds, said):
-    assert command.pace(count, seconds).endswith(f" {said}")
+    assert closing.pace(count, seconds).endswith(f" {said}")
 
 
 def test_what_to_do_is_said_where_a_status_is_printed():
     status = dataset.flagged(xr.Variable("d", [0, 4, 4, 2]))
-    lines = command.statuses(xr.DataArray(status)).split("\n")
+    lines = closing.statuses(xr.DataArray(status)).split("\n")
     assert lines[0] == "cells by status: ok 1, permanent_contact 1, slow 2"
     assert lines[1:] == [f"    permanent_contact: {Status(2).advice}", f"    slow: {Status(4).advice}"]
 

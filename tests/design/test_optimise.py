@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 
-import command
 import design as script
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,8 @@ import numpy as np
 import pytest
 
 import vijax
+from vijax.cli import design as page
+from vijax.cli import process
 from vijax.design import objective, optimise
 from vijax.design import report as reports
 from vijax.design import robustness as around
@@ -222,7 +223,7 @@ BAD = [
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command, "keep_compiled", lambda: None)
+    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     return tmp_path
 
 
@@ -252,9 +253,9 @@ def test_a_report_is_strict_json_whole_or_not_at_all(folder):
 
 
 def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys, monkeypatch):
-    monkeypatch.setattr(script, "_POINTS", 12)
-    monkeypatch.setattr(script, "_NEAR", 8)
-    monkeypatch.setattr(script, "_BASINS", 100)
+    monkeypatch.setattr(page, "_POINTS", 12)
+    monkeypatch.setattr(page, "_NEAR", 8)
+    monkeypatch.setattr(page, "_BASINS", 100)
     assert script.main(["--d", "0.2", *SMALL, *FEW, "--tolerance", "omega0=5%"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["design.json", "design.png"]
     report, said = strict(folder / "design.json"), capsys.readouterr().out
@@ -308,9 +309,9 @@ def test_designs_along_an_axis(folder, capsys):
 
 
 def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder, capsys, monkeypatch):
-    monkeypatch.setattr(script, "_POINTS", 24)
-    monkeypatch.setattr(script, "_NEAR", 8)
-    monkeypatch.setattr(script, "_BASINS", 100)
+    monkeypatch.setattr(page, "_POINTS", 24)
+    monkeypatch.setattr(page, "_NEAR", 8)
+    monkeypatch.setattr(page, "_BASINS", 100)
     assert script.main(["--d", "0.2", "--out", "paper.json", *FEW]) == 0
     report, said = strict(folder / "paper.json"), capsys.readouterr().out
     assert max(report["best"]["penetration"]) == pytest.approx(report["best"]["penetration_limit"], rel=1e-6)
@@ -322,7 +323,7 @@ def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder
 
 
 def test_chaos_without_a_design_is_told_with_its_power(folder, capsys, monkeypatch):
-    monkeypatch.setattr(script, "_POINTS", 8)
+    monkeypatch.setattr(page, "_POINTS", 8)
     chaos = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--steps", "4", "--balls", "2"]
     assert script.main([*chaos, "--impacts", "2"]) == 0
     said = capsys.readouterr().out

@@ -1,0 +1,286 @@
+"""The command `vijax`: its pages and the scripts that are doors to them, help, examples, completion."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from importlib import import_module
+
+import click
+import pytest
+from helpers import SCRIPTS
+
+import vijax
+from vijax.cli import main as command
+from vijax.cli import process
+from vijax.cli.options import AXES
+from vijax.model.quantities import AXES as QUANTITIES
+from vijax.orbits import continuation, periodic
+from vijax.plots import branches, orbit_diagrams
+
+ROOT = SCRIPTS.parent
+DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram", "basins": "basins", "branch": "branch", "design": "design"}
+PAGES = [*DOORS, "compare"]
+PLANE = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
+RUNS = {
+    "sweep": (PLANE, "grid", PLANE),
+    "compare": ([*PLANE, "--tolerance", "5%"], "grid", [*PLANE, "--compare", "rigid", "--tolerance", "5%"]),
+    "basins": (same := ["--d", "0.2", "--kappa", "3", "--periods", "200", "--v0=-0.6:0.6:12"], "basins", same),
+    "orbit-diagram": (same := ["--along", "d=0.3:0.2:3", "--periods", "120", "--keep", "2"], "orbit_diagram", same),
+    "branch": (
+        same := [*shlex.split("--wall rigid --A 100 --guesses 32 --generations 0 --along omega=4.8Hz:5.2Hz")],
+        "branch",
+        same,
+    ),
+    "design": (same := shlex.split("--d 0.12 --tune kappa --bounds kappa=390:410 --steps 4 --balls 2"), "design", same),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(process, "keep_compiled", lambda: None)
+    return tmp_path
+
+
+def page(name: str) -> click.Command:
+    return command.vijax.get_command(click.Context(command.vijax), name)
+
+
+def helped(arguments: list[str], capsys) -> str:
+    assert command.main([*arguments, "--help"]) == 0
+    return capsys.readouterr().out
+
+
+# --- the same as the scripts -----------------------------------------------------------------------------------------
+
+
+def content(path):
+    """A file of a store as bytes, without what two runs cannot have in common."""
+    if path.name == "lock":
+        return b""
+    if path.suffix != ".json":
+        return path.read_bytes()
+    kept = json.loads(path.read_bytes())
+    for name in ("seconds", "finished", "birth", "checksum"):
+        kept.pop(name, None)
+    return json.dumps(kept).encode()
+
+
+def written(folder):
+    return {str(path.relative_to(folder)): content(path) for path in folder.rglob("*") if path.is_file()}
+
+
+def timeless(said):
+    return re.sub(r"in [\d.]+ s(, [\d.,e+]+ (\w+)/s)?$|^[\d.]+ s from", "in T s", said, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_command_and_the_script_write_and_say_the_same(folder, capsys, monkeypatch, name):
+    monkeypatch.setattr("vijax.cli.design._POINTS", 8)
+    arguments, script, given = RUNS[name]
+    ends = []
+    for place, run in (
+        ("command", lambda: command.main([name, *arguments])),
+        ("script", lambda: import_module(script).main(given)),
+    ):
+        (folder / place).mkdir()
+        monkeypatch.chdir(folder / place)
+        assert run() == 0
+        ends.append((written(folder / place), timeless(capsys.readouterr().out)))
+    (files, said), (theirs, told) = ends
+    assert len(files) > 1
+    assert files.keys() == theirs.keys()
+    assert [file for file in files if files[file] != theirs[file]] == []
+    assert said == told
+
+
+@pytest.mark.parametrize("script", DOORS.values())
+def test_a_script_and_its_subcommand_have_the_same_options(script):
+    name = next(page for page, door in DOORS.items() if door == script)
+    theirs = {option.name: option.opts for option in getattr(import_module(script), script).params}
+    ours = {option.name: option.opts for option in page(name).params}
+    more = {"compare", "tolerance"} if name == "sweep" else set()
+    assert theirs == ours | {option: [f"--{option}"] for option in more}
+
+
+def test_python_m_is_the_command():
+    said = subprocess.run(
+        [sys.executable, "-m", "vijax", "sweep", "--wall", "x"], capture_output=True, text=True, cwd=ROOT
+    )
+    assert (said.returncode, said.stderr) == (2, 'error: wall must be "soft" or "rigid"; got \'x\'\n')
+
+
+# --- words -----------------------------------------------------------------------------------------------------------
+
+CELL = {"d": 0.2, "kappa": 3.0}
+WORDS = {
+    "sweep --wall": lambda word: vijax.sweep(**CELL, wall=word),
+    "sweep --until": lambda word: vijax.sweep(**CELL, until=word),
+    "sweep --dtype": lambda word: vijax.sweep(**CELL, dtype=word),
+    "sweep --method": lambda word: vijax.sweep(**CELL, method=word),
+    "sweep --method ode --solver": lambda word: vijax.sweep(**CELL, method="ode", solver=word),
+    "orbit-diagram --direction": lambda word: vijax.orbit_diagram(along="d", values=[0.2, 0.3], direction=word),
+    "orbit-diagram --quantity": orbit_diagrams.check_quantity,
+    "branch --quantity": branches.check_branch_quantity,
+    "design --objective": lambda word: vijax.optimise(objective=word),
+    "basins --wall": lambda word: vijax.basins(**CELL, wall=word),
+}
+LEAST = {
+    "sweep --periods 0": lambda: vijax.sweep(**CELL, periods=0),
+    "sweep --transient=-1": lambda: vijax.sweep(**CELL, transient=-1),
+    "sweep --refine 0": lambda: vijax.sweep(**CELL, refine=0),
+    "sweep --workers 0": lambda: vijax.sweep(**CELL, workers=0, out="map.zarr"),
+    "sweep --method rk4 --steps 7": lambda: vijax.sweep(**CELL, method="rk4", steps=7),
+    "sweep --method ode --atol 0": lambda: vijax.sweep(**CELL, method="ode", atol=0.0),
+    "sweep --chi=-1": lambda: vijax.HuntCrossley(-1.0),
+    "sweep --exponent 0.5": lambda: vijax.HuntCrossley(1.0, 0.5),
+    "orbit-diagram --keep 0": lambda: vijax.orbit_diagram(along="d", values=[0.2, 0.3], keep=0),
+    "basins --starts 0": lambda: vijax.basin_fractions(**CELL, starts=0),
+    "basins --seed=-1": lambda: vijax.basin_fractions(**CELL, starts=4, seed=-1),
+    "basins --speed 0": lambda: vijax.basin_fractions(**CELL, starts=4, speed=0.0),
+    "branch --guesses 0": lambda: periodic.search(vijax.impact_pair(0.2, 3.0, 0.5), "1:1", guesses=0),
+    "branch --generations=-1": lambda: continuation.family(None, "d", (0.1, 0.2), generations=-1),
+    "design --steps 1": lambda: vijax.optimise(steps=1),
+    "design --balls 0": lambda: vijax.optimise(balls=0),
+    "design --impacts 0": lambda: vijax.optimise(impacts=0),
+}
+
+
+@pytest.mark.parametrize("line", WORDS)
+def test_the_words_that_may_be_chosen_are_those_of_python(folder, capsys, line):
+    assert command.main([*line.split(), "x"]) == 2
+    with pytest.raises(ValueError, match="must be") as refused:
+        WORDS[line]("x")
+    assert capsys.readouterr().err == f"error: {refused.value}\n"
+
+
+@pytest.mark.parametrize("line", LEAST)
+def test_the_least_that_may_be_given_is_that_of_python(folder, capsys, line):
+    assert command.main(line.split()) == 2
+    with pytest.raises(ValueError, match="must be") as refused:
+        LEAST[line]()
+    assert capsys.readouterr().err == f"error: {refused.value}\n"
+
+
+def test_every_axis_has_an_option():
+    assert set(AXES) == set(QUANTITIES)
+
+
+# --- help ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_help_has_every_option_in_one_section_and_ends_with_the_examples(capsys, name):
+    said = helped([name], capsys)
+    *sections, examples = re.split(r"\n(?=\w[^\n]*:\n)", said)
+    for (title, options), section in zip(page(name).sections.items(), sections[1:], strict=True):
+        assert section.startswith(f"{title}:\n")
+        shown = re.findall(r"^  (--[\w-]+)", section.split("\n\n")[0], re.MULTILINE)
+        assert [option for option in shown if option != "--help"] == [option.opts[0] for option in options]
+    assert said.count("  --help  ") == 1
+    assert examples.splitlines()[0] == "Examples:"
+    assert [line.split(name, 1)[1].strip() for line in examples.splitlines()[1:]] == list(page(name).examples)
+
+
+def test_help_needs_no_jax():
+    code = (
+        "import sys; from vijax.cli.main import main; import grid; "
+        f"codes = [main([*page, '--help']) for page in ([], *([name] for name in {PAGES}))]; "
+        "print(codes, grid.main(['--help']), {'jax', 'numpy', 'xarray', 'matplotlib'} & set(sys.modules))"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.splitlines()[-1] == "[0, 0, 0, 0, 0, 0, 0] 0 set()"
+
+
+def test_alone_it_says_what_there_is_and_which_version(capsys):
+    assert command.main([]) == 0
+    said = capsys.readouterr().out
+    assert re.findall(r"^  ([a-z][a-z-]+)  +[A-Z].*[^.]\.$", said, re.M) == list(command.vijax.list_commands(None))
+    assert command.main(["--version"]) == 0
+    assert re.fullmatch(r"vijax \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+# --- examples --------------------------------------------------------------------------------------------------------
+
+
+class BegunError(Exception):
+    """What a run raises that was begun."""
+
+
+@pytest.fixture
+def begun(folder, monkeypatch):
+    """Lines that pass all doors end where the progress bar would begin."""
+
+    def bar(*_, **__):
+        raise BegunError
+
+    bar.write = print
+    monkeypatch.setattr("tqdm.tqdm", bar)
+
+
+@pytest.mark.parametrize("line", [f"{name} {line}".strip() for name in PAGES for line in page(name).examples])
+def test_examples_pass_all_doors(begun, line):
+    with pytest.raises(BegunError):
+        command.main(shlex.split(line))
+
+
+@pytest.mark.parametrize("line", import_module("grid").grid.examples)
+def test_examples_of_the_script_pass_all_doors(begun, line):
+    with pytest.raises(BegunError):
+        import_module("grid").main(shlex.split(line))
+
+
+# --- completion ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def completed(monkeypatch, capsys):
+    """What a shell is told that completes the last of some words."""
+
+    def complete(line):
+        monkeypatch.setenv("_VIJAX_COMPLETE", "bash_complete")
+        monkeypatch.setenv("COMP_WORDS", line)
+        monkeypatch.setenv("COMP_CWORD", str(line.count(" ")))
+        with pytest.raises(SystemExit) as ended:
+            command.vijax.main([], prog_name="vijax")
+        assert ended.value.code == 0
+        return [item.partition(",")[2] for item in capsys.readouterr().out.split()]
+
+    return complete
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("vijax ", ["sweep", "compare", "orbit-diagram", "basins", "branch", "design"]),
+        ("vijax b", ["basins", "branch"]),
+        ("vijax sweep --me", ["--method", "--membrane"]),
+        ("vijax sweep --wall ", ["soft", "rigid"]),
+        ("vijax sweep --method ode --solver Dop", ["Dopri5", "Dopri8"]),
+        ("vijax compare --compar", []),
+        ("vijax orbit-diagram --direction d", ["down"]),
+        ("vijax branch --quantity m", ["multiplier"]),
+        ("vijax design --objective ", ["P", "power", "speed", "mean", "worst"]),
+        ("vijax sweep --show l", ["lyapunov", "label"]),
+        ("vijax sweep --outputs P,peri", ["P,period", "P,periods_run"]),
+    ],
+)
+def test_a_shell_completes_subcommands_options_and_choices(completed, line, words):
+    assert sorted(completed(line)) == sorted(words)
+
+
+def test_bash_completes_after_the_line_of_the_readme(tmp_path):
+    """By a command of the name that a wheel installs."""
+    (line,) = set(re.findall(r'`(eval "[^`]*")`', (ROOT / "README.md").read_text(encoding="utf-8")))
+    stub = tmp_path / "vijax"
+    stub.write_text(f"#!{sys.executable}\nimport sys\nfrom vijax.cli.main import main\nsys.exit(main())\n")
+    stub.chmod(0o755)
+    environment = os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    asked = 'COMP_WORDS=(vijax sweep --wall r) COMP_CWORD=3; _vijax_completion vijax; echo "${COMPREPLY[@]}"'
+    done = subprocess.run(["bash", "-c", f"{line}; {asked}"], capture_output=True, text=True, env=environment)
+    assert done.stdout == "rigid\n", done.stderr
+    assert line in " ".join(command.vijax.get_help(click.Context(command.vijax)).split())

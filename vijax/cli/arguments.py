@@ -1,0 +1,89 @@
+"""What options say: axes and device of the texts they were given, one point of them, parts of a whole."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from vijax.cli.options import AXES, PHYSICAL
+
+if TYPE_CHECKING:
+    from vijax.model.device import Harvester
+    from vijax.model.pair import ImpactPair
+
+
+def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, Any]:
+    """Take the values of the axes out of what was given.
+
+    Args:
+        given: What click parsed, by name; the axes leave it.
+        defaults: Texts of axes that count as given where no physical name is among those that are.
+    """
+    from vijax.planes.axes import parse_axis
+
+    axes = {name: given.pop(name) for name in list(given) if name in AXES}
+    texts = {name: text for name, text in axes.items() if text is not None}
+    # The defaults come first, so that what is given besides makes panels of their plane.
+    if not PHYSICAL & set(texts):
+        texts = {name: text for name, text in defaults.items() if name not in texts} | texts
+    return {name: parse_axis(name, text) for name, text in texts.items()}
+
+
+def device(constants: Iterable[str]) -> "Harvester":
+    """Make the device of Tables I and II with other constants, each written NAME=VALUE, with a unit or in SI."""
+    from vijax.model import units
+    from vijax.model.device import Harvester, with_constants
+
+    values = {}
+    for text in constants:
+        name, _, value = text.partition("=")
+        if not name:
+            raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}")
+        if name in AXES:
+            raise ValueError(
+                f"set must name a constant that has no option of its own; got {text!r}; give --{name}={value}"
+            )
+        number, unit = units.split(value)
+        try:
+            values[name] = float(number)
+        except ValueError:
+            raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}") from None
+        if unit:
+            values[name] = units.with_unit(name, values[name], unit)
+    with about("set"):
+        return with_constants(Harvester(), **values)
+
+
+@contextmanager
+def about(option: str) -> Iterator[None]:
+    """Name the option that a value came by in whatever is found wrong with it."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"--{option}: {error}") from None
+
+
+def part(option: str, text: str) -> float:
+    """Read a part of a whole, written 5% or 0.05."""
+    try:
+        return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError:
+        raise ValueError(f"{option} must be a part such as 5% or 0.05; got {text!r}") from None
+
+
+def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft") -> "tuple[ImpactPair, Harvester]":
+    """Find the pair that the axes give, each by one number, and the device that has it."""
+    from vijax.model.device import with_constants, with_pair
+    from vijax.model.pair import WALLS, impact_pair
+    from vijax.planes.axes import cells
+    from vijax.runtime import checks
+
+    for name, values in axes.items():
+        if values.size != 1:
+            raise ValueError(f"{name} must be one number here; got {values.size} of them")
+    checks.choice("wall", wall, WALLS)
+    given = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
+    d, kappa, r, gamma, A, omega = (float(given[name]) for name in ("d", "kappa", "r", "gamma", "A", "omega"))
+    device = with_constants(device, A=A, omega=omega, omega0=kappa * omega / math.pi)
+    pair = impact_pair(d, kappa if wall == "soft" else None, r, gamma)
+    return pair, with_pair(device, pair)

@@ -1,0 +1,161 @@
+"""`vijax basins`: which attractor each start ends on."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vijax.cli import options, process
+from vijax.cli.arguments import device, take_axes
+from vijax.cli.closing import finish, pace, tally
+from vijax.cli.kinds import Real, Whole
+from vijax.cli.page import Page, Sections
+from vijax.cli.progress import progress
+from vijax.cli.targets import targets
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vijax.planes.dataset import Plan
+
+_CELL = {"d": "0.2", "kappa": "3"}
+_FILES = ("basins.zarr", "basins.png")
+_MOST_ROWS = 24
+
+
+def coexisting(
+    constants: tuple[str, ...],
+    merge_mirrors: bool,
+    starts: int | None,
+    speed: float | None,
+    seed: int | None,
+    overwrite: bool,
+    yes: bool,
+    **given: Any,
+) -> None:
+    """Find the attractors that coexist, and their basins.
+
+    The plane is that of the starts u0 and v0; further arrays make panels. With --starts, the plane is that of the
+    parameters: how many attractors coexist in every cell, found from so many starts, and the share of each.
+    """
+    with process.door():
+        out, plot = targets(given.pop("out"), given.pop("plot"), _FILES, overwrite)
+        axes, made = take_axes(given, _CELL), device(constants)
+        planned = _plan(axes, made, starts, speed, seed, merge_mirrors=merge_mirrors, **given)
+        if plot is not None:
+            _check_picture(plot, planned)
+        process.keep_compiled()
+        _agree(planned, yes)
+    from vijax.planes import sweep
+
+    began = time.perf_counter()
+    with progress(planned.count, "starts") as show:
+        swept = sweep.run(planned, show)
+    said = pace(planned.count, time.perf_counter() - began, "starts")
+    from vijax.planes.basins import matched
+
+    dataset = matched(swept, merge_mirrors)
+    finish(dataset, "\n".join([said, *_summary(dataset)]), out, plot, _draw, overwrite)
+
+
+def _plan(
+    axes: dict[str, Any], device: Any, starts: int | None, speed: float | None, seed: int | None, **settings: Any
+) -> "Plan":
+    from vijax.planes.basins import SPEED, plan_basins, plan_fractions
+
+    if starts is not None:
+        speed = SPEED if speed is None else speed
+        return plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, **settings)
+    for name, value in (("speed", speed), ("seed", seed)):
+        if value is not None:
+            raise ValueError(f"{name} must come with starts; got {value} alone; add --starts 64")
+    return plan_basins(axes, device, **settings)
+
+
+def _agree(planned: "Plan", yes: bool) -> None:
+    from vijax.planes import estimate, sweep
+
+    sweep.check_room(planned)
+    process.agree(estimate.of(planned), yes)
+
+
+def _check_picture(path: Path, planned: "Plan") -> None:
+    from vijax.plots.style import check_format, layout_of_kinds
+
+    check_format(path)
+    layout_of_kinds({dim: size for dim, size in planned.cells.sizes.items() if dim != "start"})
+
+
+def _draw(dataset: "xr.Dataset", path: Path) -> None:
+    from vijax.plots import maps as pictures
+
+    (pictures.multistability_map if "start" in dataset.sizes else pictures.basin_map)(dataset, path)
+
+
+def _summary(dataset: "xr.Dataset") -> Iterator[str]:
+    """Name the attractors of every cell, or count how many cells have how many of them."""
+    cells = [str(dim) for dim in dataset["attractors"].dims]
+    if dataset["attractors"].size > 1:
+        yield f"cells by number of attractors: {tally(dataset['attractors'].values, '{:.0f}:'.format)}"
+        return
+    first = dataset.isel(dict.fromkeys(cells, 0))
+    mirrors = ", mirror images as one" if dataset.attrs["merge_mirrors"] else ""
+    yield f"{'label':<20}{'starts':>12}{'share':>9}{'P [J]':>12}{'v max [m/s]':>13}{'exponent':>10}  {mirrors[2:]}"
+    for n in range(min(first.sizes["attractor"], _MOST_ROWS)):
+        yield _row(first.isel(attractor=n))
+
+
+def _row(entry: "xr.Dataset") -> str:
+    label, share = str(entry["label"].values), 100 * float(entry["fraction"])
+    energy, speed, exponent = (float(entry[name].values.flat[0]) for name in ("P", "max_impact_speed", "lyapunov"))
+    looked = "" if entry["periodic"] else f"  looked for {float(entry['periods_run']):g} periods"
+    start = f"{label:<20}{int(entry['starts']):>12,}{share:>7.2f} %"
+    return f"{start}{energy:>12.4g}{speed:>13.4g}{exponent:>10.3g}{looked}"
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+_HELP = {
+    "d": "gap, dimensionless [0.2 unless --s, --omega0 or --k is given]",
+    "kappa": "stiffness, dimensionless [3 unless --s, --omega0 or --k is given]",
+    "u0": "displacements at the start, dimensionless [the whole gap, as many as of v0]",
+    "v0": "velocities at the start, dimensionless [-0.6:0.6:256]",
+}
+
+
+def _sections() -> Sections:
+    speed = Real("a positive finite number", min=0, min_open=True)
+    long = "forcing periods to look for an attractor"
+    return {
+        "Cell and starts": [*options.axis_options(**_HELP), *options.device_options()],
+        "Starts in every cell": [
+            click.Option(["--starts"], type=Whole(1), help="map parameters instead, with so many starts in every cell"),
+            click.Option(["--speed"], type=speed, help="with --starts: their largest velocity [0.6]"),
+            click.Option(["--seed"], type=Whole(0), help="with --starts: draw them at random [an even lattice]"),
+        ],
+        "Run": [
+            click.Option(["--merge-mirrors"], is_flag=True, help="count mirror images as one attractor (gamma = 0)"),
+            click.Option(["--periods"], type=Whole(1), default=400, show_default=True, help=long),
+            options.wall_option(),
+        ],
+        "Files": options.file_options(),
+        "Size": [options.size_option()],
+    }
+
+
+_EXAMPLES = (
+    "",
+    "--d 0.22 --kappa 40 --v0=-1:1:600 --plot basins.png",
+    "--wall rigid --d 0.19 --kappa 400 --v0=-0.6:0.6:1000 --plot basins.png",
+    "--d 0.05:0.3:48 --kappa 3:40:48:log --starts 64 --merge-mirrors --plot coexisting.png",
+)
+
+basins = Page(
+    "basins",
+    coexisting,
+    _sections(),
+    _EXAMPLES,
+    f"{options.VALUES} With neither --out nor --plot, basins.zarr and basins.png are written.",
+)

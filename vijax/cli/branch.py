@@ -1,0 +1,212 @@
+"""`vijax branch`: periodic orbits along a parameter, stable and unstable, with their bifurcations located."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vijax.cli import options, process
+from vijax.cli.arguments import about, at_one_point, device, take_axes
+from vijax.cli.closing import finish, pace
+from vijax.cli.kinds import Whole
+from vijax.cli.page import Page, Sections
+from vijax.cli.progress import progress, waiting
+from vijax.cli.targets import targets
+
+if TYPE_CHECKING:
+    from vijax.model.device import Harvester
+    from vijax.model.pair import ImpactPair
+    from vijax.orbits.continuation import Branch
+    from vijax.orbits.periodic import Orbit
+
+_FILES = ("branch.zarr", "branch.png")
+_START = {"d": "0.2", "kappa": "400"}
+_PARTS = (1 / 2, 1 / 4, 3 / 4, 1 / 8, 3 / 8, 5 / 8, 7 / 8)  # of the bounds: where orbits to begin with are looked for
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Branches that are asked for.
+
+    Attributes:
+        pair, device: What the orbits belong to.
+        impacts, guesses, generations: As `periodic.search` and `continuation.family` take them.
+        along, within: The parameter that is followed, and its bounds.
+        places: Values of it at which orbits to begin with are looked for, in turn.
+    """
+
+    pair: "ImpactPair"
+    device: "Harvester"
+    impacts: str
+    guesses: int
+    generations: int
+    along: str
+    within: tuple[float, float]
+    places: list[float]
+
+
+def branches(
+    quantity: str, out: str | None, plot: str | None, overwrite: bool, constants: tuple[str, ...], **given: Any
+) -> None:
+    """Follow periodic orbits, and locate what they meet.
+
+    Followed is d, kappa, r, gamma, omega, omega0, k, s, A or beta. The orbits start at the parameters given, with the
+    impacts asked for: walls in order, such as RLL, or a label n:m/pT. Where that parameter is not given, they start at
+    the device's own value, or where there are orbits within its bounds.
+    """
+    with process.door():
+        store, picture = targets(out, plot, _FILES, overwrite)
+        asked = _asked(constants, **given)
+        _check_picture(picture, quantity)
+    process.keep_compiled()
+    from vijax.orbits import continuation
+
+    began = time.perf_counter()
+    with progress(2, "stages") as show:
+        waiting("search for orbits, compiled at first")
+        with process.door():
+            found = _found(asked)
+        show(1, 2)
+        waiting("branches, compiled at first")
+        followed = continuation.family(
+            found, asked.along, asked.within, device=asked.device, generations=asked.generations
+        )
+        show(2, 2)
+    seconds = time.perf_counter() - began
+
+    def draw(dataset: Any, path: Path) -> None:
+        from vijax.plots import branches as pictures
+
+        pictures.branches(dataset, path, quantity)
+
+    dataset = continuation.dataset(followed, asked.device)
+    finish(dataset, _summary(followed, seconds), store, picture, draw, overwrite)
+
+
+def _asked(
+    constants: tuple[str, ...], along: str, impacts: str, guesses: int, generations: int, wall: str, **given: Any
+) -> Asked:
+    from vijax.orbits import continuation, periodic
+    from vijax.runtime import checks
+
+    name, within = _bounds(along)
+    chosen = given.get(name) is not None
+    # Along a quantity of the device it is a device that is given, of Tables I and II unless otherwise.
+    start = {} if name in options.DEVICE else _START
+    pair, made = at_one_point(take_axes(given, start), device(constants), wall)
+    checks.whole("generations", generations, 0, continuation.MOST_GENERATIONS)
+    walls, _ = periodic.sequences(impacts)
+    periodic.check_guesses(guesses, len(walls))
+    with about("along"):
+        continuation.check_along(pair, name, within)
+    places = list(_places(float(continuation.value_at(pair, name, made)), name, within, chosen))
+    return Asked(pair, made, impacts, guesses, generations, name, within, places)
+
+
+def _check_picture(path: Path | None, quantity: str) -> None:
+    from vijax.plots.branches import check_branch_quantity
+    from vijax.plots.style import check_format
+
+    check_branch_quantity(quantity)
+    if path is not None:
+        check_format(path)
+
+
+def _bounds(along: str) -> tuple[str, tuple[float, float]]:
+    from vijax.model.quantities import AXES
+    from vijax.planes.axes import parse_axis
+
+    name, sign, text = along.partition("=")
+    if not sign or name not in AXES or text.count(":") != 1:
+        raise ValueError(f"along must be NAME=LO:HI, as in d=0.1:0.3; got {along!r}")
+    with about("along"):
+        low, high = parse_axis(name, text.replace(":", ","))
+    return name, (float(low), float(high))
+
+
+def _places(own: float, name: str, within: tuple[float, float], chosen: bool) -> Iterator[float]:
+    """Give the places where branches may begin: the device's own value and, unless that was chosen, others."""
+    low, high = within
+    if low <= own <= high:
+        yield own
+    elif chosen:
+        raise ValueError(f"{name} must lie within the bounds of along to begin there; got {own:.6g}; leave it out")
+    if not chosen:
+        yield from (low + part * (high - low) for part in _PARTS)
+
+
+def _found(asked: Asked) -> "Orbit":
+    """Search for orbits, and take those at the first place that has any."""
+    from vijax.orbits import continuation, periodic
+
+    for place in asked.places:
+        pair = continuation.pair_at(asked.pair, asked.along, place, asked.device)
+        if len(found := periodic.search(pair, asked.impacts, guesses=asked.guesses)):
+            return found
+    tried = ", ".join(f"{place:.6g}" for place in asked.places)
+    raise ValueError(
+        f"impacts must be those of an orbit where the branch begins; got none with {asked.impacts} at {asked.along} = "
+        f"{tried}; try more guesses"
+    )
+
+
+def _summary(followed: "list[Branch]", seconds: float) -> str:
+    """Say of each branch in a line: its label, its range, how much of it is stable, what it met, how it ends."""
+    from vijax.model.label import label
+    from vijax.orbits import periodic
+
+    lines = [pace(sum(len(one.values) for one in followed), seconds, "orbits")]
+    for one in followed:
+        counts = periodic.counts(one.orbit)
+        name = Counter(label(counts.period, counts.left, counts.right).tolist()).most_common(1)[0][0]
+        met = ", ".join(f"{point.kind} {point.value:.8g}" for point in one.points) or "nothing"
+        span = f"{one.along} {one.values.min():.6g} to {one.values.max():.6g}"
+        lines.append(f"{name}: {span}, {100 * one.stable.mean():.0f} % of its orbits stable; met {met}")
+        lines.append(f"    ends: {one.ends[0]}; {one.ends[1]}")
+    return "\n".join(lines)
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+
+def _sections() -> Sections:
+    shown: dict[str, Any] = {"show_default": True}
+    switches = "how often to switch at flip and pitchfork"
+    return {
+        "Branch": [
+            click.Option(
+                ["--along"], default="d=0.1:0.3", metavar="NAME=LO:HI", help="parameter and its bounds", **shown
+            ),
+            click.Option(["--impacts"], default="1:1", help="walls in order (RLL), or a label n:m/pT", **shown),
+            click.Option(
+                ["--guesses"], type=Whole(1), default=1024, help="random guesses of each sequence of walls", **shown
+            ),
+            click.Option(["--generations"], type=Whole(0), default=1, help=switches, **shown),
+        ],
+        "Device": [
+            *options.axis_options(u0=None, v0=None),
+            *options.device_options(),
+            options.wall_option(),
+        ],
+        "Files": [options.quantity_option(options.BRANCH_QUANTITIES), *options.file_options()],
+    }
+
+
+_EXAMPLES = (
+    "",
+    "--wall rigid --d 0.19 --impacts RLL --along d=0.1:0.3",
+    "--s 0.2 --omega 11 --impacts 1:1/3T --along omega=2.5:13 --generations 2",
+    "--s 0.3 --along omega0=20:400 --quantity P",
+)
+
+branch = Page(
+    "branch",
+    branches,
+    _sections(),
+    _EXAMPLES,
+    f"{options.VALUES} With neither --out nor --plot, branch.zarr and branch.png are written.",
+)

@@ -1,0 +1,73 @@
+"""The lines that end a run: what was found, how fast, what was written."""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_STARTED = time.perf_counter()
+
+
+def finish(
+    dataset: "xr.Dataset",
+    summary: str,
+    out: Path | None,
+    plot: Path | None,
+    picture: "Callable[[xr.Dataset, Path], Any]",
+    overwrite: bool,
+    kept: bool = False,
+) -> None:
+    """Write the store, unless the run did, and the picture; say what was found and written, and how long it took."""
+    if out is not None and not kept:
+        from vijax.planes.store import save
+
+        save(dataset, out, overwrite=overwrite)
+    if plot is not None:
+        picture(dataset, plot)
+    close(summary, out, plot)
+
+
+def close(summary: str, *written: Path | None) -> None:
+    """Say what the run found, what was written and how long it all took."""
+    click.echo(summary)
+    click.echo(f"wrote {', '.join(str(path) for path in written if path)}")
+    click.echo(f"{time.perf_counter() - _STARTED:.1f} s from start to end")
+
+
+def pace(count: int, seconds: float, unit: str = "cells") -> str:
+    """Say how much was done in what time."""
+    rate = count / seconds
+    return f"{count:,} {unit} in {seconds:.2f} s, {rate:{',.0f' if rate >= 100 else '.3g'}} {unit}/s"
+
+
+def flags(variable: "xr.DataArray") -> str:
+    """Count how often each value of a variable with CF flags occurs."""
+    names = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
+    return tally(variable.values, names.get)
+
+
+def statuses(variable: "xr.DataArray", of: str = "cells") -> str:
+    """Count how often each status occurs; below, say what to do about those that are not OK."""
+    from vijax.model.records import Status
+
+    lines = [f"{of} by status: {flags(variable)}"]
+    found = [status for status in Status if status != Status.OK and (variable == status).any()]
+    return "\n".join([*lines, *(f"    {status.name.lower()}: {status.advice}" for status in found)])
+
+
+def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:
+    """Count how often each name occurs among values, the least values first, or those least by `order`."""
+    import numpy as np
+
+    kinds, counts = np.unique(values, return_counts=True)
+    found: Counter[str] = Counter()
+    rows = zip(kinds.tolist(), counts.tolist(), strict=True)
+    for kind, count in sorted(rows, key=lambda row: (order or float)(row[0])):
+        found[str(name(kind))] += count
+    return ", ".join(f"{word} {n:,}" for word, n in found.items())

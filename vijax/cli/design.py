@@ -1,0 +1,279 @@
+"""`vijax design`: the best membrane, what surrounds it, and what tolerances make of it."""
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vijax.cli import options, process
+from vijax.cli.arguments import about, at_one_point, device, part, take_axes
+from vijax.cli.closing import close
+from vijax.cli.kinds import Choice, Whole
+from vijax.cli.page import Page, Sections
+from vijax.cli.progress import progress, waiting
+from vijax.cli.targets import targets
+
+if TYPE_CHECKING:
+    import numpy as np
+    import xarray as xr
+
+    from vijax.design.optimise import Design
+    from vijax.design.tolerance import Tolerance
+    from vijax.model.device import Harvester
+
+_FILES = ("design.json", "design.png")
+_POINTS, _NEAR = 320, 160  # of the picture, and of its close view
+_OVER_TOLERANCES = ("mean", "worst")
+_BASINS = 2000  # starts that show what attracts at the optimum
+_STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the last
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Designs that are asked for.
+
+    Attributes:
+        devices: One, or one for each value of the axis `over`.
+        over: The axis along which designs are wanted, and its values.
+        tolerances: By how much constants may be off.
+        search: Of the arguments of `optimise_all` all the others.
+    """
+
+    devices: "list[Harvester]"
+    over: "tuple[str, np.ndarray] | None"
+    tolerances: "tuple[Tolerance, ...]"
+    search: dict[str, Any]
+
+
+def best(out: str | None, plot: str | None, overwrite: bool, yes: bool, **given: Any) -> None:
+    """Find the membrane that harvests most and can be built.
+
+    Tuned are omega0 (or k, or kappa), s or d, r, A, omega, beta or gamma, and the constants of the membrane. With
+    --over the best design is found for every value of an axis.
+    """
+    with process.door():
+        written, picture = targets(out, plot, _FILES, overwrite, ".json")
+        if picture is not None:
+            _check_format(picture)
+        asked = _asked(**given)
+        process.keep_compiled()
+        _agree(asked, yes)
+    whole, diagram, climbed = _run(asked)
+    _write(whole, diagram, written, picture)
+    close("\n".join([climbed, *_lines(whole)]), written, picture)
+
+
+def _check_format(picture: Path) -> None:
+    from vijax.plots.style import check_format
+
+    check_format(picture)
+
+
+def _asked(
+    tune: str,
+    bounds: tuple[str, ...],
+    tolerance: tuple[str, ...],
+    objective: str,
+    over: str | None,
+    constants: tuple[str, ...],
+    steps: int,
+    balls: int,
+    impacts: int,
+    **given: Any,
+) -> Asked:
+    from vijax.design import optimise
+
+    names = tuple(name.strip() for name in tune.split(","))
+    along, devices = _devices(over, take_axes(given, {}), device(constants), names)
+    scatter = _tolerances(tolerance)
+    within = _bounds(bounds)
+    weighed = scatter if objective in _OVER_TOLERANCES else ()
+    optimise.check(devices, names, within, objective, weighed)
+    search = {"tune": names, "bounds": within, "objective": objective, "tolerances": weighed}
+    return Asked(devices, along, scatter, search | {"steps": steps, "balls": balls, "impacts": impacts})
+
+
+def _agree(asked: Asked, yes: bool) -> None:
+    from vijax.design import optimise
+
+    effort = optimise.effort(*(asked.search[name] for name in ("steps", "balls", "impacts")))
+    process.agree(optimise.expected(len(asked.devices), effort), yes)
+
+
+def _run(asked: Asked) -> "tuple[dict[str, Any], xr.Dataset | None, str]":
+    """Find the designs; give the report, the diagram along the first tuned axis, and how long the ascents took."""
+    from vijax.design import optimise, report
+
+    alone = asked.over is None
+    stages, diagram = _STAGES if alone else 2, None
+    with progress(stages, "stages") as show:
+        waiting("survey and ascents, compiled at first")
+        began = time.perf_counter()
+        found = optimise.optimise_all(asked.devices, **asked.search)
+        seconds = time.perf_counter() - began
+        show(1, stages)
+        if alone:
+            waiting("orbit diagram")
+            diagram = _diagram(found[0], asked.devices[0])
+            show(2, stages)
+        waiting("surroundings and tolerances")
+        told = [report.describe(one, diagram=diagram, **_judged(one, asked.tolerances, alone)) for one in found]
+        show(stages, stages)
+    climbed = f"{sum(one.starts for one in found):,} ascents in {seconds:.1f} s"
+    if asked.over is None:
+        return told[0], diagram, climbed
+    return {"over": {"name": asked.over[0], "values": asked.over[1]}, "designs": told}, None, climbed
+
+
+def _write(whole: dict[str, Any], diagram: "xr.Dataset | None", written: Path | None, picture: Path | None) -> None:
+    from vijax.plots import designs as pictures
+    from vijax.runtime.files import write_json
+
+    if written is not None:
+        write_json(whole, written)
+    if picture is not None and diagram is not None:
+        pictures.design(diagram, whole, picture)
+    elif picture is not None:
+        pictures.design_map(whole, picture)
+
+
+def _lines(whole: dict[str, Any]) -> Iterable[str]:
+    from vijax.design import report
+
+    return report.table(whole) if "over" in whole else report.lines(whole)
+
+
+def _devices(
+    over: str | None, axes: dict[str, Any], device: "Harvester", names: tuple[str, ...]
+) -> "tuple[tuple[str, np.ndarray] | None, list[Harvester]]":
+    """Give the axis along which designs are wanted, if there is one, and the device at each of its values."""
+    import numpy as np
+
+    from vijax.design.variables import constant
+    from vijax.model.quantities import AXES
+    from vijax.planes.axes import parse_axis
+
+    if over is None:
+        return None, [at_one_point(axes, device)[1]]
+    name, sign, text = over.partition("=")
+    if not sign or name not in AXES or name in ("u0", "v0"):
+        raise ValueError(f"over must be NAME=VALUES, as in d=0.05:0.3:64; got {over!r}")
+    if name in axes:
+        raise ValueError(f"over must name an axis that is not given besides; got {name}, also given by --{name}")
+    if constant(name) in map(constant, names):
+        raise ValueError(f"over must name what is not tuned; got {name}, with {', '.join(names)} tuned")
+    with about("over"):
+        values = np.atleast_1d(parse_axis(name, text))
+    return (name, values), [at_one_point({**axes, name: value}, device)[1] for value in values]
+
+
+def _bounds(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """Read bounds written NAME=LO:HI."""
+    from vijax.design.variables import NAMES
+    from vijax.planes.axes import parse_axis
+
+    found = {}
+    for text in texts:
+        name, sign, pair = text.partition("=")
+        if not sign or name not in NAMES or pair.count(":") != 1:
+            raise ValueError(f"bounds must be NAME=LO:HI of a tuned quantity, as in omega0=20:400; got {text!r}")
+        with about("bounds"):
+            low, high = parse_axis(name, pair.replace(":", ","))
+        found[name] = (float(low), float(high))
+    return found
+
+
+def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
+    """Read tolerances written NAME=5%, NAME=0.05 or NAME=5%:lognormal, apart by commas."""
+    from vijax.design.tolerance import Tolerance, check_tolerances
+
+    found = []
+    for text in (item.strip() for several in texts for item in several.split(",")):
+        name, _, rest = text.partition("=")
+        spread, _, kind = rest.partition(":")
+        if not name or not spread:
+            raise ValueError(f"tolerance must be NAME=5%, with :lognormal or not; got {text!r}")
+        found.append(Tolerance(name, part("tolerance", spread), kind or "uniform"))
+    with about("tolerance"):
+        return check_tolerances(found)
+
+
+def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
+    """Compute P up and down along the first tuned axis, closer by about the best design, all else as there."""
+    import numpy as np
+
+    from vijax.design.variables import LINEAR, limits
+    from vijax.model.quantities import AXES
+    from vijax.planes.orbit_diagram import orbit_diagram
+    from vijax.plots.designs import close_view
+
+    along = next((name for name in found.tune if name in AXES), "omega0")
+    device = found.best.device if found.best else device
+    low, high = limits((along,), {along: found.bounds[along]} if along in found.bounds else {}, device)[:, 0]
+    values = (np.linspace if along in LINEAR else np.geomspace)(low, high, _POINTS)
+    if found.best is not None and along in found.best.values:
+        first, last = close_view(along, found.best.values[along])
+        near = np.linspace(max(first, low), min(last, high), _NEAR)
+        values = np.unique(np.concatenate([values, near]))
+    return orbit_diagram(along=along, values=values, direction="both", device=device)
+
+
+def _judged(found: "Design", scatter: "tuple[Tolerance, ...]", alone: bool) -> dict[str, Any]:
+    """Find what becomes of the best design over the tolerances; what lies around it, where it is the only one."""
+    from vijax.design.optimise import under
+    from vijax.design.robustness import surroundings
+
+    if found.best is None:
+        return {"tolerances": scatter}
+    around = surroundings(found.best, starts=_BASINS) if alone else None
+    return {"tolerances": scatter, "spread": under(found.best, scatter) if scatter else None, "surroundings": around}
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+
+def _goal_options() -> list[click.Parameter]:
+    shown: dict[str, Any] = {"show_default": True}
+    within = "of a tuned quantity [kappa 2 to 400, r 0.05 to 0.95]"
+    off, goal = "by how much a constant may be off", "what is made most; mean and worst are over the tolerances"
+    return [
+        click.Option(["--tune"], default="omega0", metavar="NAME,NAME", help="what is tuned", **shown),
+        click.Option(["--bounds"], multiple=True, metavar="NAME=LO:HI", help=within),
+        click.Option(["--tolerance"], multiple=True, metavar="NAME=5%[:lognormal]", help=off),
+        click.Option(["--objective"], type=Choice(options.OBJECTIVES), default="P", help=goal, **shown),
+        click.Option(["--over"], metavar="NAME=VALUES", help="axis along which to find the best designs"),
+    ]
+
+
+def _sections() -> Sections:
+    shown: dict[str, Any] = {"show_default": True}
+    return {
+        "Goal": _goal_options(),
+        "Survey": [
+            click.Option(["--steps"], type=Whole(2), default=256, help="values at which the survey looks", **shown),
+            click.Option(["--balls"], type=Whole(1), default=8, help="starts of the survey at each of them", **shown),
+            click.Option(["--impacts"], type=Whole(1), default=16, help="most impacts of an orbit", **shown),
+        ],
+        "Device": [*options.axis_options(u0=None, v0=None), *options.device_options()],
+        "Files": options.file_options(".json", "report"),
+        "Size": [options.size_option()],
+    }
+
+
+_EXAMPLES = (
+    "",
+    "--d 0.2 --r 0.5 --A 3 --omega 10pi --set V=1700 --tolerance omega0=5%",
+    "--d 0.2 --tune omega0,r --bounds r=0.3:0.8 --tolerance omega0=5%,s=1% --objective worst",
+    "--over d=0.05:0.3:64 --out designs.json --plot designs.png",
+)
+
+design = Page(
+    "design",
+    best,
+    _sections(),
+    _EXAMPLES,
+    f"{options.VALUES} With neither --out nor --plot, design.json and design.png are written.",
+)

@@ -1,0 +1,64 @@
+"""The page of `scripts/grid.py`: `vijax sweep`, and with --compare `vijax compare`."""
+
+from typing import Any
+
+import click
+
+from vijax.cli import process
+from vijax.cli import sweep as page
+from vijax.cli.compare import difference_map, tolerance_option
+from vijax.cli.kinds import Choice
+from vijax.cli.page import Page, Sections
+
+_METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", "chi", "exponent")
+
+
+def map_or_difference(compare: str | None, tolerance: str | None, **given: Any) -> None:
+    """Map the energy harvested over a plane of parameters."""
+    if compare is None:
+        with process.door():
+            if tolerance is not None:
+                raise ValueError(f"tolerance must come with compare; got {tolerance} alone; add --compare rigid")
+        page.power_map(**given)
+    else:
+        with process.door():
+            _leave_out(given)
+        difference_map(tolerance=tolerance, **given)
+
+
+def _leave_out(given: dict[str, Any]) -> None:
+    """Take out what a comparison does not know, or raise where it was chosen."""
+    if (show := given.pop("show")) != "P":
+        raise ValueError(f"show must be left out with compare, which shows the difference in P; got {show}")
+    if (wall := given.pop("wall")) != "soft":
+        raise ValueError(f"wall must not be chosen with compare, which runs soft and rigid ones; got {wall!r}")
+    if (outputs := given.pop("outputs")) is not None:
+        raise ValueError(f"outputs must not be chosen with compare; got {outputs!r}; leave them out")
+    if (levels := given.pop("refine")) is not None:
+        raise ValueError(f"refine must not be chosen with compare, which computes every cell; got {levels}")
+    for name in _METHOD_OPTIONS:
+        if (value := given.pop(name)) not in (None, "exact"):
+            raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
+    crew = [given.pop(name) for name in ("workers", "scheduler")]
+    if crew != [None, None]:
+        raise ValueError(f"workers must be left out with compare, which runs in one process; got {crew[0] or crew[1]}")
+
+
+def _sections() -> Sections:
+    rigid = click.Option(
+        ["--compare"], type=Choice(["rigid"]), metavar="rigid", help="map what rigid walls change instead"
+    )
+    found = dict(page.sections())
+    files, size = found.pop("Files"), found.pop("Size")
+    return found | {"Comparison": [rigid, tolerance_option("with --compare: ")], "Files": files, "Size": size}
+
+
+_EXAMPLES = (*page.EXAMPLES, "--kappa 3:4000:128:log --compare rigid --tolerance 5%")
+
+grid = Page(
+    "grid",
+    map_or_difference,
+    _sections(),
+    _EXAMPLES,
+    f"{page.NEITHER} Of a comparison they are comparison.zarr and comparison.png. {page.GOES_ON}",
+)

@@ -1,0 +1,49 @@
+"""The command `vijax`: a group of pages, each imported when it is asked for."""
+
+from importlib import import_module
+
+import click
+
+from vijax.cli.process import run
+
+_PAGES = {
+    "sweep": "sweep",
+    "compare": "compare",
+    "orbit-diagram": "orbit_diagram",
+    "basins": "basins",
+    "branch": "branch",
+    "design": "design",
+}
+
+
+class Pages(click.Group):
+    """The group of subcommands. A page is a room of this folder, and what it is called there."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """List the subcommands in the order of help."""
+        return list(_PAGES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the page of a subcommand."""
+        room = _PAGES.get(cmd_name)
+        return None if room is None else getattr(import_module(f"vijax.cli.{room}"), room)
+
+
+@click.group(
+    cls=Pages,
+    invoke_without_command=True,
+    epilog="`vijax sweep --help` has the options of a sweep, and lines to begin with. A shell completes options and "
+    'choices after eval "$(_VIJAX_COMPLETE=bash_source vijax)"; likewise zsh_source, and fish_source for source.',
+    context_settings={"max_content_width": 120},
+)
+@click.version_option(package_name="vijax", message="vijax %(version)s")
+@click.pass_context
+def vijax(ctx: click.Context) -> None:
+    """Map, compare and design vibro-impact energy harvesters with soft and hard walls."""
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit code of the command; see `process.run`."""
+    return run(vijax, arguments)

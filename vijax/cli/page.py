@@ -1,0 +1,55 @@
+"""A subcommand whose help shows its options in sections, and ends with lines to copy."""
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import click
+
+Sections = Mapping[str, Sequence[click.Parameter]]
+"""Options under the title that help shows them by."""
+
+
+class Page(click.Command):
+    """A subcommand of `vijax`, or a script.
+
+    Attributes:
+        sections: Its options by title, in the order of help.
+        examples: Arguments that it may be called with.
+    """
+
+    def __init__(
+        self, name: str, callback: Callable[..., None], sections: Sections, examples: Sequence[str], epilog: str
+    ) -> None:
+        """Take the options from the sections and the first words of help from the callback's docstring."""
+        self.sections, self.examples = sections, examples
+        super().__init__(
+            name,
+            context_settings={"max_content_width": 120},
+            callback=callback,
+            params=[option for options in sections.values() for option in options],
+            help=inspect.getdoc(callback),
+            epilog=epilog,
+        )
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write a section for each title; the last has --help too."""
+        shown = {title: list(_records(options, ctx)) for title, options in self.sections.items()}
+        shown[next(reversed(shown))].extend(_records([self.get_help_option(ctx)], ctx))
+        # One column for all of them, however long the names of a section are.
+        width = max(len(names) for rows in shown.values() for names, _ in rows)
+        for title, rows in shown.items():
+            with formatter.section(title):
+                formatter.write_dl([(names.ljust(width), text) for names, text in rows], col_max=width)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog, then the examples as they are typed: a line each, however long."""
+        super().format_epilog(ctx, formatter)
+        with formatter.section("Examples"):
+            for arguments in self.examples:
+                formatter.write(" " * formatter.current_indent + f"{ctx.command_path} {arguments}".rstrip() + "\n")
+
+
+def _records(options: Sequence[click.Parameter | None], ctx: click.Context) -> Iterator[tuple[str, str]]:
+    for option in options:
+        if option is not None and (record := option.get_help_record(ctx)) is not None:
+            yield record

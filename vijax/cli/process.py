@@ -1,0 +1,114 @@
+"""What the process of a command does: bad input is one line, warnings are, signals have their exit codes.
+
+A page is one `door`, one run under `progress` and one `closing.finish`.
+"""
+
+import io
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from vijax.planes.estimate import Estimate
+
+
+@contextmanager
+def door() -> Iterator[None]:
+    """Turn what is raised within into one line and exit code 2: bad input, before anything runs."""
+    try:
+        yield
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        raise click.UsageError(str(error)) from None
+
+
+def agree(expected: "Estimate", yes: bool) -> None:
+    """Ask whether a long run is meant, or refuse it where nobody can answer."""
+    if not expected.long or yes:
+        return
+    if not sys.stdin.isatty():
+        raise ValueError(f"yes must be given beyond an hour or 10 GB; got {expected}; add --yes, or ask for less")
+    click.confirm(f"{expected}: begin?", abort=True, err=True)
+
+
+def keep_compiled() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX was told of another."""
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(cache / "vijax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def import_beside(module: str) -> None:
+    """Import what will be wanted at the end while XLA compiles or loads, which needs no Python."""
+    threading.Thread(target=import_module, args=(module,), daemon=True).start()
+
+
+def run(command: click.Command, arguments: list[str] | None = None) -> int:
+    """Run a command and return its exit code.
+
+    It is 0; 1 if what is to be written could not be; 2 after bad input, when nothing was run. After Ctrl-C the process
+    ends with 130, after SIGTERM with 143.
+    """
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _terminate)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show must not end a finished run
+    try:
+        with _warnings_told():
+            command.main(arguments, standalone_mode=False)
+    except click.ClickException as error:
+        click.echo(f"error: {error.format_message()}", err=True)
+        return 2
+    except (click.Abort, KeyboardInterrupt) as error:
+        cause = error.__cause__ or error
+        click.echo(f"stopped; {_kept(cause)}", err=True)
+        # A compiled call cannot be stopped: leave without waiting for it.
+        os._exit(143 if isinstance(cause, _Terminated) else 130)
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
+        os._exit(1)
+    return 0
+
+
+@contextmanager
+def _warnings_told() -> Iterator[None]:
+    """Turn what vijax warns of into one line, told once."""
+    from tqdm import tqdm
+
+    told: set[str] = set()
+
+    def tell(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in told:
+            told.add(str(message))
+            tqdm.write(f"warning: {message}", file=sys.stderr)  # beside a bar that may be there
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=UserWarning, module="vijax")
+        warnings.showwarning = tell
+        yield
+
+
+class _Terminated(KeyboardInterrupt):
+    """What SIGTERM raises."""
+
+
+def _terminate(signum: int, frame: Any) -> None:
+    raise _Terminated
+
+
+def _kept(error: BaseException) -> str:
+    """Say what became of the files of a run that came to no end."""
+    return " ".join(getattr(error, "__notes__", ["nothing half-written is left"]))

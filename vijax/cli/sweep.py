@@ -1,0 +1,293 @@
+"""`vijax sweep`: a map over a plane of parameters."""
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vijax.cli import options, process
+from vijax.cli.arguments import device, take_axes
+from vijax.cli.closing import finish, statuses, tally
+from vijax.cli.kinds import Choice, Real, Whole
+from vijax.cli.page import Page, Sections
+from vijax.cli.progress import counted
+from vijax.cli.targets import targets
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from vijax.planes.dataset import Plan
+
+PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
+_LONG = 9  # periods from here on are counted together
+_FILES = {"P": ("power_map.zarr", "power_map.png"), "label": ("label_map.zarr", "label_map.png")}
+
+
+def power_map(
+    constants: tuple[str, ...],
+    outputs: str | None,
+    show: str,
+    overwrite: bool,
+    workers: int | None,
+    scheduler: str | None,
+    yes: bool,
+    **given: Any,
+) -> None:
+    """Map the energy harvested over a plane of parameters."""
+    with process.door():
+        _check_show(show, given["until"])
+        files = _FILES.get(show, (f"{show}_map.zarr", f"{show}_map.png"))
+        out, plot = targets(given.pop("out"), given.pop("plot"), files, overwrite, goes_on=True)
+        axes, made = take_axes(given, PLANE), device(constants)
+        planned = _plan(axes, made, _wanted(outputs, show), given)
+        if plot is not None:
+            _check_picture(plot, planned, show)
+        crew = _crew(planned, workers, scheduler, out)
+        _check_room(planned, out, overwrite)
+        process.keep_compiled()
+        _agree(planned, yes)
+    if plot is not None:
+        process.import_beside("vijax.plots.maps")
+    from vijax.planes import sweep as sweeps
+
+    dataset, pace = counted(planned.count, lambda tell: sweeps.run(planned, tell, out, overwrite, crew))
+    finish(dataset, f"{pace}\n{_summary(dataset)}", out, plot, partial(_draw, show), overwrite, kept=True)
+
+
+def _crew(planned: "Plan", workers: int | None, scheduler: str | None, out: Path | None) -> int | str | None:
+    """Say who runs the tiles, unless this process does."""
+    from vijax.planes.sweep import check_workers
+
+    if workers is not None and scheduler is not None:
+        raise ValueError(f"workers must be left out with scheduler, which has its own; got {workers}")
+    crew = scheduler if workers is None else workers
+    if crew is not None:
+        check_workers(planned, crew, out)
+    return crew
+
+
+def _check_room(planned: "Plan", out: Path | None, overwrite: bool) -> None:
+    from vijax.planes import sweep as sweeps
+
+    if out is None:
+        sweeps.check_room(planned)
+    else:
+        sweeps.check(planned, out, overwrite)
+
+
+def _agree(planned: "Plan", yes: bool) -> None:
+    from vijax.planes import estimate
+
+    process.agree(estimate.of(planned), yes)
+
+
+def _check_show(show: str, until: str) -> None:
+    from vijax.planes.dataset import OUTPUTS
+
+    if show != "label" and show not in OUTPUTS:
+        raise ValueError(f"show must be label, or among {', '.join(OUTPUTS)}; got {show!r}")
+    if show == "label" and until != "attractor":
+        raise ValueError(f"show must not be label unless cells are run until their attractor; got until {until}")
+
+
+def _wanted(outputs: str | None, show: str) -> list[str] | None:
+    if outputs is not None:
+        return [name.strip() for name in outputs.split(",")]
+    from vijax.planes.dataset import ON_REQUEST, OUTPUTS
+
+    shown = "lyapunov" if show == "label" else show
+    return [name for name in OUTPUTS if name not in ON_REQUEST or name == shown]
+
+
+def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, settings: dict[str, Any]) -> "Plan":
+    from vijax.planes.sweep import plan
+
+    settings["membrane"] = _membrane(settings["membrane"], settings.pop("chi"), settings.pop("exponent"))
+    return plan(axes, outputs, device, **settings)
+
+
+def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
+    from vijax.model.membrane import HuntCrossley, Linear
+
+    if name == "hunt-crossley":
+        if chi is None:
+            raise ValueError("chi must be given with --membrane hunt-crossley; got none")
+        return HuntCrossley(chi) if exponent is None else HuntCrossley(chi, exponent)
+    for option, value in (("chi", chi), ("exponent", exponent)):
+        if value is not None:
+            raise ValueError(f"{option} must be left out unless --membrane is hunt-crossley; got {value:g}")
+    if name not in (None, "linear"):
+        raise ValueError(f"membrane must be linear or hunt-crossley; got {name!r}")
+    return None if name is None else Linear()
+
+
+def _check_picture(path: Path, planned: "Plan", show: str) -> None:
+    from vijax.planes.dataset import specimen
+    from vijax.plots import style
+
+    style.check_format(path)
+    needs = {"label": style.LABEL_NEEDS, "P": style.NEEDS}.get(show, (show,))
+    missing = [name for name in needs if name not in planned.outputs]
+    if missing:
+        raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
+    sizes = planned.cells.sizes
+    if show == "label":
+        style.layout_of_kinds({dim: sizes[dim] for dim in planned.cells.dynamic})
+        return
+    if show == "P":
+        style.layout(sizes)
+        return
+    drawn = specimen(planned)[show]  # its dimensions are those that it depends on
+    fits = style.layout_of_kinds if style.is_kind(drawn) else style.layout
+    fits({str(dim): sizes[str(dim)] for dim in drawn.dims})
+
+
+def _draw(show: str, dataset: "xr.Dataset", path: Path) -> None:
+    from vijax.plots import maps as pictures
+
+    known = {"P": pictures.power_map, "label": pictures.label_map}
+    if show in known:
+        known[show](dataset, path)
+    else:
+        pictures.variable_map(dataset, show, path)
+
+
+def _summary(dataset: "xr.Dataset") -> str:
+    """Say what the map holds, in a few lines: cells by status and by period, the best of them."""
+    from vijax.planes.dataset import best
+
+    lines = [statuses(dataset["status"])]
+    if "computed" in dataset:
+        computed, shown = dataset.attrs["refine_computed"], dataset.attrs["refine_shown"]
+        lines.insert(0, f"cells computed: {computed:,} of {shown:,} shown, {computed / shown:.1%}; the others filled")
+    if "period" in dataset:
+        names = {-1: "undecided", 0: "aperiodic"} | {n: f"period {n}" for n in range(1, _LONG)}
+        periods = tally(
+            dataset["period"].values,
+            lambda period: names.get(period, f"{_LONG} and more"),
+            order=lambda period: period if period > 0 else math.inf,
+        )
+        lines.append(f"cells by period: {periods}")
+    if {"P", "admissible"} <= set(dataset):
+        peak = best(dataset)
+        lines.append(f"largest admissible P: {'none' if peak is None else _place(peak, dataset)}")
+    return "\n".join(lines)
+
+
+def _place(peak: "xr.DataArray", dataset: "xr.Dataset") -> str:
+    where = ", ".join(f"{dim} = {float(peak[dim]):.6g}" for dim in dataset["P"].dims)
+    return f"{float(peak):.6g} J per half period at {where or 'the only cell'}"
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+
+def plane_options() -> list[click.Parameter]:
+    """Make options of the axes, with the plane that is mapped by default, and of the device."""
+    planes = {
+        name: f"{options.AXES[name]} [{text} unless --s, --omega0 or --k is given]" for name, text in PLANE.items()
+    }
+    return [*options.axis_options(**planes), *options.device_options()]
+
+
+def run_options() -> list[click.Parameter]:
+    """Make options of how long cells are run."""
+    shown: dict[str, Any] = {"show_default": True}
+    return [
+        click.Option(["--periods"], type=Whole(1), default=400, help="forcing periods to run, at most", **shown),
+        click.Option(
+            ["--until"], type=Choice(options.UNTIL), default="attractor", help="what cells are run to", **shown
+        ),
+        click.Option(["--transient"], type=Whole(0), default=0, help="forcing periods to drop before a window", **shown),
+    ]
+
+
+class _Membrane(Choice):
+    """The name of a membrane, any text at first: Python takes records in its place, so that `_membrane` refuses it."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Leave the text as it is."""
+        return value
+
+
+def _method_options() -> list[click.Parameter]:
+    solvers = f"of ode: {', '.join(options.SOLVERS)} [Tsit5]"
+    above = Real("a finite number above 0", min=0, min_open=True)
+    return [
+        click.Option(["--method"], type=Choice(options.METHODS), default="exact", show_default=True, help="engine"),
+        click.Option(["--solver"], type=Choice(options.SOLVERS), metavar="NAME", help=solvers),
+        click.Option(["--rtol"], type=float, help="of ode: relative tolerance of a step [1e-8]"),
+        click.Option(["--atol"], type=above, help="of ode: absolute tolerance of a step [1e-10]"),
+        click.Option(["--steps"], type=Whole(8), help="of rk4: steps per forcing period [1000]"),
+        click.Option(["--membrane"], type=_Membrane(options.MEMBRANES), help="of ode and rk4 [linear]"),
+        click.Option(["--chi"], type=_at_least(0), help="of hunt-crossley: damping over stiffness"),
+        click.Option(["--exponent"], type=_at_least(1), help="of hunt-crossley: exponent of the penetration [1.5]"),
+    ]
+
+
+def _at_least(least: int) -> Real:
+    return Real(f"one finite number of at least {least}", min=least)
+
+
+def _dask_options() -> list[click.Parameter]:
+    return [
+        click.Option(["--workers"], type=Whole(1), help="processes that share the cores and write the store, by Dask"),
+        click.Option(["--scheduler"], metavar="ADDRESS", help="of Dask: its workers, which see the store, write it"),
+    ]
+
+
+def _output_options() -> list[click.Parameter]:
+    wanted = "variables wanted [all but asymmetry, lyapunov; for labels lyapunov too]"
+    some = "compute every 2^LEVELS-th cell along each axis, then those at borders; fill the others"
+    shown = "what the picture shows: any variable, or label"
+    return [
+        click.Option(["--outputs"], metavar="NAME,NAME", shell_complete=_complete_outputs, help=wanted),
+        click.Option(["--refine"], type=Whole(1), metavar="LEVELS", help=some),
+        click.Option(
+            ["--show"], metavar="NAME", default="P", show_default=True, shell_complete=_complete_outputs, help=shown
+        ),
+    ]
+
+
+def _complete_outputs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the last of several names of variables. The rooms that know them take a moment to load."""
+    from vijax.planes.dataset import OUTPUTS
+
+    before, comma, begun = incomplete.rpartition(",")
+    names = [*OUTPUTS, "label"] if param.name == "show" else OUTPUTS
+    return [f"{before}{comma}{name}" for name in names if name.startswith(begun)]
+
+
+def sections() -> Sections:
+    """Make the options of the page."""
+    return {
+        "Plane": plane_options(),
+        "Run": [*run_options(), options.wall_option()],
+        "Method": [*_method_options(), options.dtype_option()],
+        "Variables": _output_options(),
+        "Files": options.file_options(),
+        "Size": [*_dask_options(), options.size_option()],
+    }
+
+
+NEITHER = (
+    f"{options.VALUES} With neither --out nor --plot, power_map.zarr and power_map.png are written, or the same of "
+    "label_map or NAME_map, by what is shown."
+)
+GOES_ON = (
+    "A map is written as it is made: stopped in whatever way, the same command goes on with it, and --overwrite begins "
+    "anew."
+)
+EXAMPLES = (
+    "",
+    "--gamma 0.1 --out inclined.zarr --plot inclined.png",
+    "--omega pi:6pi:96 --omega0 20:400:96 --plot device.png",
+    "--show label --plot labels.png",
+    "--show max_penetration --plot depth.png",
+    "--d 0.05:0.3:1024 --kappa 3:400:1024:log --refine 3 --out fine.zarr --plot fine.png",
+    "--d 0.2,0.3 --kappa 40:400:8:log --method ode --membrane hunt-crossley --chi 0.8 --out hertz.zarr",
+)
+
+sweep = Page("sweep", power_map, sections(), EXAMPLES, f"{NEITHER} {GOES_ON}")

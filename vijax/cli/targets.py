@@ -1,0 +1,43 @@
+"""The store and the picture that a run will write, looked at before it begins."""
+
+from pathlib import Path
+
+
+def targets(
+    out: str | None,
+    plot: str | None,
+    defaults: tuple[str, str],
+    overwrite: bool,
+    ending: str = ".zarr",
+    goes_on: bool = False,
+) -> tuple[Path | None, Path | None]:
+    """Name the store and the picture to write, both by default where neither was given; raise unless they can be.
+
+    With `goes_on` a store that is there is left to `tiled_store.check`; its picture is drawn again if vijax drew it.
+    """
+    if out is None and plot is None:
+        out, plot = defaults
+    store = None if out is None else _store(out, ending, overwrite, goes_on)
+    again = goes_on and not overwrite and store is not None and store.exists()
+    return store, None if plot is None else _picture(plot, overwrite, again)
+
+
+def _store(out: str, ending: str, overwrite: bool, goes_on: bool) -> Path:
+    from vijax.planes.store import check_place, check_store
+    from vijax.runtime.files import check_ending, check_output
+
+    if ending != ".zarr":
+        check_ending("out", out, ending)
+        return check_output("out", out, overwrite)
+    place = check_place("out", out)
+    return place if goes_on and not overwrite and place.exists() else check_store("out", out, overwrite)
+
+
+def _picture(plot: str, overwrite: bool, again: bool) -> Path:
+    from vijax.plots.style import is_drawn
+    from vijax.runtime.files import check_output
+
+    picture = check_output("plot", plot, overwrite or again)
+    if again and picture.exists() and not is_drawn(picture):
+        raise FileExistsError(f"plot must be new or a picture drawn by vijax; got {plot}; take another name")
+    return picture
