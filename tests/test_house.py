@@ -197,4 +197,4 @@ def test_what_is_offered_can_be_listed_and_nothing_else_is_had():
     offered = json.loads(said("import json, vijax; print(json.dumps(dir(vijax)))"))
     assert "sweep" in offered
     assert said(f"from vijax import *; print(all(name in globals() for name in {offered}))") == "True\n"
-    assert said("import vijax; print(hasattr(vijax, 'os_'), hasattr(vijax, 'OUTPUTS'))") == "False False\n"
+    assert said("import vijax; print(hasattr(vijax, 'swept'))") == "False\n"

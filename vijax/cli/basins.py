@@ -141,7 +141,7 @@ def _sections() -> Sections:
             options.wall_option(),
         ],
         "Files": options.file_options(),
-        "Size": [options.size_option()],
+        "Large runs": [options.size_option()],
     }
 
 

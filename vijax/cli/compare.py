@@ -97,7 +97,7 @@ def _sections() -> Sections:
         "Run": [*run_options(), options.dtype_option()],
         "Verdict": [tolerance_option()],
         "Files": options.file_options(),
-        "Size": [options.size_option()],
+        "Large runs": [options.size_option()],
     }
 
 

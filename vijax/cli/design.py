@@ -259,7 +259,7 @@ def _sections() -> Sections:
         ],
         "Device": [*options.axis_options(u0=None, v0=None), *options.device_options()],
         "Files": options.file_options(".json", "report"),
-        "Size": [options.size_option()],
+        "Large runs": [options.size_option()],
     }
 
 

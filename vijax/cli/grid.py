@@ -49,8 +49,8 @@ def _sections() -> Sections:
         ["--compare"], type=Choice(["rigid"]), metavar="rigid", help="map what rigid walls change instead"
     )
     found = dict(page.sections())
-    files, size = found.pop("Files"), found.pop("Size")
-    return found | {"Comparison": [rigid, tolerance_option("with --compare: ")], "Files": files, "Size": size}
+    files, large = found.pop("Files"), found.pop("Large runs")
+    return found | {"Comparison": [rigid, tolerance_option("with --compare: ")], "Files": files, "Large runs": large}
 
 
 _EXAMPLES = (*page.EXAMPLES, "--kappa 3:4000:128:log --compare rigid --tolerance 5%")

@@ -128,7 +128,7 @@ def _sections() -> Sections:
             options.dtype_option(),
         ],
         "Files": [options.quantity_option(options.POINT_QUANTITIES), *options.file_options()],
-        "Size": [options.size_option()],
+        "Large runs": [options.size_option()],
     }
 
 

@@ -268,7 +268,7 @@ def sections() -> Sections:
         "Method": [*_method_options(), options.dtype_option()],
         "Variables": _output_options(),
         "Files": options.file_options(),
-        "Size": [*_dask_options(), options.size_option()],
+        "Large runs": [*_dask_options(), options.size_option()],
     }
 
 
