@@ -23,7 +23,7 @@ from vijax.design.tolerance import Tolerance, nodes
 from vijax.model import device
 from vijax.orbits import continuation, motion, periodic, shooting
 from vijax.planes.compare import cheapest_model
-from vijax.plots import branches, designs, maps, orbit_diagrams
+from vijax.plots import branch_diagrams, designs, maps, orbit_diagrams
 
 NAN, INF, HUGE = math.nan, math.inf, 10**45
 
@@ -462,7 +462,7 @@ CALLS: Table = {
         {"dataset": DATASET, "name": (3, None, ["mass"], "P")},
     ),
     "orbit_diagrams.orbit_diagram": (orbit_diagrams.orbit_diagram, {}, {"dataset": DATASET}),
-    "branches.branches": (branches.branches, {}, {"dataset": DATASET}),
+    "branch_diagrams.branches": (branch_diagrams.branches, {}, {"dataset": DATASET}),
     "tolerance.nodes": (
         nodes,
         {"tolerances": (Tolerance("omega0", 0.05),)},

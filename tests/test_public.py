@@ -1,11 +1,13 @@
 """What `vijax` offers: it is there whatever was imported before, it says what it takes, and a type checker sees it."""
 
+import ast
 import inspect
 import pkgutil
 import re
 import subprocess
 import sys
 from importlib import import_module
+from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, Literal, Unpack, get_args, get_origin, is_typeddict
 
@@ -18,7 +20,9 @@ from vijax.model import pair
 from vijax.orbits import continuation
 from vijax.planes import axes, orbit_diagram, sweep
 
-FUNCTIONS = {name: found for name in vijax.__all__ if isinstance(found := getattr(vijax, name), FunctionType)}
+OFFERED = {name: getattr(vijax, name) for name in vijax.__all__}
+OFFERED |= {f"plots.{name}": getattr(vijax.plots, name) for name in vijax.plots.__all__}
+FUNCTIONS = {name: found for name, found in OFFERED.items() if isinstance(found, FunctionType)}
 ROOMS = [room.name for room in pkgutil.walk_packages(vijax.__path__, "vijax.")]
 # Arguments of a few closed choices, each a `Literal` wherever it stands.
 CHOICES = {
@@ -53,7 +57,7 @@ def test_functions_are_functions_whatever_is_imported_first():
     assert len(ROOMS) > 60
 
 
-@pytest.mark.parametrize("folder", ["vijax"])
+@pytest.mark.parametrize("folder", ["vijax", "vijax.plots"])
 def test_no_module_has_the_name_of_what_stands_beside_it(folder):
     package = import_module(folder)
     modules = {room.name for room in pkgutil.iter_modules(package.__path__)}
@@ -67,6 +71,15 @@ def test_the_front_page_names_all_that_there_is():
     assert set(vijax.__all__) <= set(re.findall(r"`(\w+)`", vijax.__doc__))
     with pytest.raises(AttributeError, match="module 'vijax' has no attribute 'swep'"):
         _ = vijax.swep  # type: ignore[attr-defined]
+
+
+def test_plots_offer_to_a_type_checker_what_they_offer():
+    tree = ast.parse(Path(vijax.plots.__file__).read_text())
+    (choice,) = [node for node in tree.body if isinstance(node, ast.If)]
+    seen = {(name.name, node.module) for node in choice.body if isinstance(node, ast.ImportFrom) for name in node.names}
+    assert seen == {(name, getattr(vijax.plots, name).__module__) for name in vijax.plots.__all__}
+    with pytest.raises(AttributeError, match=r"module 'vijax.plots' has no attribute 'powermap'"):
+        _ = vijax.plots.powermap  # type: ignore[attr-defined]
 
 
 def refused(function: FunctionType) -> list[str]:

@@ -145,14 +145,14 @@ def test_types_reach_a_user_of_the_wheel(installed, tmp_path):
     (tmp_path / "user.py").write_text(USER)
     (tmp_path / "mistakes.py").write_text(MISTAKES)
     command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", str(installed)]
-    (tmp_path / "names.py").write_text(
-        "import vijax\n" + "".join(f"reveal_type(vijax.{name})\n" for name in vijax.__all__)
-    )
+    asked = [f"reveal_type(vijax.{name})" for name in vijax.__all__]
+    asked += [f"reveal_type(vijax.plots.{name})" for name in vijax.plots.__all__]
+    (tmp_path / "names.py").write_text("\n".join(["import vijax", *asked, ""]))
     files = ["user.py", "mistakes.py", "names.py"]
     done = alone([*command, "--cache-dir", str(tmp_path / "cache"), *files], tmp_path)
     found = re.findall(r"^(\w+)\.py:(\d+): error", done.stdout, re.M)
     lines = [n for n, line in enumerate(MISTAKES.splitlines(), 1) if line.startswith("vijax.")]
     assert found == [("mistakes", str(line)) for line in lines], done.stdout + done.stderr
     revealed = re.findall(r'^names.py:\d+: note: Revealed type is "(.*)"$', done.stdout, re.M)
-    assert len(revealed) == len(vijax.__all__)
+    assert len(revealed) == len(asked)
     assert not [kind for kind in revealed if re.search(r"^Any$|: Any( =|[,)])|-> Any$", kind)]

@@ -19,12 +19,12 @@ import pytest
 import xarray as xr
 from helpers import SCRIPTS, stand_in
 
+from vijax import plots
 from vijax.batch import simulate
 from vijax.cli import process
 from vijax.planes import dispatch, tiled_store
 from vijax.planes import sweep as sweeps
 from vijax.planes.sweep import load, sweep
-from vijax.plots import maps
 from vijax.plots.style import is_drawn
 from vijax.runtime import files
 
@@ -272,7 +272,7 @@ def test_a_picture_never_replaces_a_folder(folder):
     (folder / "map.png").mkdir()
     (folder / "map.png" / "thesis.tex").write_text("precious")
     with pytest.raises(IsADirectoryError):
-        maps.power_map(load("map.zarr"), "map.png")
+        plots.save(plots.power_map(load("map.zarr")), "map.png")
     assert [path.name for path in (folder / "map.png").iterdir()] == ["thesis.tex"]
 
 

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vijax import plots
 from vijax.model.device import Harvester, with_constants
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
 from vijax.orbits import continuation
 from vijax.orbits import periodic as orbits
 from vijax.orbits.shooting import Sequence
-from vijax.plots import branches as pictures
 
 SPAN = (0.1, 0.3)
 # Of the reference: where the symmetric orbit breaks, and where two left and one right impact fold.
@@ -100,7 +100,7 @@ def test_the_dataset_and_its_picture(family, tmp_path):
         for number, point in enumerate(one.points):
             place = int(found["event_point"][index, number])
             assert np.nanmax(np.abs(one.orbit.knots[place, :, 1] - point.orbit.knots[0, :, 1])) < 0.02
-    pictures.branches(found, tmp_path / "branches.png")
+    plots.save(plots.branches(found), tmp_path / "branches.png")
     assert (tmp_path / "branches.png").stat().st_size > 10_000
 
 

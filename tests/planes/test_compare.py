@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from vijax import plots
 from vijax.cli import process
 from vijax.model.records import Status
 from vijax.planes import sweep as sweeps
 from vijax.planes.compare import SURE, Label, Model, cheapest_model, compare, plan, rigid_from, run
 from vijax.planes.sweep import load, save, sweep
-from vijax.plots import maps
 
 # Rigid walls at d 0.12: chaos; at 0.2: an orbit 2:1/1T that soft walls reach beyond kappa 1e3; above: the orbit 1:1/1T.
 AXES = {"d": [0.12, 0.2, 0.25, 0.3], "kappa": [4.0, 1e2, 1e3, 1e4, 1e5]}
@@ -203,7 +203,8 @@ def test_progress_counts_the_cells_of_both_walls():
 def test_a_comparison_comes_back_equal_and_is_drawn(found, tmp_path):
     save(found, tmp_path / "comparison.zarr")
     xr.testing.assert_identical(load(tmp_path / "comparison.zarr"), found)
-    figure = maps.difference_map(found, tmp_path / "comparison.png")
+    figure = plots.difference_map(found)
+    plots.save(figure, tmp_path / "comparison.png")
     assert (tmp_path / "comparison.png").stat().st_size
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "rigid is enough within 1 %" in said

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vijax import sweep
+from vijax import plots, sweep
 from vijax.model.records import Status
 from vijax.planes import refine
 from vijax.planes.refine import Mesh
@@ -366,7 +366,7 @@ def test_progress_grows_with_what_is_wanted(both):
 def test_a_refined_map_is_drawn_and_stored_as_any_other(both, tmp_path):
     _, found, _ = both
     for draw in (maps.power_map, maps.label_map):
-        draw(found, tmp_path / f"{draw.__name__}.png")
+        plots.save(draw(found), tmp_path / f"{draw.__name__}.png")
     save(found, tmp_path / "map.zarr")
     back = load(tmp_path / "map.zarr")
     assert back.identical(found)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vijax.plots import orbit_diagrams
+from vijax.plots import orbit_diagrams, save
 
 ALONG = {"units": "1", "symbol": "d"}
 
@@ -41,7 +41,8 @@ def points(line) -> set[tuple[float, float]]:
 
 def test_each_direction_has_its_panel_and_the_other_one_behind_it(tmp_path):
     ds = drawn()
-    figure = orbit_diagrams.orbit_diagram(ds, tmp_path / "diagram.png")
+    figure = orbit_diagrams.orbit_diagram(ds)
+    save(figure, tmp_path / "diagram.png")
     assert (tmp_path / "diagram.png").stat().st_size > 0
     down, up = figure.axes
     assert "falling" in down.get_title(loc="left")
@@ -75,9 +76,9 @@ def test_energies_are_drawn_over_decades_and_speeds_are_not():
 @pytest.mark.parametrize(
     ("call", "say"),
     [
-        (lambda path: orbit_diagrams.orbit_diagram(drawn(), path, "speed"), "quantity must be among v_in"),
-        (lambda path: orbit_diagrams.orbit_diagram(drawn(kappa=range(1, 20)), path), "at most 10 values of kappa"),
-        (lambda path: orbit_diagrams.orbit_diagram(drawn(), path.with_suffix(".txt")), "plot must end in"),
+        (lambda path: orbit_diagrams.orbit_diagram(drawn(), "speed"), "quantity must be among v_in"),
+        (lambda path: orbit_diagrams.orbit_diagram(drawn(kappa=range(1, 20))), "at most 10 values of kappa"),
+        (lambda path: save(orbit_diagrams.orbit_diagram(drawn()), path.with_suffix(".txt")), "plot must end in"),
         (
             lambda path: orbit_diagrams.check_layout("d", {"direction": 2, "d": 9, "r": 2, "kappa": 3}),
             "besides d; got r, kappa",

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_rgba
 
-from vijax.plots import designs
+from vijax.plots import designs, save
 
 GREEN = to_rgba(designs._STAR["color"])
 
@@ -56,7 +56,8 @@ def span(axes, label):
 
 
 def test_the_optimum_its_band_its_edge_and_the_ascent_are_where_the_report_says(tmp_path):
-    figure = designs.design(diagram(), report(), tmp_path / "design.png")
+    figure = designs.design(diagram(), report())
+    save(figure, tmp_path / "design.png")
     assert (tmp_path / "design.png").stat().st_size > 0
     for axes in figure.axes:
         np.testing.assert_allclose(line(axes, "optimum").get_xydata(), [[50, 1e-6]])
@@ -101,7 +102,8 @@ def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
     held[0]["best"]["active"] = ["penetration limit at the right wall"]
     held[3]["best"]["stopped"] = "stalled"
     found = {"over": {"name": "d", "values": [0.1, 0.2, 0.3, 0.4]}, "designs": held}
-    figure = designs.design_map(found, tmp_path / "map.png")
+    figure = designs.design_map(found)
+    save(figure, tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 0
     upper, lower = figure.axes
     assert words(figure) == [
@@ -121,7 +123,6 @@ def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
 
 
 def test_a_picture_of_another_kind_is_refused(tmp_path):
-    for draw in (lambda path: designs.design(diagram(), report(), path), lambda path: designs.design_map({}, path)):
-        with pytest.raises(ValueError, match="plot must end in"):
-            draw(tmp_path / "picture.txt")
+    with pytest.raises(ValueError, match="plot must end in"):
+        save(designs.design(diagram(), report()), tmp_path / "picture.txt")
     assert not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ from matplotlib.legend import Legend
 from vijax.model.records import Status
 from vijax.planes.compare import Label, Model
 from vijax.planes.dataset import best
-from vijax.plots import maps
+from vijax.plots import maps, save
 from vijax.plots.style import layout
 
 SYMBOLS = {
@@ -83,7 +83,8 @@ def test_what_no_picture_holds_says_what_to_fix(sizes, say):
 
 def test_power_map_explains_itself(tmp_path):
     file = tmp_path / "map.png"
-    figure = maps.power_map(drawn_map(d=D, kappa=KAPPA), file)
+    figure = maps.power_map(drawn_map(d=D, kappa=KAPPA))
+    save(figure, file)
     assert file.read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
     said = words(figure)
@@ -164,7 +165,8 @@ def drawn_comparison(**axes) -> xr.Dataset:
 
 def test_difference_map_explains_itself(tmp_path):
     found = drawn_comparison(d=D, kappa=KAPPA)
-    figure = maps.difference_map(found, tmp_path / "map.png")
+    figure = maps.difference_map(found)
+    save(figure, tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     said = words(figure)
     for part in ("other labels", "rigid is enough within 0.5 %", "undecided", "P_\\mathrm{soft}"):
@@ -256,7 +258,7 @@ def test_missing_variables_and_endings_are_named(tmp_path):
     with pytest.raises(ValueError, match="without admissible"):
         maps.power_map(drawn_map(d=D, kappa=KAPPA).drop_vars("admissible"))
     with pytest.raises(ValueError, match=r"plot must end in \.png"):
-        maps.power_map(drawn_map(d=D, kappa=KAPPA), tmp_path / "map.doc")
+        save(maps.power_map(drawn_map(d=D, kappa=KAPPA)), tmp_path / "map.doc")
 
 
 # --- maps of kinds ----------------------------------------------------------------------------------------------------
@@ -315,7 +317,8 @@ def test_label_map_names_the_commonest_and_says_how_long_chaos_was_looked_at():
 
 
 def test_label_map_keeps_mirror_images_apart_under_gravity_and_needs_no_exponent(tmp_path):
-    figure = maps.label_map(labelled_map(gamma=0.1).drop_vars("lyapunov"), tmp_path / "map.png")
+    figure = maps.label_map(labelled_map(gamma=0.1).drop_vars("lyapunov"))
+    save(figure, tmp_path / "map.png")
     assert {"10 % 2:1/2T", "10 % 1:2/2T"} < set(legend(figure))
     assert len(figure.axes) == 1
     assert (tmp_path / "map.png").stat().st_size
@@ -415,7 +418,8 @@ def test_any_number_of_a_map_is_drawn(name, log, says):
 
 
 def test_a_variable_without_what_tells_of_the_others_is_drawn(tmp_path):
-    figure = maps.variable_map(held_map()[["max_penetration"]], "max_penetration", tmp_path / "map.png")
+    figure = maps.variable_map(held_map()[["max_penetration"]], "max_penetration")
+    save(figure, tmp_path / "map.png")
     assert "inadmissible" not in words(figure)
     assert (tmp_path / "map.png").exists()
 

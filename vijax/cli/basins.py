@@ -89,9 +89,9 @@ def _check_picture(path: Path, planned: "Plan") -> None:
 
 
 def _draw(dataset: "xr.Dataset", path: Path) -> None:
-    from vijax.plots import maps as pictures
+    from vijax import plots
 
-    (pictures.multistability_map if "start" in dataset.sizes else pictures.basin_map)(dataset, path)
+    plots.save(plots.basins(dataset), path)
 
 
 def _summary(dataset: "xr.Dataset") -> Iterator[str]:

@@ -79,9 +79,9 @@ def branches(
     seconds = time.perf_counter() - began
 
     def draw(dataset: Any, path: Path) -> None:
-        from vijax.plots import branches as pictures
+        from vijax import plots
 
-        pictures.branches(dataset, path, quantity)
+        plots.save(plots.branches(dataset, quantity), path)
 
     dataset = continuation.dataset(followed, asked.device)
     finish(dataset, _summary(followed, seconds), store, picture, draw, overwrite)
@@ -108,7 +108,7 @@ def _asked(
 
 
 def _check_picture(path: Path | None, quantity: str) -> None:
-    from vijax.plots.branches import check_branch_quantity
+    from vijax.plots.branch_diagrams import check_branch_quantity
     from vijax.plots.style import check_format
 
     check_branch_quantity(quantity)

@@ -61,9 +61,9 @@ def _agree(planned: "Comparison", yes: bool) -> None:
 
 
 def _draw(dataset: "xr.Dataset", path: Path) -> None:
-    from vijax.plots.maps import difference_map
+    from vijax import plots
 
-    difference_map(dataset, path)
+    plots.save(plots.difference_map(dataset), path)
 
 
 def _summary(dataset: "xr.Dataset") -> str:

@@ -129,15 +129,15 @@ def _run(asked: Asked) -> "tuple[dict[str, Any], xr.Dataset | None, str]":
 
 
 def _write(whole: dict[str, Any], diagram: "xr.Dataset | None", written: Path | None, picture: Path | None) -> None:
-    from vijax.plots import designs as pictures
+    from vijax import plots
     from vijax.runtime.files import write_json
 
     if written is not None:
         write_json(whole, written)
     if picture is not None and diagram is not None:
-        pictures.design(diagram, whole, picture)
+        plots.save(plots.design(diagram, whole), picture)
     elif picture is not None:
-        pictures.design_map(whole, picture)
+        plots.save(plots.design_map(whole), picture)
 
 
 def _lines(whole: dict[str, Any]) -> Iterable[str]:

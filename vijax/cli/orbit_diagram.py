@@ -51,9 +51,9 @@ def diagram(
     seconds = time.perf_counter() - began
 
     def draw(dataset: "xr.Dataset", path: Path) -> None:
-        from vijax.plots import orbit_diagrams
+        from vijax import plots
 
-        orbit_diagrams.orbit_diagram(dataset, path, quantity)
+        plots.save(plots.orbit_diagram(dataset, quantity), path)
 
     finish(dataset, _summary(dataset, planned.count, seconds), store, picture, draw, overwrite)
 

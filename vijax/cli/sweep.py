@@ -145,13 +145,10 @@ def _check_picture(path: Path, planned: "Plan", show: str) -> None:
 
 
 def _draw(show: str, dataset: "xr.Dataset", path: Path) -> None:
-    from vijax.plots import maps as pictures
+    from vijax import plots
 
-    known = {"P": pictures.power_map, "label": pictures.label_map}
-    if show in known:
-        known[show](dataset, path)
-    else:
-        pictures.variable_map(dataset, show, path)
+    known = {"P": plots.power_map, "label": plots.label_map}
+    plots.save(known[show](dataset) if show in known else plots.variable_map(dataset, show), path)
 
 
 def _summary(dataset: "xr.Dataset") -> str:
@@ -200,7 +197,9 @@ def run_options() -> list[click.Parameter]:
         click.Option(
             ["--until"], type=Choice(options.UNTIL), default="attractor", help="what cells are run to", **shown
         ),
-        click.Option(["--transient"], type=Whole(0), default=0, help="forcing periods to drop before a window", **shown),
+        click.Option(
+            ["--transient"], type=Whole(0), default=0, help="periods to drop before a window", **shown
+        ),
     ]
 
 

@@ -2,3 +2,44 @@
 
 `style` knows before a run what can be drawn, and loads none of it. Begin with `maps`.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vijax.plots.branch_diagrams import branches
+    from vijax.plots.designs import design, design_map
+    from vijax.plots.figure import save
+    from vijax.plots.maps import basins, difference_map, label_map, power_map, variable_map
+    from vijax.plots.motions import trajectory
+    from vijax.plots.orbit_diagrams import orbit_diagram
+else:
+    # What stands where; a room is loaded, and matplotlib with it, when something of it is first asked for.
+    _ROOMS = {
+        "branches": "branch_diagrams",
+        **dict.fromkeys(("design", "design_map"), "designs"),
+        "save": "figure",
+        **dict.fromkeys(("basins", "difference_map", "label_map", "power_map", "variable_map"), "maps"),
+        "trajectory": "motions",
+        "orbit_diagram": "orbit_diagrams",
+    }
+
+    def __getattr__(name: str) -> Any:
+        if name not in _ROOMS:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_ROOMS[name]}"), name)
+
+
+__all__ = [
+    "basins",
+    "branches",
+    "design",
+    "design_map",
+    "difference_map",
+    "label_map",
+    "orbit_diagram",
+    "power_map",
+    "save",
+    "trajectory",
+    "variable_map",
+]

@@ -1,9 +1,7 @@
 """Pictures of designs: P along an axis with its cliff, the ascent and the optimum; designs along an axis."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,7 +9,8 @@ from matplotlib.figure import Figure
 from vijax.design.report import amount, factors
 from vijax.design.variables import LINEAR, constant
 from vijax.model.units import UNITS
-from vijax.plots.style import STYLE, axis_label, check_format, save_figure, symbol
+from vijax.plots.figure import styled
+from vijax.plots.style import axis_label, symbol
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -38,38 +37,30 @@ _HEADROOM = 1.25
 _JOULES = ("P", "mean", "worst")
 
 
-def design(diagram: "xr.Dataset", report: dict[str, Any], path: str | Path | None = None) -> Figure:
+@styled
+def design(diagram: "xr.Dataset", report: dict[str, Any]) -> Figure:
     """P along an axis, falling and rising, under the ascent, the optimum, its tolerance band and what is not physical.
 
     Args:
         diagram: `vijax.orbit_diagram` in both directions, at the optimum.
         report: What `vijax.design.report.describe` returned, with the same diagram.
-        path: Where to write it, if anywhere; the ending chooses the format.
-
-    Raises:
-        ValueError: If the path does not end as a picture does.
     """
     checks.record("report", report, ("best",), "vijax.design.report.describe")
     checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
-    if path is not None:
-        check_format(path)
     along, best = str(diagram.attrs["along"]), report["best"]
     near = None if best is None else close_view(along, _here(best, along))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 4.2 if near is None else 6.6), layout="constrained")
-        panels = figure.subplots(1 if near is None else 2, squeeze=False)[:, 0]
-        for axes in panels:
-            _draw(axes, diagram, report)
-        _whole(panels[0], diagram)
-        panels[0].set_title(_title(diagram, report), fontsize="medium")
-        if near is not None:
-            panels[1].set(xlim=near, ylim=(0, _HEADROOM * best["P"]), ylabel="$P$ [J per half period]")
-            panels[1].ticklabel_format(axis="y", scilimits=(0, 0))
-        panels[-1].set_xlabel(axis_label(diagram[along]))
-        handles, texts = panels[0].get_legend_handles_labels()
-        figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(6.4, 4.2 if near is None else 6.6), layout="constrained")
+    panels = figure.subplots(1 if near is None else 2, squeeze=False)[:, 0]
+    for axes in panels:
+        _draw(axes, diagram, report)
+    _whole(panels[0], diagram)
+    panels[0].set_title(_title(diagram, report), fontsize="medium")
+    if near is not None:
+        panels[1].set(xlim=near, ylim=(0, _HEADROOM * best["P"]), ylabel="$P$ [J per half period]")
+        panels[1].ticklabel_format(axis="y", scilimits=(0, 0))
+    panels[-1].set_xlabel(axis_label(diagram[along]))
+    handles, texts = panels[0].get_legend_handles_labels()
+    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
     return figure
 
 
@@ -180,41 +171,33 @@ _HELD = {  # what holds a design, by the words it begins with
 }
 
 
-def design_map(report: dict[str, Any], path: str | Path | None = None) -> Figure:
+@styled
+def design_map(report: dict[str, Any]) -> Figure:
     """The best designs along an axis: what the first tuned quantity should be, and P; coloured by what holds them.
 
     Args:
         report: `over` (name and values of the axis) and `designs`, one of `vijax.design.report.describe` for
             each value.
-        path: Where to write it, if anywhere; the ending chooses the format.
-
-    Raises:
-        ValueError: If the path does not end as a picture does.
     """
-    if path is not None:
-        check_format(path)
     checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
     over, designs = report["over"], report["designs"]
     tuned = designs[0]["tune"][0]
     found = [(x, one) for x, one in zip(over["values"], designs, strict=True) if one["best"]]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 5.0), layout="constrained")
-        upper, lower = figure.subplots(2, sharex=True)
-        for held, (colour, name) in _HELD.items():
-            mine = [(x, one["best"]) for x, one in found if _holding(one["best"]) == held]
-            style: Any = {"linestyle": "none", "marker": "o", "markersize": 3, "color": colour}
-            upper.plot([x for x, _ in mine], [one["values"][tuned] for _, one in mine], **style)
-            known = any(text.get_label() == name for text in lower.get_lines())
-            label = None if known or not mine else name
-            lower.plot([x for x, _ in mine], [one["P"] for _, one in mine], label=label, **style)
-        if any(one["spread"] for _, one in found):
-            worst = [one["spread"]["worst"] for _, one in found]
-            lower.plot([x for x, _ in found], worst, "_", color="black", label="worst within the tolerances")
-        upper.set(yscale="linear" if tuned in LINEAR else "log", ylabel=f"best {_named(tuned)}")
-        lower.set(yscale="log", ylabel="$P$ [J per half period]", xlabel=_named(over["name"]))
-        figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(6.4, 5.0), layout="constrained")
+    upper, lower = figure.subplots(2, sharex=True)
+    for held, (colour, name) in _HELD.items():
+        mine = [(x, one["best"]) for x, one in found if _holding(one["best"]) == held]
+        style: Any = {"linestyle": "none", "marker": "o", "markersize": 3, "color": colour}
+        upper.plot([x for x, _ in mine], [one["values"][tuned] for _, one in mine], **style)
+        known = any(text.get_label() == name for text in lower.get_lines())
+        label = None if known or not mine else name
+        lower.plot([x for x, _ in mine], [one["P"] for _, one in mine], label=label, **style)
+    if any(one["spread"] for _, one in found):
+        worst = [one["spread"]["worst"] for _, one in found]
+        lower.plot([x for x, _ in found], worst, "_", color="black", label="worst within the tolerances")
+    upper.set(yscale="linear" if tuned in LINEAR else "log", ylabel=f"best {_named(tuned)}")
+    lower.set(yscale="log", ylabel="$P$ [J per half period]", xlabel=_named(over["name"]))
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
     return figure
 
 

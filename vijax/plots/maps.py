@@ -4,7 +4,6 @@ import itertools
 import math
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import matplotlib as mpl
@@ -21,17 +20,15 @@ from matplotlib.ticker import EngFormatter
 from vijax.model.label import label
 from vijax.planes.compare import Label, Model
 from vijax.planes.dataset import best
+from vijax.plots.figure import styled
 from vijax.plots.style import (
     LABEL_NEEDS,
     NEEDS,
-    STYLE,
     axis_label,
-    check_format,
     equations,
     is_kind,
     layout,
     layout_of_kinds,
-    save_figure,
     title,
     units,
 )
@@ -100,7 +97,8 @@ class _Kind(NamedTuple):
     marks: "Callable[[xr.Dataset], list[_Mark]]"
 
 
-def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+@styled
+def power_map(dataset: "xr.Dataset") -> Figure:
     """P on a log colour scale, with all that tells where to believe it.
 
     Inadmissible cells are veiled and hatched, the border of the period-1 region is a line, aperiodic cells carry dots
@@ -110,15 +108,15 @@ def power_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     Args:
         dataset: A map with `P`, `period` and `admissible`. Its dimensions are, in order, x, y, columns and rows of
             panels; of one dimension a curve is drawn.
-        path: Where to write it, if anywhere; the ending chooses the format.
 
     Raises:
         ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
-    return _picture(dataset, _POWER, path)
+    return _picture(dataset, _POWER)
 
 
-def variable_map(dataset: "xr.Dataset", name: str, path: str | Path | None = None) -> Figure:
+@styled
+def variable_map(dataset: "xr.Dataset", name: str) -> Figure:
     """Any variable of a map, with the marks of `power_map` for as much as the map holds.
 
     Numbers are coloured, on a log scale where they are positive and span a factor of 30; what is a kind, such as
@@ -127,7 +125,6 @@ def variable_map(dataset: "xr.Dataset", name: str, path: str | Path | None = Non
     Args:
         dataset: What `sweep` returned; dimensions as in `power_map`, for kinds two at least.
         name: Of the variable.
-        path: Where to write it, if anywhere; the ending chooses the format.
 
     Raises:
         ValueError: As `power_map`.
@@ -136,17 +133,18 @@ def variable_map(dataset: "xr.Dataset", name: str, path: str | Path | None = Non
     checks.choice("name", name, [str(one) for one in dataset])
     variable = dataset[name]
     if is_kind(variable):
-        return _coded(*_kinds(dataset, name), path)
+        return _coded(*_kinds(dataset, name))
     if variable.dtype.kind == "i":
         dataset = dataset.assign({name: variable.where(variable >= 0)})  # -1 is none
     written = name.replace("_", " ") + (f" [{units(variable)}]" if units(variable) else "")
     kind = _Kind(
         name, written, "sweep", (name,), (*NEEDS,), partial(_number_colours, name), partial(_number_marks, name)
     )
-    return _picture(dataset, kind, path)
+    return _picture(dataset, kind)
 
 
-def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+@styled
+def label_map(dataset: "xr.Dataset") -> Figure:
     """The plane coloured by attractor, n:m/pT; aperiodic cells are shaded by their Lyapunov exponent.
 
     The commonest labels have a colour and a name each, the others are one group. Without gravity mirror images count as
@@ -155,7 +153,6 @@ def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     Args:
         dataset: A map with `period`, `impacts_left`, `impacts_right` and `status`, and with `lyapunov` for shades;
             dimensions as in `power_map`, two at least.
-        path: Where to write it, if anywhere; the ending chooses the format.
 
     Raises:
         ValueError: As `power_map`.
@@ -168,15 +165,15 @@ def label_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     drawn = dataset[["lyapunov"] if "lyapunov" in dataset else []].assign(
         code=(period.dims, codes), aperiodic=period == 0
     )
-    return _coded(drawn.assign_attrs(dataset.attrs), categories, path)
+    return _coded(drawn.assign_attrs(dataset.attrs), categories)
 
 
-def basin_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+@styled
+def basin_map(dataset: "xr.Dataset") -> Figure:
     """The (u0, v0) plane coloured by the attractor on which each start ends, with a table of them beside it.
 
     Args:
         dataset: What `basins` returned for arrays u0 and v0; further axes make panels, each with a table of its own.
-        path: Where to write it, if anywhere; the ending chooses the format.
 
     Raises:
         ValueError: As `power_map`.
@@ -185,15 +182,15 @@ def basin_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
     further = [dim for dim in dataset["P"].dims if dim not in (*dataset["basin"].dims, "attractor")]
     dataset = dataset.isel(dict.fromkeys(further, 0))
     drawn = dataset.assign(code=dataset["basin"].clip(max=_MOST_NAMED)).drop_vars("basin")
-    return _coded(drawn, None, path)
+    return _coded(drawn, None)
 
 
-def multistability_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+@styled
+def multistability_map(dataset: "xr.Dataset") -> Figure:
     """The plane of parameters coloured by the number of coexisting attractors.
 
     Args:
         dataset: What `basin_fractions` returned; dimensions as in `power_map`, two at least.
-        path: Where to write it, if anywhere; the ending chooses the format.
 
     Raises:
         ValueError: As `power_map`.
@@ -209,10 +206,11 @@ def multistability_map(dataset: "xr.Dataset", path: str | Path | None = None) ->
         for n, (shade, text) in enumerate(zip(shades, texts[: most + 1], strict=True))
     ]
     drawn = dataset[[]].assign(code=number).assign_attrs(dataset.attrs)
-    return _coded(drawn, categories, path)
+    return _coded(drawn, categories)
 
 
-def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Figure:
+@styled
+def difference_map(dataset: "xr.Dataset") -> Figure:
     """The relative difference in P between rigid and soft walls on a log colour scale.
 
     A line parts cells whose labels differ from the others; another one, where the comparison was given a tolerance,
@@ -220,18 +218,25 @@ def difference_map(dataset: "xr.Dataset", path: str | Path | None = None) -> Fig
 
     Args:
         dataset: What `compare` returned; dimensions as in `power_map`.
-        path: Where to write it, if anywhere; the ending chooses the format.
 
     Raises:
         ValueError: As `power_map`.
     """
-    return _picture(dataset, _DIFFERENCE, path)
+    return _picture(dataset, _DIFFERENCE)
 
 
-def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Figure:
+def basins(dataset: "xr.Dataset") -> Figure:
+    """Draw coexisting attractors: `basin_map` of what `basins` returned, `multistability_map` of `basin_fractions`.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    checks.variables("dataset", dataset, ("attractors",), "basins")
+    return (multistability_map if "start" in dataset.sizes else basin_map)(dataset)
+
+
+def _picture(dataset: "xr.Dataset", kind: _Kind) -> Figure:
     checks.variables("dataset", dataset, kind.needs, kind.made, "variable_map (--show NAME) draws any that there is")
-    if path is not None:
-        check_format(path)
     whole = dataset[kind.coloured]
     layout({str(dim): size for dim, size in whole.sizes.items()})
     names = list(dict.fromkeys([*kind.needs, *(name for name in kind.optional if name in dataset)]))
@@ -239,10 +244,7 @@ def _picture(dataset: "xr.Dataset", kind: _Kind, path: str | Path | None) -> Fig
     full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
     dataset = dataset.assign(full)[names].squeeze()
     dims = [str(dim) for dim in dataset[kind.coloured].dims]
-    with mpl.rc_context(STYLE):
-        figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
-        if path is not None:
-            save_figure(figure, path)
+    figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
     return figure
 
 
@@ -453,34 +455,29 @@ class _Category(NamedTuple):
     text: str
 
 
-def _coded(dataset: "xr.Dataset", categories: list[_Category] | None, path: str | Path | None) -> Figure:
+def _coded(dataset: "xr.Dataset", categories: list[_Category] | None) -> Figure:
     """A map of kinds, by their places `code` among the categories; those of every panel's own table if there are none.
 
     Where it is `aperiodic`, the Lyapunov exponent shades it.
     """
-    if path is not None:
-        check_format(path)
     layout_of_kinds({str(dim): size for dim, size in dataset["code"].sizes.items()})
     dataset = dataset.squeeze([dim for dim, size in dataset["code"].sizes.items() if size == 1])
     dims = [str(dim) for dim in dataset["code"].dims]
-    with mpl.rc_context(STYLE):
-        figure, panels = _panels(dataset, dims)
-        figure.set_figwidth(figure.get_figwidth() + 1.5)
-        for axes, panel in panels:
-            kinds = _table_categories(panel) if categories is None else categories
-            across, up = (_edges(panel[dim].values)[0] for dim in dims[:2])
-            colours = ListedColormap([kind.colour for kind in kinds])
-            scale = BoundaryNorm(np.arange(len(kinds) + 1) - 0.5, len(kinds))
-            axes.pcolormesh(across, up, panel["code"].values, cmap=colours, norm=scale, rasterized=True)
-            if categories is None:
-                _list_categories(axes, kinds, loc="upper left", bbox_to_anchor=(1.0, 1.02))
-        if {"lyapunov", "aperiodic"} <= set(dataset) and dataset["aperiodic"].any():
-            _shade(figure, dataset, panels, dims)
-        if categories is not None:
-            _list_categories(figure, categories, loc="outside right upper")
-        figure.suptitle(title(dataset), fontsize="medium")
-        if path is not None:
-            save_figure(figure, path)
+    figure, panels = _panels(dataset, dims)
+    figure.set_figwidth(figure.get_figwidth() + 1.5)
+    for axes, panel in panels:
+        kinds = _table_categories(panel) if categories is None else categories
+        across, up = (_edges(panel[dim].values)[0] for dim in dims[:2])
+        colours = ListedColormap([kind.colour for kind in kinds])
+        scale = BoundaryNorm(np.arange(len(kinds) + 1) - 0.5, len(kinds))
+        axes.pcolormesh(across, up, panel["code"].values, cmap=colours, norm=scale, rasterized=True)
+        if categories is None:
+            _list_categories(axes, kinds, loc="upper left", bbox_to_anchor=(1.0, 1.02))
+    if {"lyapunov", "aperiodic"} <= set(dataset) and dataset["aperiodic"].any():
+        _shade(figure, dataset, panels, dims)
+    if categories is not None:
+        _list_categories(figure, categories, loc="outside right upper")
+    figure.suptitle(title(dataset), fontsize="medium")
     return figure
 
 

@@ -1,16 +1,15 @@
 """Pictures of orbit diagrams: a quantity of every impact over the axis that is swept."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from vijax.plots.style import QUANTITIES, STYLE, axis_label, check_format, save_figure, symbol, title, units
+from vijax.plots.figure import styled
+from vijax.plots.style import QUANTITIES, axis_label, symbol, title, units
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -26,7 +25,8 @@ _LOGARITHMIC, _DECADES = ("depth", "E", "P"), 8
 _FURTHER = ("s", "omega0", "k", "beta")  # what a physical sweep holds constant besides
 
 
-def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantity: str = "v_in") -> Figure:
+@styled
+def orbit_diagram(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
     """A quantity of every kept impact against the axis swept, a colour for each value of the other axis.
 
     Of a diagram in both directions each has its panel, the other one's points in grey behind its own: grey that shows
@@ -34,42 +34,36 @@ def orbit_diagram(dataset: "xr.Dataset", path: str | Path | None = None, quantit
 
     Args:
         dataset: What `vijax.planes.orbit_diagram.orbit_diagram` returned, with at most one axis besides the one swept.
-        path: Where to write it, if anywhere; the ending chooses the format.
         quantity: A variable over impacts, strobes or points.
 
     Raises:
-        ValueError: A quantity that is none, more axes or values than a picture can hold, a format that is none.
+        ValueError: A quantity that is none, more axes or values than a picture can hold.
     """
     check_quantity(quantity)
     checks.variables("dataset", dataset, ("P", quantity), "orbit_diagram")
     along = dataset.attrs["along"]
     others = check_layout(along, {str(dim): dataset.sizes[dim] for dim in dataset["P"].dims})
-    if path is not None:
-        check_format(path)
     ways = (
         [str(way) for way in dataset["direction"].values]
         if "direction" in dataset.dims
         else [dataset.attrs["direction"]]
     )
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 1.4 + 2.9 * len(ways)), layout="constrained")
-        panels = figure.subplots(len(ways), sharex=True, sharey=True, squeeze=False)[:, 0]
-        for axes, way in zip(panels, ways, strict=True):
-            for other in ways:
-                if other != way:
-                    _cloud(axes, _way(dataset, other), quantity, others, _OTHER_WAY)
-            _cloud(axes, _way(dataset, way), quantity, others)
-            axes.set_title(f"{symbol(dataset[along])} {_WAYS[way]}", loc="left", fontsize="medium")
-            axes.set_ylabel(QUANTITIES[quantity])
-            axes.margins(x=0.01)
-        if quantity in _LOGARITHMIC:
-            most = float(dataset[quantity].max())
-            panels[0].set(yscale="log", ylim=(most / 10**_DECADES, 2 * most) if most > 0 else None)
-        panels[-1].set_xlabel(axis_label(dataset[along]))
-        figure.suptitle(title(dataset, _FURTHER), fontsize="medium")
-        _explain(figure, dataset, others, ways)
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(6.4, 1.4 + 2.9 * len(ways)), layout="constrained")
+    panels = figure.subplots(len(ways), sharex=True, sharey=True, squeeze=False)[:, 0]
+    for axes, way in zip(panels, ways, strict=True):
+        for other in ways:
+            if other != way:
+                _cloud(axes, _way(dataset, other), quantity, others, _OTHER_WAY)
+        _cloud(axes, _way(dataset, way), quantity, others)
+        axes.set_title(f"{symbol(dataset[along])} {_WAYS[way]}", loc="left", fontsize="medium")
+        axes.set_ylabel(QUANTITIES[quantity])
+        axes.margins(x=0.01)
+    if quantity in _LOGARITHMIC:
+        most = float(dataset[quantity].max())
+        panels[0].set(yscale="log", ylim=(most / 10**_DECADES, 2 * most) if most > 0 else None)
+    panels[-1].set_xlabel(axis_label(dataset[along]))
+    figure.suptitle(title(dataset, _FURTHER), fontsize="medium")
+    _explain(figure, dataset, others, ways)
     return figure
 
 

@@ -1,15 +1,14 @@
 """Pictures of branches of periodic orbits: stable, unstable, and what they met on the way."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from vijax.plots.style import QUANTITIES, STYLE, axis_label, check_format, save_figure, title
+from vijax.plots.figure import styled
+from vijax.plots.style import QUANTITIES, axis_label, title
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -21,41 +20,36 @@ _STABLE, _UNSTABLE = "black", "red"
 _BRANCH_QUANTITIES = ("v_in", "phase", "duration", "depth", "P", "multiplier")
 
 
-def branches(dataset: "xr.Dataset", path: str | Path | None = None, quantity: str = "v_in") -> Figure:
+@styled
+def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
     """Branches of orbits over their parameter: stable black, unstable red, with what they met on the way.
 
     Args:
         dataset: What `vijax.orbits.continuation.dataset` returned.
-        path: Where to write it, if anywhere; the ending chooses the format.
         quantity: A variable over impacts, or over points.
 
     Raises:
-        ValueError: A quantity that is none, a format that is none.
+        ValueError: A quantity that is none.
     """
     check_branch_quantity(quantity)
     checks.variables("dataset", dataset, (quantity, "stable", "event"), "vijax.orbits.continuation.dataset")
-    if path is not None:
-        check_format(path)
     along = dataset[dataset.attrs["along"]]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-        axes = figure.subplots()
-        for index in range(dataset.sizes["branch"]):
-            one = dataset.isel(branch=index)
-            for colour, width, kept in ((_UNSTABLE, 0.8, 0.0), (_STABLE, 1.4, 1.0)):
-                # A segment belongs to the point it leads to, so that the two colours join.
-                shown = (one["stable"] == kept) | (one["stable"].shift(point=-1) == kept)
-                axes.plot(one[along.name], one[quantity].where(shown), color=colour, linewidth=width)
-            _mark_events(axes, one, quantity)
-        axes.set_xlabel(axis_label(along))
-        axes.set_ylabel(QUANTITIES.get(quantity, "largest modulus of a multiplier"))
-        axes.set_title(title(dataset), fontsize="medium")
-        kinds = {str(kind).split()[0] for kind in dataset["event"].values.flat if kind}
-        lines = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
-        lines += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
-        figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False)
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for index in range(dataset.sizes["branch"]):
+        one = dataset.isel(branch=index)
+        for colour, width, kept in ((_UNSTABLE, 0.8, 0.0), (_STABLE, 1.4, 1.0)):
+            # A segment belongs to the point it leads to, so that the two colours join.
+            shown = (one["stable"] == kept) | (one["stable"].shift(point=-1) == kept)
+            axes.plot(one[along.name], one[quantity].where(shown), color=colour, linewidth=width)
+        _mark_events(axes, one, quantity)
+    axes.set_xlabel(axis_label(along))
+    axes.set_ylabel(QUANTITIES.get(quantity, "largest modulus of a multiplier"))
+    axes.set_title(title(dataset), fontsize="medium")
+    kinds = {str(kind).split()[0] for kind in dataset["event"].values.flat if kind}
+    lines = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
+    lines += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
+    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False)
     return figure
 
 
