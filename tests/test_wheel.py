@@ -131,6 +131,14 @@ def test_the_wheel_alone_knows_its_version(installed, tmp_path):
     assert (done.stdout, done.stderr) == (f"{VERSION}\n", "")
 
 
+def test_the_wheel_alone_maps_a_plane(installed, tmp_path):
+    plane = ["--d", "0.05:0.3:32", "--kappa", "3:400:32:log", "--plot", "map.png"]
+    done = alone([str(installed.parent / "vijax"), "sweep", *plane], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "largest admissible P" in done.stdout
+    assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
 def test_the_wheel_alone_asks_for_all_that_it_imports(installed, tmp_path):
     files = (ROOT / "vijax").rglob("*.py")
     names = {name.partition(".")[0] for file in files for name in house.imported(ast.parse(file.read_text()))}

@@ -18,7 +18,7 @@ from vijax.cli import process
 from vijax.cli.options import AXES
 from vijax.model.quantities import AXES as QUANTITIES
 from vijax.orbits import continuation, periodic
-from vijax.plots import branches, orbit_diagrams
+from vijax.plots import branch_diagrams, orbit_diagrams
 
 ROOT = SCRIPTS.parent
 DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram", "basins": "basins", "branch": "branch", "design": "design"}
@@ -124,7 +124,7 @@ WORDS = {
     "sweep --method ode --solver": lambda word: vijax.sweep(**CELL, method="ode", solver=word),
     "orbit-diagram --direction": lambda word: vijax.orbit_diagram(along="d", values=[0.2, 0.3], direction=word),
     "orbit-diagram --quantity": orbit_diagrams.check_quantity,
-    "branch --quantity": branches.check_branch_quantity,
+    "branch --quantity": branch_diagrams.check_branch_quantity,
     "design --objective": lambda word: vijax.optimise(objective=word),
     "basins --wall": lambda word: vijax.basins(**CELL, wall=word),
 }

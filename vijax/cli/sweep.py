@@ -197,9 +197,7 @@ def run_options() -> list[click.Parameter]:
         click.Option(
             ["--until"], type=Choice(options.UNTIL), default="attractor", help="what cells are run to", **shown
         ),
-        click.Option(
-            ["--transient"], type=Whole(0), default=0, help="periods to drop before a window", **shown
-        ),
+        click.Option(["--transient"], type=Whole(0), default=0, help="periods to drop before a window", **shown),
     ]
 
 
