@@ -11,8 +11,9 @@ import click
 from vijax.cli.kinds import Choice, NewFile
 
 VALUES = (
-    "VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --u0=-0.1:0.1:9); a number "
-    "may be a multiple of pi, as in 6pi, and all may have units, as in 2Hz:10Hz:9 or 20deg (Hz are turns a second)."
+    "VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --gamma=-0.1:0.1:9); "
+    "a number may be a multiple of pi, as in 6pi, and all may have units, as in 2Hz:10Hz:9 or 20deg (Hz are turns a "
+    "second)."
 )
 AXES = {
     "d": "gap, dimensionless",
