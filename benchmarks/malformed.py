@@ -23,7 +23,7 @@ from vijax.design.tolerance import Tolerance, nodes
 from vijax.model import device
 from vijax.orbits import continuation, motion, periodic, shooting
 from vijax.planes.compare import cheapest_model
-from vijax.plots import branch_diagrams, designs, maps, orbit_diagrams
+from vijax.plots import branch_diagrams, designs, kind_maps, number_maps, orbit_diagrams
 
 NAN, INF, HUGE = math.nan, math.inf, 10**45
 
@@ -454,10 +454,16 @@ CALLS: Table = {
     "report.optimum": (report.optimum, {}, {"one": (3, None, "best")}),
     **{
         f"plot.{door.__name__}": (door, {"dataset": a_map()}, {"dataset": DATASET})
-        for door in (maps.power_map, maps.label_map, maps.basin_map, maps.multistability_map, maps.difference_map)
+        for door in (
+            number_maps.power_map,
+            kind_maps.label_map,
+            kind_maps.basin_map,
+            kind_maps.multistability_map,
+            number_maps.difference_map,
+        )
     },
-    "maps.variable_map": (
-        maps.variable_map,
+    "number_maps.variable_map": (
+        number_maps.variable_map,
         {"dataset": a_map(), "name": "mass"},
         {"dataset": DATASET, "name": (3, None, ["mass"], "P")},
     ),

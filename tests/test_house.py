@@ -99,7 +99,7 @@ def test_heavy_packages_stay_in_their_room(path):
 
 
 def named(parsed: ast.AST) -> Iterator[str]:
-    """Rooms and folders that strings name: "vijax.plots.maps", and of f"vijax.engine.{name}" the folder."""
+    """Rooms and folders that strings name: "vijax.plots.cells", and of f"vijax.engine.{name}" the folder."""
     for node in ast.walk(parsed):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             found = re.fullmatch(r"vijax((?:\.\w+)+)\.?", node.value)

@@ -16,7 +16,7 @@ from helpers import SCRIPTS
 from vijax.cli import closing, process, progress
 from vijax.model.records import Status
 from vijax.planes import dataset, sweep
-from vijax.plots import figure, maps
+from vijax.plots import figure, kind_maps, number_maps
 
 TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
 
@@ -214,7 +214,7 @@ def test_labels_are_shown_with_exponents(folder, monkeypatch):
     monkeypatch.setattr(
         sweep, "run", lambda plan, *args: plans.append(plan) or args[0](0, 1) or xr.Dataset({"status": ok})
     )
-    monkeypatch.setattr(maps, "label_map", lambda found: "labels")
+    monkeypatch.setattr(kind_maps, "label_map", lambda found: "labels")
     monkeypatch.setattr(figure, "save", lambda made, path: drawn.append((made, path.name)))
     monkeypatch.setattr(process, "keep_compiled", lambda: None)
     assert script.main(["--show", "label", "--plot", "labels.png"]) == 0
@@ -237,7 +237,7 @@ def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
         return found
 
     monkeypatch.setattr(sweep, "run", run)
-    monkeypatch.setattr(maps, "power_map", lambda found: None)
+    monkeypatch.setattr(number_maps, "power_map", lambda found: None)
     monkeypatch.setattr(figure, "save", lambda made, path: None)
     monkeypatch.setattr(process, "keep_compiled", lambda: None)
     assert script.main(["--refine", "3", "--plot", "map.png"]) == 0

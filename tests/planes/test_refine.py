@@ -12,7 +12,7 @@ from vijax.model.records import Status
 from vijax.planes import refine
 from vijax.planes.refine import Mesh
 from vijax.planes.sweep import load, plan, save
-from vijax.plots import maps
+from vijax.plots import kind_maps, number_maps
 
 LEVELS = 3
 LINE = np.linspace(0.0, 1.0, 65)
@@ -365,7 +365,7 @@ def test_progress_grows_with_what_is_wanted(both):
 
 def test_a_refined_map_is_drawn_and_stored_as_any_other(both, tmp_path):
     _, found, _ = both
-    for draw in (maps.power_map, maps.label_map):
+    for draw in (number_maps.power_map, kind_maps.label_map):
         plots.save(draw(found), tmp_path / f"{draw.__name__}.png")
     save(found, tmp_path / "map.zarr")
     back = load(tmp_path / "map.zarr")

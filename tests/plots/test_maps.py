@@ -9,7 +9,7 @@ from matplotlib.legend import Legend
 from vijax.model.records import Status
 from vijax.planes.compare import Label, Model
 from vijax.planes.dataset import best
-from vijax.plots import maps, save
+from vijax.plots import cells, kind_maps, number_maps, save
 from vijax.plots.style import layout
 
 SYMBOLS = {
@@ -83,7 +83,7 @@ def test_what_no_picture_holds_says_what_to_fix(sizes, say):
 
 def test_power_map_explains_itself(tmp_path):
     file = tmp_path / "map.png"
-    figure = maps.power_map(drawn_map(d=D, kappa=KAPPA))
+    figure = number_maps.power_map(drawn_map(d=D, kappa=KAPPA))
     save(figure, file)
     assert file.read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["map.png"]
@@ -110,13 +110,13 @@ def test_legend_names_only_what_is_there():
     found["period"][:] = 1
     found["admissible"][:] = True
     found["P"][:] = 1e-6
-    said = words(maps.power_map(found))
+    said = words(number_maps.power_map(found))
     assert not [part for part in ("inadmissible", "aperiodic", "undecided", "no impact") if part in said]
 
 
 def test_colours_are_logarithmic_and_span_the_admissible_cells():
     found = drawn_map(d=D, kappa=KAPPA)
-    mesh = maps.power_map(found).axes[0].collections[0]
+    mesh = number_maps.power_map(found).axes[0].collections[0]
     assert isinstance(mesh.norm, LogNorm)
     assert mesh.norm.vmax == pytest.approx(float(found["P"].where(found["admissible"]).max()))
 
@@ -125,7 +125,7 @@ def test_star_stands_on_the_largest_admissible_cell():
     found = drawn_map(d=D, kappa=KAPPA)
     peak = best(found)
     assert float(peak) == pytest.approx(36e-6)
-    star = next(line for line in maps.power_map(found).axes[0].lines if line.get_marker() == "*")
+    star = next(line for line in number_maps.power_map(found).axes[0].lines if line.get_marker() == "*")
     assert (star.get_xdata()[0], star.get_ydata()[0]) == (float(peak["d"]), float(peak["kappa"]))
 
 
@@ -133,12 +133,12 @@ def test_best_is_none_without_an_admissible_cell():
     found = drawn_map(d=D, kappa=KAPPA)
     found["admissible"][:] = False
     assert best(found) is None
-    assert "largest" not in words(maps.power_map(found))
+    assert "largest" not in words(number_maps.power_map(found))
 
 
 def test_hatch_border_and_dots_lie_on_their_cells():
     found = drawn_map(d=D, kappa=KAPPA)
-    axes = maps.power_map(found).axes[0]
+    axes = number_maps.power_map(found).axes[0]
     aperiodic = found["period"].stack(cell=["d", "kappa"])
     aperiodic = aperiodic[(aperiodic == 0).values]
     dots = next(line for line in axes.lines if line.get_marker() == ".")
@@ -165,7 +165,7 @@ def drawn_comparison(**axes) -> xr.Dataset:
 
 def test_difference_map_explains_itself(tmp_path):
     found = drawn_comparison(d=D, kappa=KAPPA)
-    figure = maps.difference_map(found)
+    figure = number_maps.difference_map(found)
     save(figure, tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     said = words(figure)
@@ -176,12 +176,12 @@ def test_difference_map_explains_itself(tmp_path):
     assert not np.ma.getmaskarray(mesh.get_array()).any()  # infinitely different is not missing
     norm = mesh.norm
     assert (type(norm), norm.vmin, norm.vmax) == (LogNorm, 1e-4, 1.0)
-    said = words(maps.difference_map(found.drop_vars("cheapest_model")))
+    said = words(number_maps.difference_map(found.drop_vars("cheapest_model")))
     assert not [part for part in ("enough", "undecided") if part in said]
 
 
 def test_lines_go_around_other_labels_and_where_rigid_is_enough():
-    axes = maps.difference_map(drawn_comparison(d=D, kappa=KAPPA)).axes[0]
+    axes = number_maps.difference_map(drawn_comparison(d=D, kappa=KAPPA)).axes[0]
     labels, enough = (piece.get_segments() for piece in axes.collections[1:3])
     assert {round(x, 12) for segment in labels for x, _ in segment} == {0.125}
     assert {round(y, 9) for segment in enough for _, y in segment} == {round(np.sqrt(KAPPA[4] * KAPPA[5]), 9)}
@@ -192,7 +192,7 @@ def test_lines_go_around_other_labels_and_where_rigid_is_enough():
 def test_a_difference_over_one_axis_is_a_curve():
     found = drawn_comparison(d=D, kappa=KAPPA)
     found["relative_difference"][0, 7] = np.nan
-    figure = maps.difference_map(found.isel(d=[0]))
+    figure = number_maps.difference_map(found.isel(d=[0]))
     (axes,) = figure.axes
     np.testing.assert_array_equal(axes.lines[0].get_ydata()[[0, 7]], [np.nan, np.nan])
     edges = [line.get_xdata()[0] for line in axes.lines[1:] if line.get_color() == "red"]
@@ -202,7 +202,7 @@ def test_a_difference_over_one_axis_is_a_curve():
 
 def test_borders_part_a_mask_from_the_rest():
     mask = np.array([[True, False, False], [True, True, False]])
-    segments = maps._borders(np.arange(4.0), np.arange(3.0), mask)
+    segments = cells.borders(np.arange(4.0), np.arange(3.0), mask)
     assert sorted(sorted(segment) for segment in segments) == [
         [(1.0, 0.0), (1.0, 1.0)],
         [(1.0, 1.0), (2.0, 1.0)],
@@ -211,20 +211,20 @@ def test_borders_part_a_mask_from_the_rest():
 
 
 def test_fine_maps_carry_marks_by_blocks():
-    size = 2 * maps._MARKS
+    size = 2 * cells.MOST_MARKS
     mask = np.zeros((size, size), bool)
     mask[:2, :2] = True
     mask[100, 100] = True
     places = np.arange(size)
-    most = maps._marks(mask, places, places, most=True)
-    anywhere = maps._marks(mask, places, places, most=False)
+    most = cells.marked_places(mask, places, places, most=True)
+    anywhere = cells.marked_places(mask, places, places, most=False)
     assert (most[0].tolist(), most[1].tolist()) == ([1], [1])
     assert len(anywhere[0]) == 2
 
 
 def test_panels_show_the_further_axes_in_order():
     found = drawn_map(d=D, kappa=KAPPA, A=[1.0, 2.0], r=[0.3, 0.5, 0.8])
-    figure = maps.power_map(found)
+    figure = number_maps.power_map(found)
     titles = [axes.get_title() for axes in figure.axes[:6]]
     assert titles[1] == "$A$ = 2 m s$^{-2}$, $r$ = 0.3"
     assert titles[2] == "$A$ = 1 m s$^{-2}$, $r$ = 0.5"
@@ -237,12 +237,12 @@ def test_panels_show_the_further_axes_in_order():
 def test_unsorted_values_are_drawn_sorted():
     found = drawn_map(d=D, kappa=KAPPA)
     mixed = found.isel(d=[3, 0, 5, 1, 4, 2])
-    want, got = (maps.power_map(each).axes[0].collections[0].get_array() for each in (found, mixed))
+    want, got = (number_maps.power_map(each).axes[0].collections[0].get_array() for each in (found, mixed))
     np.testing.assert_array_equal(np.ma.filled(got, 0.0), np.ma.filled(want, 0.0))
 
 
 def test_one_axis_is_a_curve():
-    figure = maps.power_map(drawn_map(omega0=np.linspace(20, 400, 30)))
+    figure = number_maps.power_map(drawn_map(omega0=np.linspace(20, 400, 30)))
     (axes,) = figure.axes
     assert (axes.get_xlabel(), axes.get_yscale()) == (r"$\omega_0$ [rad s$^{-1}$]", "log")
     assert isinstance(figure.legends[0], Legend)
@@ -251,14 +251,14 @@ def test_one_axis_is_a_curve():
 def test_a_map_without_energy_is_drawn():
     found = drawn_map(d=D, kappa=KAPPA)
     found["P"][:] = 0.0
-    assert "no impact" in words(maps.power_map(found))
+    assert "no impact" in words(number_maps.power_map(found))
 
 
 def test_missing_variables_and_endings_are_named(tmp_path):
     with pytest.raises(ValueError, match="without admissible"):
-        maps.power_map(drawn_map(d=D, kappa=KAPPA).drop_vars("admissible"))
+        number_maps.power_map(drawn_map(d=D, kappa=KAPPA).drop_vars("admissible"))
     with pytest.raises(ValueError, match=r"plot must end in \.png"):
-        save(maps.power_map(drawn_map(d=D, kappa=KAPPA)), tmp_path / "map.doc")
+        save(number_maps.power_map(drawn_map(d=D, kappa=KAPPA)), tmp_path / "map.doc")
 
 
 # --- maps of kinds ----------------------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ def legend(figure) -> dict[str, tuple]:
 
 def test_label_map_names_the_commonest_and_says_how_long_chaos_was_looked_at():
     found = labelled_map()
-    figure = maps.label_map(found)
+    figure = kind_maps.label_map(found)
     shown = legend(figure)
     rare = {f"0.5 % 1:{n}" for n in range(3, 23)}
     assert list(shown)[:2] == ["50 % 1:1", "20 % 1:2/2T"]  # mirror images as one
@@ -317,7 +317,7 @@ def test_label_map_names_the_commonest_and_says_how_long_chaos_was_looked_at():
 
 
 def test_label_map_keeps_mirror_images_apart_under_gravity_and_needs_no_exponent(tmp_path):
-    figure = maps.label_map(labelled_map(gamma=0.1).drop_vars("lyapunov"))
+    figure = kind_maps.label_map(labelled_map(gamma=0.1).drop_vars("lyapunov"))
     save(figure, tmp_path / "map.png")
     assert {"10 % 2:1/2T", "10 % 1:2/2T"} < set(legend(figure))
     assert len(figure.axes) == 1
@@ -340,23 +340,23 @@ def basin_table(**further) -> xr.Dataset:
 
 def test_basin_map_lists_its_attractors():
     found = basin_table()
-    figure = maps.basin_map(found)
+    figure = kind_maps.basin_map(found)
     shown = legend(figure)
     chaos = "37.5 % aperiodic within 300 periods, $P$ = 2.00 µJ"
     assert list(shown) == ["50 % 1:2/2T, $P$ = 4.00 mJ", chaos, "12.5 % 1:1, $P$ = 1.00 µJ"]
     (mesh,) = figure.axes[0].collections
     colours = mesh.cmap(mesh.norm(mesh.get_array()))
     assert [tuple(colours[0, column]) for column in (0, 4, 7)] == list(shown.values())
-    assert shown[chaos] == to_rgba(maps._NO_ORBIT["aperiodic"])
+    assert shown[chaos] == to_rgba(kind_maps._NO_ORBIT["aperiodic"])
     assert figure.axes[0].get_xlabel() == "$u0$"
 
 
 def test_more_attractors_than_colours_are_others():
-    many, most = 40, maps._MOST_NAMED
+    many, most = 40, kind_maps._MOST_NAMED
     found = basin_table().isel(attractor=np.zeros(many, int))
     found["fraction"] = ("attractor", np.full(many, 1 / many))
     found["basin"] = (("u0", "v0"), np.arange(80).reshape(8, 10) % many)
-    shown = legend(maps.basin_map(found))
+    shown = legend(kind_maps.basin_map(found))
     assert list(shown)[-1] == f"70 % {many - most} others"
 
 
@@ -364,17 +364,17 @@ def test_multistability_map_counts_attractors():
     number = np.tile([0, 1, 1, 3], (5, 1))
     place = coords(d=np.linspace(0.1, 0.3, 5), kappa=np.arange(3.0, 7.0))
     found = xr.Dataset({"attractors": (("d", "kappa"), number)}, place, {"wall": "soft"})
-    shown = legend(maps.multistability_map(found))
+    shown = legend(kind_maps.multistability_map(found))
     assert list(shown) == ["25 % undecided", "50 % 1 attractor", "0 % 2 attractors", "25 % 3 attractors"]
 
 
 def test_a_map_of_kinds_wants_a_plane_and_its_variables():
     with pytest.raises(ValueError, match="two axes of more than one value; got d alone"):
-        maps.label_map(labelled_map().isel(kappa=[0]))
+        kind_maps.label_map(labelled_map().isel(kappa=[0]))
     with pytest.raises(ValueError, match="without status"):
-        maps.label_map(labelled_map().drop_vars("status"))
+        kind_maps.label_map(labelled_map().drop_vars("status"))
     with pytest.raises(ValueError, match="without P"):
-        maps.basin_map(basin_table().drop_vars("P"))
+        kind_maps.basin_map(basin_table().drop_vars("P"))
 
 
 # --- any variable -----------------------------------------------------------------------------------------------------
@@ -406,7 +406,7 @@ def held_map() -> xr.Dataset:
 )
 def test_any_number_of_a_map_is_drawn(name, log, says):
     found = held_map()
-    figure = maps.variable_map(found, name)
+    figure = number_maps.variable_map(found, name)
     mesh = figure.axes[0].collections[0]
     assert isinstance(mesh.norm, LogNorm) == log
     assert figure.axes[1].get_ylabel() == says
@@ -418,7 +418,7 @@ def test_any_number_of_a_map_is_drawn(name, log, says):
 
 
 def test_a_variable_without_what_tells_of_the_others_is_drawn(tmp_path):
-    figure = maps.variable_map(held_map()[["max_penetration"]], "max_penetration")
+    figure = number_maps.variable_map(held_map()[["max_penetration"]], "max_penetration")
     save(figure, tmp_path / "map.png")
     assert "inadmissible" not in words(figure)
     assert (tmp_path / "map.png").exists()
@@ -426,13 +426,13 @@ def test_a_variable_without_what_tells_of_the_others_is_drawn(tmp_path):
 
 def test_kinds_have_a_colour_each():
     for name, share in (("status", "75 % ok\n25 % slow"), ("admissible", "25 % no\n75 % yes")):
-        figure = maps.variable_map(held_map(), name)
+        figure = number_maps.variable_map(held_map(), name)
         assert "\n".join(text.get_text() for text in figure.legends[0].get_texts()) == share
         assert figure.axes[0].get_yscale() == "log"  # the axes are still those of the map
 
 
 def test_a_variable_over_one_axis_is_a_curve():
-    figure = maps.variable_map(held_map().isel(kappa=3), "asymmetry")
+    figure = number_maps.variable_map(held_map().isel(kappa=3), "asymmetry")
     assert figure.axes[0].get_yscale() == "linear"
     np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), held_map()["asymmetry"][:, 3])
 
@@ -441,12 +441,12 @@ def test_few_admissible_cells_do_not_choose_the_colours():
     found = drawn_map(d=D, kappa=KAPPA)
     for trusted, span in ((4, (2e-6, 48e-6)), (5, (4e-6, 8e-6))):  # of 47 cells shown
         found["admissible"][:] = (found["P"] > 3.5e-6) & (found["P"] < (3.5 + trusted) * 1e-6)
-        norm = maps.power_map(found).axes[0].collections[0].norm
+        norm = number_maps.power_map(found).axes[0].collections[0].norm
         assert (norm.vmin, norm.vmax) == pytest.approx(span)
 
 
 def test_a_map_without_what_is_asked_for_says_what_draws_the_others():
     with pytest.raises(ValueError, match=r"dataset must hold P, .* without P; variable_map \(--show NAME\) draws any"):
-        maps.power_map(held_map().drop_vars("P"))
+        number_maps.power_map(held_map().drop_vars("P"))
     with pytest.raises(ValueError, match=r"name must be among P, .* got 'lyapunov'"):
-        maps.variable_map(held_map(), "lyapunov")
+        number_maps.variable_map(held_map(), "lyapunov")

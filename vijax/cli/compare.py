@@ -31,7 +31,7 @@ def difference_map(constants: tuple[str, ...], tolerance: str | None, overwrite:
         process.keep_compiled()
         _agree(planned, yes)
     if plot is not None:
-        process.import_beside("vijax.plots.maps")
+        process.import_beside("vijax.plots.number_maps")
     from vijax.planes.compare import run
 
     dataset, pace = counted(planned.count, lambda tell: run(planned, tell))

@@ -49,7 +49,7 @@ def power_map(
         process.keep_compiled()
         _agree(planned, yes)
     if plot is not None:
-        process.import_beside("vijax.plots.maps")
+        process.import_beside("vijax.plots.number_maps")
     from vijax.planes import sweep as sweeps
 
     dataset, pace = counted(planned.count, lambda tell: sweeps.run(planned, tell, out, overwrite, crew))

@@ -1,6 +1,6 @@
 """Pictures of maps, orbit diagrams, branches and designs: the only folder that imports matplotlib.
 
-`style` knows before a run what can be drawn, and loads none of it. Begin with `maps`.
+`style` knows before a run what can be drawn, and loads none of it. Begin with `number_maps`.
 """
 
 from importlib import import_module
@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from vijax.plots.branch_diagrams import branches
     from vijax.plots.designs import design, design_map
     from vijax.plots.figure import save
-    from vijax.plots.maps import basins, difference_map, label_map, power_map, variable_map
+    from vijax.plots.kind_maps import basins, label_map
     from vijax.plots.motions import trajectory
+    from vijax.plots.number_maps import difference_map, power_map, variable_map
     from vijax.plots.orbit_diagrams import orbit_diagram
 else:
     # What stands where; a room is loaded, and matplotlib with it, when something of it is first asked for.
@@ -19,7 +20,8 @@ else:
         "branches": "branch_diagrams",
         **dict.fromkeys(("design", "design_map"), "designs"),
         "save": "figure",
-        **dict.fromkeys(("basins", "difference_map", "label_map", "power_map", "variable_map"), "maps"),
+        **dict.fromkeys(("basins", "label_map"), "kind_maps"),
+        **dict.fromkeys(("difference_map", "power_map", "variable_map"), "number_maps"),
         "trajectory": "motions",
         "orbit_diagram": "orbit_diagrams",
     }

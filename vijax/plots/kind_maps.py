@@ -1,0 +1,213 @@
+"""Maps coloured by kinds: attractors and their number, basins, flags."""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap, Normalize, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import EngFormatter
+
+from vijax.model.label import label
+from vijax.plots.cells import edges, panels
+from vijax.plots.figure import styled
+from vijax.plots.style import LABEL_NEEDS, layout_of_kinds, title
+from vijax.runtime import checks
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Of kinds: so many by name, in these colours; strong ones first, their pale sisters after them, without the greys.
+_MOST_NAMED = 12
+_COLOURS = [mpl.colormaps["tab20"](n) for n in (*range(0, 20, 2), *range(1, 20, 2)) if n not in (14, 15)]
+_OTHERS = "#fff3c4"
+_NO_ORBIT = {
+    "no impact": "0.93",
+    "permanent contact": "white",
+    "aperiodic": "0.35",
+    "undecided": "magenta",
+    "failed": "red",
+}
+_GREYS = LinearSegmentedColormap.from_list("greys", ["0.8", "black"])
+
+
+class _Category(NamedTuple):
+    """One colour of a map of kinds, and what it means."""
+
+    colour: Any
+    text: str
+
+
+@styled
+def label_map(dataset: "xr.Dataset") -> Figure:
+    """The plane coloured by attractor, n:m/pT; aperiodic cells are shaded by their Lyapunov exponent.
+
+    The commonest labels have a colour and a name each, the others are one group. Without gravity mirror images count as
+    one, by the smaller count first. Aperiodic means: without a period within the periods that were run.
+
+    Args:
+        dataset: A map with `period`, `impacts_left`, `impacts_right` and `status`, and with `lyapunov` for shades;
+            dimensions as in `power_map`, two at least.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    checks.variables("dataset", dataset, LABEL_NEEDS, "sweep")
+    period = dataset["period"]
+    level = (dataset["gamma"] == 0).broadcast_like(period).transpose(*period.dims)
+    words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
+    codes, categories = _named(words, int(dataset.attrs["periods"]))
+    drawn = dataset[["lyapunov"] if "lyapunov" in dataset else []].assign(
+        code=(period.dims, codes), aperiodic=period == 0
+    )
+    return coded(drawn.assign_attrs(dataset.attrs), categories)
+
+
+@styled
+def basin_map(dataset: "xr.Dataset") -> Figure:
+    """The (u0, v0) plane coloured by the attractor on which each start ends, with a table of them beside it.
+
+    Args:
+        dataset: What `basins` returned for arrays u0 and v0; further axes make panels, each with a table of its own.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    checks.variables("dataset", dataset, ("basin", "label", "fraction", "P"), "basins")
+    further = [dim for dim in dataset["P"].dims if dim not in (*dataset["basin"].dims, "attractor")]
+    dataset = dataset.isel(dict.fromkeys(further, 0))
+    drawn = dataset.assign(code=dataset["basin"].clip(max=_MOST_NAMED)).drop_vars("basin")
+    return coded(drawn, None)
+
+
+@styled
+def multistability_map(dataset: "xr.Dataset") -> Figure:
+    """The plane of parameters coloured by the number of coexisting attractors.
+
+    Args:
+        dataset: What `basin_fractions` returned; dimensions as in `power_map`, two at least.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    checks.variables("dataset", dataset, ("attractors",), "basin_fractions")
+    number = dataset["attractors"]
+    most = int(number.max())
+    shades = mpl.colormaps["viridis_r"](np.linspace(0, 1, most + 1))
+    shades[0] = to_rgba(_NO_ORBIT["undecided"])
+    texts = ["undecided", "1 attractor", *(f"{n} attractors" for n in range(2, most + 1))]
+    categories = [
+        _Category(tuple(shade), f"{_share((number == n).mean())} {text}")
+        for n, (shade, text) in enumerate(zip(shades, texts[: most + 1], strict=True))
+    ]
+    drawn = dataset[[]].assign(code=number).assign_attrs(dataset.attrs)
+    return coded(drawn, categories)
+
+
+def basins(dataset: "xr.Dataset") -> Figure:
+    """Draw coexisting attractors: `basin_map` of what `basins` returned, `multistability_map` of `basin_fractions`.
+
+    Raises:
+        ValueError: As `power_map`.
+    """
+    checks.variables("dataset", dataset, ("attractors",), "basins")
+    return (multistability_map if "start" in dataset.sizes else basin_map)(dataset)
+
+
+def of_flags(dataset: "xr.Dataset", name: str) -> "tuple[xr.Dataset, list[_Category]]":
+    """A variable of flags as places among categories, those that occur."""
+    variable = dataset[name]
+    if variable.dtype == bool:
+        words = {0: "no", 1: "yes"}
+    else:
+        words = dict(zip(variable.flag_values, variable.flag_meanings.split(), strict=True))
+    found = sorted(flag for flag in words if (variable == flag).any())
+    codes = np.searchsorted(found, variable.values.astype(int))
+    shares = [f"{_share((variable.values == flag).mean())} {words[flag].replace('_', ' ')}" for flag in found]
+    categories = [_Category(colour, text) for colour, text in zip(_COLOURS, shares, strict=False)]
+    return dataset[[]].assign(code=variable.copy(data=codes)).assign_attrs(dataset.attrs), categories
+
+
+def coded(dataset: "xr.Dataset", categories: list[_Category] | None) -> Figure:
+    """A map of kinds, by their places `code` among the categories; those of every panel's own table if there are none.
+
+    Where it is `aperiodic`, the Lyapunov exponent shades it.
+    """
+    layout_of_kinds({str(dim): size for dim, size in dataset["code"].sizes.items()})
+    dataset = dataset.squeeze([dim for dim, size in dataset["code"].sizes.items() if size == 1])
+    dims = [str(dim) for dim in dataset["code"].dims]
+    figure, filled = panels(dataset, dims)
+    figure.set_figwidth(figure.get_figwidth() + 1.5)
+    for axes, panel in filled:
+        kinds = _table_categories(panel) if categories is None else categories
+        across, up = (edges(panel[dim].values)[0] for dim in dims[:2])
+        colours = ListedColormap([kind.colour for kind in kinds])
+        scale = BoundaryNorm(np.arange(len(kinds) + 1) - 0.5, len(kinds))
+        axes.pcolormesh(across, up, panel["code"].values, cmap=colours, norm=scale, rasterized=True)
+        if categories is None:
+            _list_categories(axes, kinds, loc="upper left", bbox_to_anchor=(1.0, 1.02))
+    if {"lyapunov", "aperiodic"} <= set(dataset) and dataset["aperiodic"].any():
+        _shade(figure, dataset, filled, dims)
+    if categories is not None:
+        _list_categories(figure, categories, loc="outside right upper")
+    figure.suptitle(title(dataset), fontsize="medium")
+    return figure
+
+
+def _shade(figure: Figure, dataset: "xr.Dataset", filled: "list[tuple[Axes, xr.Dataset]]", dims: list[str]) -> None:
+    """Aperiodic cells in greys, the darker the faster they forget their start."""
+    exponents = dataset["lyapunov"].where(dataset["aperiodic"])
+    scale = Normalize(0.0, float(exponents.max()))
+    for axes, panel in filled:
+        across, up = (edges(panel[dim].values)[0] for dim in dims[:2])
+        shown = np.ma.masked_invalid(panel["lyapunov"].where(panel["aperiodic"]).values)
+        mesh = axes.pcolormesh(across, up, shown, cmap=_GREYS, norm=scale, rasterized=True)
+    figure.colorbar(mesh, ax=figure.axes, location="bottom", aspect=40, label="Lyapunov exponent per forcing period")
+
+
+def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]]:
+    """Every word's place among the categories, and these: the commonest labels, the others, and what is no orbit."""
+    kinds, which, counts = np.unique(words, return_inverse=True, return_counts=True)
+    orbits = [place for place in np.argsort(-counts, kind="stable") if kinds[place] not in _NO_ORBIT]
+    ranked = [[place] for place in orbits[:_MOST_NAMED]] + [orbits[_MOST_NAMED:]]
+    colours = [*_COLOURS[: len(ranked) - 1], _OTHERS]
+    texts = [str(kinds[place[0]]) for place in ranked[:-1]] + [f"{len(ranked[-1])} other labels"]
+    for word, colour in _NO_ORBIT.items():
+        ranked.append(list(np.flatnonzero(kinds == word)))
+        colours.append(colour)
+        texts.append(f"aperiodic within {periods} periods" if word == "aperiodic" else word)
+    shown = [n for n, places in enumerate(ranked) if places]
+    codes = np.empty(kinds.size, int)
+    for code, n in enumerate(shown):
+        codes[ranked[n]] = code
+    categories = [_Category(colours[n], f"{_share(counts[ranked[n]].sum() / words.size)} {texts[n]}") for n in shown]
+    return codes[which].reshape(words.shape), categories
+
+
+def _table_categories(panel: "xr.Dataset") -> list[_Category]:
+    """The attractors of one table, the commonest by name."""
+    found = panel.isel(attractor=panel["starts"].values > 0)
+    colours = iter(_COLOURS)
+    categories = []
+    for n in range(min(found.sizes["attractor"], _MOST_NAMED)):
+        entry = found.isel(attractor=n)
+        word = str(entry["label"].values)
+        colour = _NO_ORBIT[word] if word in _NO_ORBIT else next(colours)
+        if word == "aperiodic":
+            word += f" within {float(entry['periods_run']):g} periods"
+        power = f", $P$ = {EngFormatter('J', places=2)(float(entry['P']))}" if entry["P"] > 0 else ""
+        categories.append(_Category(colour, f"{_share(entry['fraction'])} {word}{power}"))
+    rest = found["fraction"].values[_MOST_NAMED:]
+    return [*categories, _Category(_OTHERS, f"{_share(rest.sum())} {rest.size} others")] if rest.size else categories
+
+
+def _list_categories(where: Figure | Axes, categories: list[_Category], **place: Any) -> None:
+    handles = [Patch(facecolor=kind.colour, edgecolor="0.3", linewidth=0.4) for kind in categories]
+    texts = [kind.text for kind in categories]
+    where.legend(handles, texts, frameon=False, handlelength=1.2, fontsize="small", **place)
+
+
+def _share(part: Any) -> str:
+    return f"{100 * float(part):.3g} %"
