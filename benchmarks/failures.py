@@ -40,7 +40,7 @@ import numpy as np
 from peers import rk4
 
 import vijax
-from vijax.batch.trajectory import Trajectory
+from vijax.batch.run_records import Trajectory
 from vijax.engine import exact
 from vijax.engine.method import Ode
 from vijax.model import flow

@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from vijax.batch.trajectory import Trajectory, trajectory
+from vijax.batch.run_records import Trajectory
+from vijax.batch.trajectory import trajectory
 from vijax.design.optimise import Design, Optimum, optimise
 from vijax.design.optimise import under as under_tolerances
 from vijax.design.robustness import Surroundings, surroundings

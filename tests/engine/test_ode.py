@@ -8,7 +8,7 @@ import pytest
 from helpers import reference_trajectories
 
 import vijax
-from vijax.engine import ode
+from vijax.engine import dense_output, ode
 from vijax.engine.method import Ode, Rk4
 from vijax.model import flow
 from vijax.model.membrane import Linear
@@ -243,7 +243,7 @@ def test_both_scalings_are_one_motion():
             begin,
             begin + span,
             1e-3,
-            ode.Point(x, z),
+            dense_output.Point(x, z),
             ode.Spell(pair.gamma, jnp.int32(mode), wall),
             stepsize_controller=control,
         ).ys
@@ -254,7 +254,7 @@ def test_both_scalings_are_one_motion():
             begin / per_time,
             (begin + span) / per_time,
             1e-3,
-            ode.Point(u / per_length, v / speed),
+            dense_output.Point(u / per_length, v / speed),
             (second, jnp.int32(mode)),
             stepsize_controller=control,
         ).ys

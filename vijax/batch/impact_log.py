@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from vijax.batch.trajectory import ball_at
+from vijax.batch.exact_run import ball_at
 from vijax.engine import exact
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State

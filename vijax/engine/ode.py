@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vijax.engine.dense_output import Dense, Point, dense_output, root
 from vijax.engine.method import Ode, Passage, decided
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
@@ -32,21 +33,8 @@ Solver = Any  # a Runge-Kutta solver of diffrax
 _LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
 _CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step
 _ATTEMPTS = 6  # repeats after which a crossing is taken as it is: rounding holds it from closing
-_TRIPS = 5  # of a root on the dense output; a crossing missed by more than _CLOSED is located again
 _FIRST_STEP = 1e-3
 _VANISHING = 4  # roundings: a shorter step does not advance time
-
-
-# --- vector fields --------------------------------------------------------------------------------
-
-
-class Point(eqx.Module):
-    """A state of the solver: u and u' in flight, w and w' in contact; where asked for, the work and the tangent map."""
-
-    x: Scalar
-    z: Scalar
-    work: Scalar | None = None
-    tangent: tuple[Scalar, ...] | None = None  # row by row
 
 
 class Spell(eqx.Module):
@@ -185,62 +173,6 @@ def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: Point, y1: Poi
     return keep, jnp.where(jnp.isfinite(h), h, 0.2 * (t1 - t0))
 
 
-class Dense(eqx.Module):
-    """Dense output of a step at theta in [0, 1]: the quintic through position, velocity and acceleration at both ends.
-
-    A second-order equation gives it for nothing, and it is of higher order than diffrax's own interpolants.
-    """
-
-    c0: Scalar
-    c1: Scalar
-    c2: Scalar
-    c3: Scalar
-    c4: Scalar
-    c5: Scalar
-
-    def place(self, s: Scalar) -> Scalar:
-        """Position."""
-        return self.c0 + s * (self.c1 + s * (self.c2 + s * (self.c3 + s * (self.c4 + s * self.c5))))
-
-    def rate(self, s: Scalar) -> Scalar:
-        """Derivative of the position by theta."""
-        return self.c1 + s * (2 * self.c2 + s * (3 * self.c3 + s * (4 * self.c4 + s * (5 * self.c5))))
-
-    def bend(self, s: Scalar) -> Scalar:
-        """Second derivative."""
-        return 2 * self.c2 + s * (6 * self.c3 + s * (12 * self.c4 + s * (20 * self.c5)))
-
-    def jerk(self, s: Scalar) -> Scalar:
-        """Third derivative."""
-        return 6 * self.c3 + s * (24 * self.c4 + s * (60 * self.c5))
-
-
-def dense_output(h: Scalar, y0: Point, f0: Point, y1: Point, f1: Point) -> Dense:
-    """The dense output of a step of length h from the states at its ends and their derivatives."""
-    z, a = y0.z * h, f0.z * h * h
-    rise, gain, change = y1.x - y0.x - z - 0.5 * a, y1.z * h - z - a, f1.z * h * h - a
-    return Dense(
-        y0.x,
-        z,
-        0.5 * a,
-        10 * rise - 4 * gain + 0.5 * change,
-        -15 * rise + 7 * gain - change,
-        6 * rise - 3 * gain + 0.5 * change,
-    )
-
-
-def _root(function, low: Scalar, high: Scalar) -> Scalar:
-    """Root of a rising function in [low, high], by Newton's iteration with bisection where it leaves the bracket."""
-    x = 0.5 * (low + high)
-    for _ in range(_TRIPS):
-        value, slope = function(x)
-        low, high = jnp.where(value <= 0, x, low), jnp.where(value > 0, x, high)
-        newton = x - value / jnp.where(slope > 0, slope, jnp.inf)
-        inside = (slope > 0) & (newton >= low) & (newton <= high)
-        x = share(jnp.where(inside, newton, 0.5 * (low + high)))
-    return x
-
-
 class _Trial(eqx.Module):
     """A step that was tried: where it leads, whether its error lets it pass, and the length to try next."""
 
@@ -292,9 +224,9 @@ def _look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) -
     z0, z1, bend0, bend1 = dense.c1, dense.rate(one), dense.c2, dense.bend(one)
     heading = jnp.where(z0 == 0, jnp.sign(z1), jnp.sign(z0))
     turns = heading * z1 < 0
-    turning = _root(lambda s: (-heading * dense.rate(s), -heading * dense.bend(s)), zero, one)
+    turning = root(lambda s: (-heading * dense.rate(s), -heading * dense.bend(s)), zero, one)
     rising = jnp.sign(bend1)
-    extreme = _root(lambda s: (rising * dense.bend(s), rising * dense.jerk(s)), zero, one)
+    extreme = root(lambda s: (rising * dense.bend(s), rising * dense.jerk(s)), zero, one)
     twice = (bend0 * bend1 < 0) & ~turns & ~untwisted & (heading * dense.rate(extreme) < 0)
     # What may be met: either wall in flight, and in contact the membrane's rest from above.
     wall = jnp.where(held, 0.0, half)
@@ -303,7 +235,7 @@ def _look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) -
     second = turns & ~first & (~held | (heading > 0)) & (-heading * dense.place(one) > wall)
     aim = jnp.where(first, heading, -heading)
     low, high = jnp.where(first, 0.0, middle), jnp.where(first, middle, 1.0)
-    crossing = _root(lambda s: (aim * dense.place(s) - wall, aim * dense.rate(s)), low, high)
+    crossing = root(lambda s: (aim * dense.place(s) - wall, aim * dense.rate(s)), low, high)
     crest = turns & held & (heading > 0) if deep else jnp.zeros_like(turns)
     return _Sight(
         twice | crest | first | second,

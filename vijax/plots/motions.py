@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vijax.batch.trajectory import Trajectory
+from vijax.batch.run_records import Trajectory
 from vijax.model.pair import ImpactPair
 from vijax.orbits.motion import curve
 from vijax.plots.figure import styled

@@ -1,0 +1,179 @@
+"""Runs of the exact engine, recorded: stretches of steps in one compiled call each, cut to what was asked for."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vijax.batch.run_records import Asked, Room, Trajectory, begin
+from vijax.engine import exact
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.model.records import State, Status
+from vijax.runtime import tiles
+
+# The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
+# call, and few enough that the host waits for no long one after every ball has arrived.
+_STRETCH = 64
+# Balls at phase 0 are found together in calls of few sizes.
+_STROBES = (64, 4096)
+
+
+def _time(state: State) -> Float[Array, "..."]:
+    """Time since phase 0 of period 0."""
+    return 2.0 * state.n.astype(state.t.dtype) + state.t
+
+
+def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Array, ""]) -> tuple:
+    """Displacement, velocity and mode at a time `when` after the start of a step."""
+    aloft = (when <= out.flight) | out.quiet
+    rise, v = flow.flight(pair.gamma, start.t, start.v, jnp.where(aloft, when, 0.0))
+    held = start.mode != 0
+    side = jnp.where(held, start.mode, out.impact.side).astype(rise.dtype)
+    inside = jnp.where(aloft, 0.0, when - out.flight)
+    if pair.kappa is None:
+        # Only sticking lasts: at rest on the wall.
+        w, z = jnp.zeros_like(rise), jnp.zeros_like(rise)
+    else:
+        force = flow.contact_force(pair.gamma, side, out.impact.t)
+        w0 = jnp.where(held, side * start.u - 0.5 * pair.d, 0.0)
+        w, z = flow.oscillate(flow.membrane(pair, rolled=True), force, w0, side * out.impact.v_in, inside)
+    u = jnp.where(aloft, start.u + rise, side * (0.5 * pair.d + w))
+    return u, jnp.where(aloft, v, side * z), jnp.where(aloft, 0, side.astype(jnp.int32))
+
+
+class _Flown(NamedTuple):
+    """Steps of the exact engine [row, step]: the start of each, what came of it.
+
+    Attributes:
+        idle: Whether the run had ended before.
+    """
+
+    begun: State
+    out: exact.Outcome
+    idle: Bool[Array, "row step"]
+
+
+class _Reached(NamedTuple):
+    """Where runs of the exact engine are, and which of them are over."""
+
+    state: State
+    over: Bool[Array, "row"]
+
+
+@jax.jit
+def _set_out(pair: ImpactPair, u0, v0, t0) -> _Reached:
+    return _Reached(jax.vmap(begin)(pair, u0, v0, t0), jnp.zeros(u0.shape, bool))
+
+
+def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[Array, ""], count: int):
+    """So many steps on, the first of which has a number in the run: where the balls are then, and the `_Flown`."""
+
+    def advance(reached: _Reached, index):
+        state, over = reached
+        idle = over | (index > asked.max_impacts)
+        horizon = jnp.where(idle, 0.0, 2.0 * (asked.periods - state.n).astype(state.t.dtype) - state.t)
+
+        def fly():
+            return jax.vmap(partial(exact.step, rolled=True))(pair, state, horizon)
+
+        def rest():
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fly))
+
+        # Room that is not asked for costs no time.
+        out = lax.cond(idle.all(), rest, fly)
+        over = over | (~idle & (out.quiet | out.permanent | (horizon <= 0)))
+        ends = idle | over
+        after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
+        return _Reached(after, over), _Flown(state, out, idle)
+
+    reached, flown = lax.scan(advance, reached, first + jnp.arange(count, dtype=jnp.int32))
+    return reached, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), flown)
+
+
+_stretch = jax.jit(partial(_onward, count=_STRETCH))
+
+
+def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Reached, _Flown]:
+    """All steps of rows of starts: as many as there is room for where they are traced, else until all runs are over."""
+    reached = _set_out(pair, *starts)
+    # One step more than impacts: the flight or contact in which the last period ends.
+    steps = room.impacts + 1
+    if tiles.library((pair, starts)) is jnp:
+        return _onward(asked, pair, reached, jnp.int32(0), steps)
+    # Stretches of one length need one program, where every number of periods would need its own: 4 s and 800 mappings.
+    parts = []
+    for first in range(0, steps, _STRETCH):
+        reached, flown = _stretch(asked, pair, reached, np.int32(first))
+        parts.append(jax.tree.map(np.asarray, flown))
+        if np.asarray(reached.over).all():
+            break
+    flown = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
+    return jax.tree.map(np.asarray, reached), flown
+
+
+def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Trajectory:
+    """By the exact engine, of rows of starts."""
+    reached, flown = _fly(asked, room, pair, (u0, v0, t0))
+    own = tiles.library((pair, flown))
+    out, idle = flown.out, flown.idle
+    real = ~idle & (out.impact.side != 0)
+    counted = own.cumsum(real, axis=1, dtype=own.int32)
+    real = real & (counted <= asked.max_impacts) & (out.impact.n < asked.periods)
+    filled = real.sum(axis=1, dtype=own.int32)
+    there = own.arange(room.impacts, dtype=own.int32) < filled[:, None]
+    order = own.argsort(~real, axis=1, stable=True)[:, : room.impacts]
+    order = own.pad(order, ((0, 0), (0, room.impacts - order.shape[1])))
+
+    def keep(leaf):
+        blank = 0 if own.issubdtype(leaf.dtype, own.integer) else own.nan
+        return own.where(there, own.take_along_axis(leaf, order, axis=1), blank)
+
+    states = _strobes(pair, flown, room.periods)
+    permanent = (out.permanent & ~idle).any(axis=1)
+    short = ~reached.over & (_time(reached.state) < 2.0 * asked.periods.astype(reached.state.t.dtype))
+    status = own.where(permanent, Status.PERMANENT_CONTACT, own.where(filled == 0, Status.NO_IMPACT, Status.OK))
+    status = own.where(short, Status.EVENT_BUDGET, status).astype(own.int32)
+    return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
+
+
+exact_traced = jax.jit(exact_run, static_argnames="room")
+
+
+def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:
+    """The balls at phase 0 of periods 1 ... periods, [row, period]: each in the last step that began before."""
+    own = tiles.library((pair, flown))
+    begun, out, idle = flown
+    clock = own.where(idle, own.inf, _time(begun))
+    # A step that nothing ends is the last word on all that comes.
+    ended = idle | out.quiet | out.permanent
+    until = own.where(ended, own.inf, _time(out.state))
+    k = own.broadcast_to(own.arange(1, periods + 1, dtype=own.int32), (clock.shape[0], periods))
+    now = 2.0 * k.astype(clock.dtype)
+    index = own.clip(_before(clock, now), 0, clock.shape[1] - 1)
+    first, happened, last = jax.tree.map(lambda leaf: own.take_along_axis(leaf, index, axis=1), (begun, out, until))
+    known = now <= last
+    when = own.where(known, 2.0 * (k - first.n).astype(clock.dtype) - first.t, 0.0)
+    wide = jax.tree.map(lambda leaf: own.broadcast_to(leaf[:, None], k.shape), pair)
+    rows = jax.tree.map(lambda leaf: leaf.reshape(-1), (wide, first, happened, when))
+    u, v, mode = jax.tree.map(lambda leaf: leaf.reshape(k.shape), tiles.map_tiles(_balls_at, rows, _STROBES))
+    blank = own.where(known, 0.0, own.nan).astype(u.dtype)
+    return State(u + blank, v + blank, own.zeros_like(u), k, mode)
+
+
+@jax.jit
+def _balls_at(rows: tuple) -> tuple:
+    return jax.vmap(ball_at)(*rows)
+
+
+def _before(clock: Float[Array, "row step"], now: Float[Array, "row period"]) -> Int[Array, "row period"]:
+    """The last step of each row that began by then; -1 before all."""
+    if tiles.library((clock, now)) is jnp:
+        return jax.vmap(partial(jnp.searchsorted, side="right"))(clock, now) - 1
+    rows: Any = zip(clock, now, strict=True)
+    index: Any = np.stack([np.searchsorted(row, when, side="right") for row, when in rows])
+    return index - 1

@@ -1,0 +1,59 @@
+"""What a recorded run is asked for, and the record that it returns."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from vijax.engine import exact
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Impact, State, WithStatus
+
+# A contact that outlasts the last period by so many is taken to last for ever.
+HELD = 8
+# A differentiated run computes so many steps twice: it remembers only where a chunk began and what it decided.
+CHUNK = 64
+
+
+class Trajectory(WithStatus):
+    """Impacts and stroboscopic states of one start, or of many along leading axes.
+
+    Attributes:
+        impacts: `Impact` records along the last axis, in order; NaN (side 0) beyond `filled`.
+        filled: How many impacts there are.
+        states: The ball at phase 0 of periods 1 ... periods, along the last axis; NaN where `impacts` was too short.
+        status: OK, NO_IMPACT, PERMANENT_CONTACT, or EVENT_BUDGET where `max_impacts` came before the last period.
+    """
+
+    impacts: Impact
+    filled: Int[Array, "..."]
+    states: State
+    status: Int[Array, "..."]
+
+
+class Asked(NamedTuple):
+    """How far a run goes: traced, so that one program serves all numbers that its records have room for.
+
+    Attributes:
+        periods, max_impacts: As asked for.
+        chunks: How often a stepping engine may take `CHUNK` steps.
+    """
+
+    periods: Int[Array, ""]
+    max_impacts: Int[Array, ""]
+    chunks: Int[Array, ""]
+
+
+class Room(NamedTuple):
+    """How many of each a program has room for."""
+
+    periods: int
+    impacts: int
+    chunks: int
+
+
+def begin(pair: ImpactPair, u0, v0, t0) -> State:
+    """The start as a state, in contact or in flight."""
+    t, n = flow.wrap_phase(t0)
+    return State(u0, v0, t, n.astype(jnp.int32), exact.start_mode(pair, u0, v0, t).astype(jnp.int32))

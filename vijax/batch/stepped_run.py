@@ -1,0 +1,97 @@
+"""Runs of engines that step through time, recorded: all lanes step together."""
+
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from vijax.batch.run_records import CHUNK, HELD, Asked, Room, Trajectory, begin
+from vijax.engine.method import Method, repeated
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Impact, State, Status
+
+
+class _Recording(eqx.Module):
+    """The loop's state of stepped runs: carries, what was found so far, and whether something broke."""
+
+    carry: Any
+    impacts: Impact
+    filled: Int[Array, "lane"]
+    states: State
+    broken: Array
+
+
+def _recording(room: Room, carry: Any, like: Float[Array, "lane"]) -> _Recording:
+    """Empty records."""
+    lanes = like.shape[0]
+    whole = jnp.zeros(lanes, jnp.int32)
+
+    def blank(width):
+        return jnp.full((lanes, width), jnp.nan, like.dtype), jnp.zeros((lanes, width), jnp.int32)
+
+    x, n = blank(room.impacts)
+    impacts = Impact(n=n, t=x, side=n, v_in=x, v_out=x, depth=x, duration=x, work=x)
+    x, n = blank(room.periods)
+    k = jnp.broadcast_to(jnp.arange(1, room.periods + 1, dtype=jnp.int32), n.shape)
+    return _Recording(carry, impacts, whole, State(x, x, x, k, n), jnp.zeros(lanes, bool))
+
+
+def _write(table: Any, row: Any, index: Int[Array, "lane"], wanted: Array) -> Any:
+    """A table [lane, width] with a row written at each lane's index, where wanted."""
+
+    def write(leaf, value):
+        column = jnp.where(wanted, index, leaf.shape[1])
+        return leaf.at[jnp.arange(leaf.shape[0], dtype=jnp.int32), column].set(value.astype(leaf.dtype), mode="drop")
+
+    return jax.tree.map(write, table, row)
+
+
+@partial(jax.jit, static_argnames=("name", "room"))
+def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, name: str, room: Room) -> Trajectory:
+    """Stepping engines: all lanes step together, each until its last period is over and its last contact has ended."""
+    engine = import_module(f"vijax.engine.{name}")
+    periods, max_impacts, chunks = asked
+    begun = jax.vmap(begin)(pair, u0, v0, t0)
+    wall = jax.vmap(method.law.wall)(pair)
+    carry = jax.vmap(partial(engine.start, method, deep=True, tangent=False))(pair, begun)
+    start = _recording(room, carry, u0)
+
+    def runs(r: _Recording):
+        m = r.carry
+        inside = (m.mode != 0) & (m.onset_n < periods)
+        full = (r.filled >= max_impacts) & (m.mode != 0)
+        return ~r.broken & ~full & ((m.n < periods) | (inside & (m.n < periods + HELD)))
+
+    def advance(r: _Recording) -> _Recording:
+        going = runs(r)
+        carry, passage, ended = jax.vmap(partial(engine.step, method, recorded=True))(pair, wall, r.carry)
+        impact = passage.impact
+        real = going & ended & (impact.n < periods)
+        strobe = going & (carry.n > r.carry.n) & (carry.n <= periods)
+        ball = jax.vmap(lambda pair, m: engine.ball(pair, method, m))(pair, carry)
+        return _Recording(
+            carry=jax.tree.map(lambda new, old: jnp.where(going, new, old), carry, r.carry),
+            impacts=_write(r.impacts, impact, r.filled, real),
+            filled=r.filled + real.astype(jnp.int32),
+            states=_write(r.states, ball, carry.n - 1, strobe),
+            broken=r.broken | (real & ~jnp.isfinite(impact.v_out)),
+        )
+
+    def chunk(r: _Recording, index):
+        def go(r):
+            return lax.scan(lambda r, _: (advance(r), None), r, None, length=CHUNK)[0]
+
+        return lax.cond(runs(r).any() & (index < chunks), repeated(go), lambda r: r, r), None
+
+    end, _ = lax.scan(chunk, start, jnp.arange(room.chunks, dtype=jnp.int32))
+    m = end.carry
+    held = (m.mode != 0) & (m.n >= periods) & (m.onset_n < periods)
+    short = runs(end) | ((end.filled >= max_impacts) & (m.n < periods))
+    status = jnp.where(held, Status.PERMANENT_CONTACT, jnp.where(end.filled == 0, Status.NO_IMPACT, Status.OK))
+    status = jnp.where(end.broken, Status.NONFINITE, jnp.where(short, Status.EVENT_BUDGET, status))
+    return Trajectory(end.impacts, end.filled, end.states, status.astype(jnp.int32))
