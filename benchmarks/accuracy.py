@@ -40,7 +40,7 @@ from vijax.batch import simulate
 from vijax.design import survey
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair, impact_pair
-from vijax.orbits import periodic
+from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.shooting import Sequence
 from vijax.orbits.steady import Steady, find, response
 from vijax.runtime import tiles
@@ -169,7 +169,7 @@ def steady_states(count: int) -> None:
         there = dataclasses.replace(met.pair, d=moved * met.pair.d)
         state = _steadily(device, there, sequence, met.knots)
         flown = periodic.proven(there, sequence, jnp.asarray(state.knots))
-        P, fine = np.asarray(periodic.power(flown, device)), np.asarray(flown.status) == vijax.Status.OK
+        P, fine = np.asarray(orbit_properties.power(flown, device)), np.asarray(flown.status) == vijax.Status.OK
         ok = state.status == vijax.Status.OK
         said += state.status.size
         wrong += int((ok & ~fine).sum())

@@ -64,7 +64,7 @@ from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Status
-from vijax.orbits import periodic as orbits
+from vijax.orbits import periodic
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.shooting import Sequence
 from vijax.orbits.steady import steady
@@ -103,7 +103,7 @@ def reference_orbits() -> list[tuple[dict, Orbit]]:
         pair = impact_pair(*([float(row[name])] for name in ("d", "kappa", "r", "gamma")))
         side = jnp.asarray(np.sign(v[order])[None], jnp.int32)
         knots = jnp.asarray(np.stack([t, np.abs(v), stay], axis=1)[order])[None]
-        rows.append((row, orbits.solve(pair, Sequence(side, jnp.full(1, 2.0), jnp.zeros(1, bool)), knots)[0]))
+        rows.append((row, periodic.solve(pair, Sequence(side, jnp.full(1, 2.0), jnp.zeros(1, bool)), knots)[0]))
     return rows
 
 
@@ -116,7 +116,7 @@ def random_cells() -> Orbit:
     columns = draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt
     rest, speed = np.zeros(shape), np.full(shape, 0.25)
     flown = survey(ImpactPair(*map(jnp.asarray, columns)), rest, speed, longest=4, periods=400).orbits(8)
-    found = orbits.solve(jax.tree.map(jnp.asarray, flown.pair), flown.sequence(8), jnp.asarray(flown.knots))
+    found = periodic.solve(jax.tree.map(jnp.asarray, flown.pair), flown.sequence(8), jnp.asarray(flown.knots))
     return found[np.asarray(found.status) == Status.OK]
 
 

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 import vijax
-from vijax.orbits import periodic
+from vijax.orbits import orbit_search
 
 DEVICE = vijax.Harvester()
 CALLS = {"steady": 10_000, "grad": 1_000, "trajectory": 500}
@@ -41,7 +41,7 @@ def device(number: float | jax.Array) -> vijax.Harvester:
 
 def works() -> dict[str, Callable[[int], object]]:
     """What is called, by the number of the call."""
-    found = periodic.search(DEVICE.pair(), "RL", guesses=256)
+    found = orbit_search.search(DEVICE.pair(), "RL", guesses=256)
     known = found[np.abs(np.asarray(found.multipliers)).max(axis=1) < 1][0]
     pair = vijax.impact_pair(0.2, 40.0, 0.5)
     return {

@@ -21,7 +21,18 @@ from vijax.design.report import lines, table
 from vijax.design.robustness import surroundings, weighted
 from vijax.design.tolerance import Tolerance, nodes
 from vijax.model import device
-from vijax.orbits import continuation, motion, periodic, shooting
+from vijax.orbits import (
+    branch_dataset,
+    continuation,
+    events,
+    motion,
+    orbit_properties,
+    orbit_search,
+    periodic,
+    shooting,
+    switching,
+    symmetry,
+)
 from vijax.planes.compare import cheapest_model
 from vijax.plots import branch_diagrams, designs, kind_maps, number_maps, orbit_diagrams
 
@@ -313,8 +324,8 @@ CALLS: Table = {
         {"dataset": a_map(), "path": "map.zarr"},
         {"dataset": DATASET, "path": (*TARGET, None), "overwrite": FLAG},
     ),
-    "periodic.search": (
-        periodic.search,
+    "orbit_search.search": (
+        orbit_search.search,
         {"pair": pair(), "impacts": "1:1"},
         {
             "pair": (*PAIR, vijax.impact_pair([0.2, 0.3], 40.0, 0.5)),
@@ -324,8 +335,8 @@ CALLS: Table = {
             "seed": SEED,
         },
     ),
-    "periodic.from_state": (
-        periodic.from_state,
+    "orbit_search.from_state": (
+        orbit_search.from_state,
         {"pair": pair(), "u": 0.05, "v": -0.4},
         {
             "pair": PAIR,
@@ -336,8 +347,8 @@ CALLS: Table = {
             "settle": WHOLE,
         },
     ),
-    "periodic.from_state beyond a rigid wall": (
-        periodic.from_state,
+    "orbit_search.from_state beyond a rigid wall": (
+        orbit_search.from_state,
         {"pair": vijax.impact_pair(0.2, None, 0.5), "v": 0.0},
         {"u": (0.2, -0.11, [0.0, 5.0])},
     ),
@@ -373,21 +384,21 @@ CALLS: Table = {
     **{
         f"orbit.{door.__name__}": (door, {}, {"orbit": ORBIT})
         for door in (
-            periodic.symmetric,
-            periodic.halved,
-            periodic.doubled,
-            periodic.unfolded,
-            periodic.counts,
-            periodic.labels,
+            symmetry.symmetric,
+            symmetry.halved,
+            symmetry.doubled,
+            symmetry.unfolded,
+            orbit_properties.counts,
+            orbit_properties.labels,
         )
     },
-    "periodic.impacts": (periodic.impacts, {}, {"orbit": ORBIT}),
-    "periodic.power": (
-        periodic.power,
+    "orbit_properties.impacts": (orbit_properties.impacts, {}, {"orbit": ORBIT}),
+    "orbit_properties.power": (
+        orbit_properties.power,
         {"orbit": an_orbit(), "device": vijax.Harvester()},
         {"orbit": ORBIT, "device": (*DEVICE, None)},
     ),
-    "periodic.path": (periodic.path, {"orbit": an_orbit()}, {"orbit": ORBIT, "samples": COUNT}),
+    "orbit_properties.path": (orbit_properties.path, {"orbit": an_orbit()}, {"orbit": ORBIT, "samples": COUNT}),
     "continuation.follow": (
         continuation.follow,
         {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
@@ -400,8 +411,8 @@ CALLS: Table = {
             "points": (*COUNT, 10**9),
         },
     ),
-    "continuation.family": (
-        continuation.family,
+    "switching.family": (
+        switching.family,
         {"orbit": an_orbit(), "along": "d", "within": (0.1, 0.3)},
         {
             "orbit": ORBIT,
@@ -412,17 +423,17 @@ CALLS: Table = {
             "points": (0, 1.5, 10**9),
         },
     ),
-    "continuation.switch": (
-        continuation.switch,
-        {"point": continuation.Point("flip", 0.2, an_orbit()), "along": "d", "within": (0.1, 0.3)},
+    "switching.switch": (
+        switching.switch,
+        {"point": events.Point("flip", 0.2, an_orbit()), "along": "d", "within": (0.1, 0.3)},
         {
-            "point": (3, None, "flip", continuation.Point("fold", 0.2, an_orbit())),
+            "point": (3, None, "flip", events.Point("fold", 0.2, an_orbit())),
             "along": (3, "mass"),
             "within": (3, (0.3, 0.1)),
             "points": (0, 1.5, 10**9),
         },
     ),
-    "continuation.dataset": (continuation.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
+    "branch_dataset.dataset": (branch_dataset.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
     "surroundings": (
         surroundings,
         {"optimum": an_optimum()},
@@ -519,8 +530,8 @@ TRACED: dict[str, Callable[[Any], Any]] = {
     "kappa of orbit_diagram": lambda x: vijax.orbit_diagram(along="d", values=[0.1, 0.2], kappa=x),
     "device of optimise": lambda x: vijax.optimise(vijax.Harvester(s=x)),
     "bounds of optimise": lambda x: vijax.optimise(bounds={"omega0": (20.0, x)}),
-    "pair of search": lambda x: periodic.search(vijax.impact_pair(x, 40.0, 0.5), "1:1"),
-    "u of from_state": lambda x: periodic.from_state(_PAIR, x, 0.1),
+    "pair of search": lambda x: orbit_search.search(vijax.impact_pair(x, 40.0, 0.5), "1:1"),
+    "u of from_state": lambda x: orbit_search.from_state(_PAIR, x, 0.1),
     "within of follow": lambda x: continuation.follow(_ORBIT, "d", (0.1, x)),
     "reach of surroundings": lambda x: weighted(a_design(), reach=x),
 }
@@ -540,7 +551,7 @@ SHAPES: dict[str, Callable[[], Any]] = {
     "gamma of with_pair": lambda: device.with_pair(vijax.Harvester(), vijax.impact_pair(0.2, 40.0, 0.5, 20.0)),
     "d and kappa of other shapes": lambda: vijax.impact_pair([0.1, 0.2], [1.0, 2.0, 3.0], 0.5),
     "u0 and v0 of other shapes": lambda: vijax.trajectory(pair(), [0.0, 0.1], [0.1, 0.2, 0.3], 4),
-    "u and v of other shapes": lambda: periodic.from_state(pair(), [0.0, 0.1], [0.1, 0.2, 0.3]),
+    "u and v of other shapes": lambda: orbit_search.from_state(pair(), [0.0, 0.1], [0.1, 0.2, 0.3]),
     "r with Hunt-Crossley": lambda: vijax.trajectory(
         pair(), 0.05, -0.4, 4, method="ode", membrane=vijax.HuntCrossley(0.5)
     ),
@@ -569,8 +580,8 @@ LARGE: dict[str, Callable[[], Any]] = {
     "keep of 10^9": lambda: vijax.orbit_diagram(along="d", values=[0.1, 0.2], periods=10**9, keep=10**9),
     "periods of 10^9 recorded": lambda: vijax.trajectory(pair(), 0.05, -0.4, 10**9),
     "periods of 10^8 and u0 of many": lambda: vijax.trajectory(pair(), np.zeros(10**4), -0.4, 10**7),
-    "samples of 10^9": lambda: periodic.path(an_orbit(), 10**9),
-    "guesses of 5005 sequences": lambda: periodic.search(pair(), "6:9", guesses=10**7),
+    "samples of 10^9": lambda: orbit_properties.path(an_orbit(), 10**9),
+    "guesses of 5005 sequences": lambda: orbit_search.search(pair(), "6:9", guesses=10**7),
     "points of 10^9": lambda: continuation.follow(an_orbit(), "d", (0.1, 0.3), points=10**9),
     "steps and balls of 10^12": lambda: vijax.optimise(steps=10**6, balls=10**6),
     "samples of optimise": lambda: vijax.optimise(

@@ -31,8 +31,7 @@ import vijax
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Status
-from vijax.orbits import continuation
-from vijax.orbits import periodic as orbits
+from vijax.orbits import continuation, orbit_properties, orbit_search, periodic, switching, symmetry
 from vijax.orbits.shooting import Sequence
 
 DATA = Path(__file__).parent.parent / "tests" / "data"
@@ -53,7 +52,7 @@ def reference() -> None:
         order = np.argsort(t)
         knots = np.stack([t, np.abs(v), stay], axis=1)[order]
         pair = impact_pair(*([float(row[name])] for name in ("d", "kappa", "r", "gamma")))
-        found = orbits.solve(
+        found = periodic.solve(
             pair, period_1(np.sign(v[order]), 1), jnp.asarray(knots * (1 + 0.02 * np.array([1, -1, 1])))[None]
         )
         multipliers = [complex(*map(float, parts)) for parts in row["multipliers_mp_contact_map"]]
@@ -63,7 +62,7 @@ def reference() -> None:
             "multipliers": min(
                 np.abs(found.multipliers[0] - np.array(m)).max() for m in (multipliers, multipliers[::-1])
             ),
-            "P, relative": abs(float(orbits.power(found, Harvester())[0]) / float(row["P_J"]) - 1),
+            "P, relative": abs(float(orbit_properties.power(found, Harvester())[0]) / float(row["P_J"]) - 1),
         }
         worst = {name: max(worst[name], float(error)) for name, error in errors.items()}
     for name, error in worst.items():
@@ -78,8 +77,8 @@ def period_1(walls, count: int) -> Sequence:
 
 def throughput() -> None:
     """Symmetric 1:1 orbits of many kappa, closed half way, each from a neighbour's knots, all of them verified."""
-    start = orbits.search(impact_pair(D, 40.0, 0.5), "RL", guesses=1024)
-    start = orbits.halved(start[np.flatnonzero(np.asarray(orbits.symmetric(start)))])
+    start = orbit_search.search(impact_pair(D, 40.0, 0.5), "RL", guesses=1024)
+    start = symmetry.halved(start[np.flatnonzero(np.asarray(symmetry.symmetric(start)))])
     fast = start[jnp.argmax(start.knots[:, 0, 1], keepdims=True)]
     (along,) = continuation.follow(fast, "kappa", (3.0, 400.0))
     say("the branch they lie on: kappa from, to", f"{along.values.min():.4g}, {along.values.max():.4g}")
@@ -123,7 +122,7 @@ def solve_all(kappa: np.ndarray, anchor: np.ndarray) -> tuple[np.ndarray, np.nda
             *(jnp.asarray(x) for x in (np.full(count, D), kappa[rows], np.full(count, 0.5), np.zeros(count)))
         )
         sequence = Sequence(jnp.ones((count, 1), jnp.int32), jnp.ones(count), jnp.ones(count, bool))
-        found = jax.tree.map(np.asarray, orbits.solve(pair, sequence, jnp.asarray(guess)[:, None]))
+        found = jax.tree.map(np.asarray, periodic.solve(pair, sequence, jnp.asarray(guess)[:, None]))
         knots[rows], status[rows], residual[rows] = found.knots[:, 0], found.status, found.residual
     return status, residual
 
@@ -147,8 +146,8 @@ def bifurcations() -> None:
 
 def met(what: str, at: dict, impacts: str, along: str, within, kind: str, known: float, device=None) -> None:
     """The point of a kind nearest to the known one, on the branches from one orbit."""
-    found = orbits.search(impact_pair(**at), impacts, guesses=1024)
-    points = [point for one in continuation.family(found, along, within, device=device) for point in one.points]
+    found = orbit_search.search(impact_pair(**at), impacts, guesses=1024)
+    points = [point for one in switching.family(found, along, within, device=device) for point in one.points]
     point = min((point for point in points if point.kind == kind), key=lambda point: abs(point.value - known))
     value = {"flip": -1}.get(kind, 1)
     off = abs(complex(point.orbit.multipliers[0, 0]) - value)

@@ -14,18 +14,18 @@ from vijax.model.energy import harvested_energy
 from vijax.model.membrane import HuntCrossley
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Impact, State, Status
+from vijax.orbits.branch_dataset import dataset as branch_dataset
 from vijax.orbits.continuation import Branch
-from vijax.orbits.continuation import dataset as branch_dataset
-from vijax.orbits.continuation import family as follow_families
 from vijax.orbits.continuation import follow as follow_orbits
+from vijax.orbits.orbit_properties import impacts as orbit_impacts
+from vijax.orbits.orbit_properties import labels as orbit_labels
+from vijax.orbits.orbit_properties import path as orbit_path
+from vijax.orbits.orbit_properties import power as orbit_power
+from vijax.orbits.orbit_search import from_state as orbits_from_states
+from vijax.orbits.orbit_search import search as find_orbits
 from vijax.orbits.periodic import Orbit
-from vijax.orbits.periodic import from_state as orbits_from_states
-from vijax.orbits.periodic import impacts as orbit_impacts
-from vijax.orbits.periodic import labels as orbit_labels
-from vijax.orbits.periodic import path as orbit_path
-from vijax.orbits.periodic import power as orbit_power
-from vijax.orbits.periodic import search as find_orbits
 from vijax.orbits.steady import Steady, steady
+from vijax.orbits.switching import family as follow_families
 from vijax.planes.basins import basin_fractions, basins
 from vijax.planes.chaos import lyapunov, survival
 from vijax.planes.compare import cheapest_model, compare, rigid_from

@@ -10,7 +10,7 @@ import numpy as np
 from paper.captions import GAP_IN_METRES, Run
 from vijax.model.device import Harvester
 from vijax.model.pair import impact_pair
-from vijax.orbits import continuation, periodic
+from vijax.orbits import continuation, orbit_search, periodic
 from vijax.planes.orbit_diagram import orbit_diagram
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def diagram(run: Run) -> "xr.Dataset":
 @lru_cache(maxsize=64)
 def orbits(walls: str, d: float, kappa: float | None, r: float = 0.5, period: int = 1) -> periodic.Orbit:
     """Every orbit found with these walls, stable or not; kappa is None of rigid walls."""
-    return periodic.search(impact_pair(d, kappa, r), walls, period)
+    return orbit_search.search(impact_pair(d, kappa, r), walls, period)
 
 
 @lru_cache(maxsize=32)

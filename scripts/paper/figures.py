@@ -12,7 +12,7 @@ from paper.captions import BRANCHES_FROM, BRANCHES_WITHIN, FIGURES, PaperFigure,
 from paper.portrait import Layer, Panel, phase_plane, small_multiples, time_series
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.orbits.motion import Curve, curve, states
-from vijax.orbits.periodic import path
+from vijax.orbits.orbit_properties import path
 
 if TYPE_CHECKING:
     import xarray as xr

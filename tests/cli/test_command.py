@@ -17,7 +17,7 @@ from vijax.cli import main as command
 from vijax.cli import process
 from vijax.cli.options import AXES
 from vijax.model.quantities import AXES as QUANTITIES
-from vijax.orbits import continuation, periodic
+from vijax.orbits import orbit_search, switching
 from vijax.plots import branch_diagrams, orbit_diagrams
 
 ROOT = SCRIPTS.parent
@@ -141,8 +141,8 @@ LEAST = {
     "basins --starts 0": lambda: vijax.basin_fractions(**CELL, starts=0),
     "basins --seed=-1": lambda: vijax.basin_fractions(**CELL, starts=4, seed=-1),
     "basins --speed 0": lambda: vijax.basin_fractions(**CELL, starts=4, speed=0.0),
-    "branch --guesses 0": lambda: periodic.search(vijax.impact_pair(0.2, 3.0, 0.5), "1:1", guesses=0),
-    "branch --generations=-1": lambda: continuation.family(None, "d", (0.1, 0.2), generations=-1),
+    "branch --guesses 0": lambda: orbit_search.search(vijax.impact_pair(0.2, 3.0, 0.5), "1:1", guesses=0),
+    "branch --generations=-1": lambda: switching.family(None, "d", (0.1, 0.2), generations=-1),
     "design --steps 1": lambda: vijax.optimise(steps=1),
     "design --balls 0": lambda: vijax.optimise(balls=0),
     "design --impacts 0": lambda: vijax.optimise(impacts=0),

@@ -11,8 +11,7 @@ import vijax
 from vijax.design.survey import survey
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
-from vijax.orbits import grazing
-from vijax.orbits import periodic as orbits
+from vijax.orbits import grazing, orbit_properties, periodic
 
 KAPPA = np.geomspace(3, 400, 64)
 
@@ -30,7 +29,7 @@ def found():
 def orbit(found):
     """The orbits of what was flown."""
     *_, met = found
-    return orbits.solve(jax.tree.map(jnp.asarray, met.pair), met.sequence(8), jnp.asarray(met.knots))
+    return periodic.solve(jax.tree.map(jnp.asarray, met.pair), met.sequence(8), jnp.asarray(met.knots))
 
 
 def test_orbits_are_those_of_a_sweep(found, orbit):
@@ -39,8 +38,8 @@ def test_orbits_are_those_of_a_sweep(found, orbit):
     here = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] > KAPPA[7]))
     np.testing.assert_array_equal(pair.kappa[met.cell[here]], KAPPA[8:])
     swept = vijax.sweep(d=0.2, kappa=KAPPA[8:], r=0.5, outputs=["P", "period"])
-    np.testing.assert_allclose(orbits.power(orbit[here], vijax.Harvester()), swept["P"], rtol=1e-7)
-    np.testing.assert_array_equal(orbits.counts(orbit[here]).period, swept["period"])
+    np.testing.assert_allclose(orbit_properties.power(orbit[here], vijax.Harvester()), swept["P"], rtol=1e-7)
+    np.testing.assert_array_equal(orbit_properties.counts(orbit[here]).period, swept["period"])
 
 
 def test_attractors_are_flown_as_their_orbits_are_and_stand_at_their_cells(found, orbit):
@@ -59,7 +58,7 @@ def test_attractors_are_flown_as_their_orbits_are_and_stand_at_their_cells(found
 def test_coexisting_attractors_are_met(found, orbit):
     pair, _, met = found
     many = np.flatnonzero((pair.d[met.cell] == 0.2) & (pair.kappa[met.cell] == 3.0))
-    power = np.asarray(orbits.power(orbit[many], vijax.Harvester()))
+    power = np.asarray(orbit_properties.power(orbit[many], vijax.Harvester()))
     assert np.unique(np.round(1e9 * power)).size == many.size > 1
 
 
@@ -97,7 +96,7 @@ def test_clearances_are_those_of_the_motion_in_between(orbit):
     sequence, knots = some.sequence, jnp.nan_to_num(some.knots)
     room = jax.jit(jax.vmap(grazing.between))(some.pair, sequence, knots).clearance
     assert (np.stack(room) > 0).all()
-    _, u, _ = orbits.path(some, samples=2001)
+    _, u, _ = orbit_properties.path(some, samples=2001)
     for index in range(len(some)):
         half = 0.5 * float(some.pair.d[index])
         pieces = u[index].reshape(-1, 2001)[: 2 * int(some.count[index])]

@@ -13,7 +13,7 @@ from vijax.design import variables
 from vijax.model import quantities, units
 from vijax.model.device import CONSTANTS, Harvester, with_constants
 from vijax.model.pair import impact_pair
-from vijax.orbits import continuation, periodic
+from vijax.orbits import continuation, orbit_search
 from vijax.planes import axes, dataset, orbit_diagram, sweep
 
 U = pint.UnitRegistry()
@@ -106,7 +106,7 @@ def test_quantities_of_pint_at_the_doors():
 
 
 def test_a_branch_between_bounds_with_units():
-    found = periodic.search(Harvester(s=0.2).pair("rigid"), "RL", guesses=32)[:1]
+    found = orbit_search.search(Harvester(s=0.2).pair("rigid"), "RL", guesses=32)[:1]
     kept = {"direction": "up", "points": 4, "device": Harvester(s=0.2)}
     own, plain = (
         continuation.follow(found, "s", within, **kept)[0] for within in ((19 * U.cm, 210 * U.mm), (0.19, 0.21))

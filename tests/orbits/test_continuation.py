@@ -9,8 +9,7 @@ from vijax import plots
 from vijax.model.device import Harvester, with_constants
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
-from vijax.orbits import continuation
-from vijax.orbits import periodic as orbits
+from vijax.orbits import branch_dataset, continuation, orbit_properties, orbit_search, parameter, periodic, switching
 from vijax.orbits.shooting import Sequence
 
 SPAN = (0.1, 0.3)
@@ -22,8 +21,8 @@ PITCHFORK, FOLD = 0.2634316, 0.20158
 def family():
     """The symmetric period-1 orbits of rigid walls, closed half way, and what bifurcates from them."""
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
-    start = orbits.solve(impact_pair([0.2], None, 0.5), half, jnp.array([[[0.15, 0.5, 0.0]]]))
-    return continuation.family(start, "d", SPAN)
+    start = periodic.solve(impact_pair([0.2], None, 0.5), half, jnp.array([[[0.15, 0.5, 0.0]]]))
+    return switching.family(start, "d", SPAN)
 
 
 def largest(point):
@@ -52,8 +51,8 @@ def test_the_branch_of_mirror_images_flips_alike(family):
     # Both leave the pitchfork, where they begin.
     assert [one.values[0] for one in family[1:]] == pytest.approx([PITCHFORK] * 2, abs=5e-8)
     # It is followed from where it begins: half the impacts there are all of them elsewhere.
-    assert [int(x[0]) for x in orbits.counts(family[0].orbit[:1])] == [1, 1, 1]
-    assert [int(x[0]) for x in orbits.counts(family[1].orbit[-1:])] == [1, 1, 1]
+    assert [int(x[0]) for x in orbit_properties.counts(family[0].orbit[:1])] == [1, 1, 1]
+    assert [int(x[0]) for x in orbit_properties.counts(family[1].orbit[-1:])] == [1, 1, 1]
 
 
 def test_every_orbit_is_one_and_the_multiplier_decides_between_stable_and_not(family):
@@ -72,14 +71,14 @@ def test_grazing_ends_a_branch_where_the_ball_just_touches(family):
     ends = points(family, "grazing flight")
     assert {one.ends[1] for one in family[1:]} == {"grazing flight"}
     for point in ends[:2]:
-        _, u, _ = orbits.path(point.orbit, samples=2001)
+        _, u, _ = orbit_properties.path(point.orbit, samples=2001)
         turning = np.sort(np.abs(u[0][1:-1][(np.diff(u[0])[1:] * np.diff(u[0])[:-1]) <= 0]))
         # A third turning point at the wall, besides the two impacts.
         assert np.abs(turning - 0.5 * point.value).min() < 1e-6
 
 
 def test_a_branch_goes_through_its_fold():
-    found = orbits.search(impact_pair(0.19, None, 0.5), "RLL", guesses=32)
+    found = orbit_search.search(impact_pair(0.19, None, 0.5), "RLL", guesses=32)
     (one,) = continuation.follow(found[:1], "d", SPAN, direction="up")
     (fold,) = (point for point in one.points if point.kind == "fold")
     assert fold.value == pytest.approx(FOLD, abs=5e-6)
@@ -89,11 +88,11 @@ def test_a_branch_goes_through_its_fold():
 
 
 def test_the_dataset_and_its_picture(family, tmp_path):
-    found = continuation.dataset(family, Harvester())
+    found = branch_dataset.dataset(family, Harvester())
     assert found.sizes["branch"] == len(family)
     assert found["d"].attrs["units"] == "1"
     first = family[0]
-    np.testing.assert_allclose(found["P"][0, : len(first.values)], orbits.power(first.orbit, Harvester()))
+    np.testing.assert_allclose(found["P"][0, : len(first.values)], orbit_properties.power(first.orbit, Harvester()))
     assert sorted(k for k in found["event"].values.flat if k) == sorted(p.kind for b in family for p in b.points)
     # Marks lie on the sheet of the branch that met them.
     for index, one in enumerate(family):
@@ -126,7 +125,7 @@ def test_bad_input_is_told(family, change, message):
 
 def test_nothing_begins_at_a_grazing(family):
     with pytest.raises(ValueError, match="point must be a flip"):
-        continuation.switch(points(family, "grazing flight")[0], "d", SPAN)
+        switching.switch(points(family, "grazing flight")[0], "d", SPAN)
 
 
 DEVICE = Harvester(s=0.2, omega0=60.0, beta=0.01)
@@ -137,12 +136,10 @@ OTHER = {"omega": 3.3, "omega0": 70.0, "k": 10.0, "s": 0.21, "A": 1.2, "beta": -
 @pytest.mark.parametrize("wall", ["soft", "rigid"])
 def test_a_quantity_of_the_device_moves_the_pair_as_it_does_the_device(along, wall):
     pair = DEVICE.pair(wall)
-    assert float(continuation.value_at(DEVICE.pair(), along, DEVICE)) == pytest.approx(
-        getattr(DEVICE, along), rel=1e-14
-    )
+    assert float(parameter.value_at(DEVICE.pair(), along, DEVICE)) == pytest.approx(getattr(DEVICE, along), rel=1e-14)
     if wall == "rigid" and along in ("omega0", "k"):
         return
-    there = continuation.pair_at(pair, along, OTHER[along], DEVICE)
+    there = parameter.pair_at(pair, along, OTHER[along], DEVICE)
     for own, expected in zip(
         jax.tree.leaves(there), jax.tree.leaves(with_constants(DEVICE, **{along: OTHER[along]}).pair(wall)), strict=True
     ):
@@ -150,7 +147,7 @@ def test_a_quantity_of_the_device_moves_the_pair_as_it_does_the_device(along, wa
 
 
 def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
-    found = orbits.search(DEVICE.pair("rigid"), "RL", guesses=32)
+    found = orbit_search.search(DEVICE.pair("rigid"), "RL", guesses=32)
     (one,) = continuation.follow(found[:1], "A", (1, 2), device=DEVICE, direction="up", points=8)
     assert one.values[0] == pytest.approx(1.0, abs=1e-14)
     assert one.values[-1] > 1.004
@@ -158,7 +155,7 @@ def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     shaken = with_constants(DEVICE, A=jnp.asarray(one.values)).pair("rigid")
     np.testing.assert_allclose(one.orbit.pair.d, shaken.d, rtol=1e-14)
     np.testing.assert_allclose(one.orbit.pair.gamma, shaken.gamma, rtol=1e-14)
-    table = continuation.dataset([one], DEVICE)
+    table = branch_dataset.dataset([one], DEVICE)
     assert table["A"].attrs["units"] == "m s-2"
     last = with_constants(DEVICE, A=float(one.values[-1]))
-    assert float(table["P"][0, -1]) == pytest.approx(float(orbits.power(one.orbit[-1:], last)[0]), rel=1e-12)
+    assert float(table["P"][0, -1]) == pytest.approx(float(orbit_properties.power(one.orbit[-1:], last)[0]), rel=1e-12)

@@ -13,7 +13,7 @@ from helpers import reference_orbits, reference_rows
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Status
-from vijax.orbits import periodic as orbits
+from vijax.orbits import orbit_properties, orbit_search, periodic
 from vijax.orbits.shooting import Sequence
 from vijax.orbits.steady import steady
 
@@ -29,7 +29,7 @@ def known(references, twist=1.0):
     sequence = Sequence(side, jnp.full(count, 2.0, float), jnp.zeros(count, bool))
     blank = jnp.full(side.shape, jnp.nan, float)
     knots = jnp.asarray([one.knots for one in references]) * twist
-    return orbits.Orbit(
+    return periodic.Orbit(
         pair, sequence, knots, blank, blank, jnp.zeros((count, 2), complex), blank[:, 0], jnp.zeros(count, jnp.int32)
     )
 
@@ -101,7 +101,7 @@ def test_reverse_is_forward_and_second_derivatives_are_differences_of_first(foun
 
 def test_where_no_orbit_attracts_nothing_is_said(found):
     guess, slope, _, _ = found
-    every = orbits.search(impact_pair(0.2, 25.0, 0.5), "RL", guesses=64)
+    every = orbit_search.search(impact_pair(0.2, 25.0, 0.5), "RL", guesses=64)
     repels = every[np.flatnonzero(np.abs(every.multipliers[:, 0]) > 1.01)[[0, 0, 0, 0]]]
     nonsense = dataclasses.replace(guess, knots=guess.knots * jnp.array([1.0, 1.0, -1.0]))
     for orbit, wanted in ((repels, Status.UNSTABLE), (nonsense, Status.NO_ORBIT)):
@@ -112,7 +112,7 @@ def test_where_no_orbit_attracts_nothing_is_said(found):
 
 
 def test_a_rigid_wall_yields_by_the_depth_it_is_lent():
-    start = orbits.search(impact_pair(0.3, None, 0.5), "RL", guesses=64)
+    start = orbit_search.search(impact_pair(0.3, None, 0.5), "RL", guesses=64)
     index = int(np.abs(start.multipliers[:, 0]).argmin())
     one = start[index]
 
@@ -121,14 +121,14 @@ def test_a_rigid_wall_yields_by_the_depth_it_is_lent():
         return steady(DEVICE, one, pair=pair).P
 
     value = jax.jit(P)
-    assert float(value(0.5)) == pytest.approx(float(orbits.power(start, DEVICE)[index]), rel=1e-12)
+    assert float(value(0.5)) == pytest.approx(float(orbit_properties.power(start, DEVICE)[index]), rel=1e-12)
     difference = (8 * (value(0.501) - value(0.499)) - (value(0.502) - value(0.498))) / 0.012
     assert float(jax.jit(jax.jacfwd(P))(0.5)) == pytest.approx(float(difference), rel=1e-7)
 
 
 def test_a_record_prints_its_status_by_name_and_what_to_do():
     # The symmetric 1:1 orbit of a rigid wall repels beyond its flip at d = 0.187.
-    found = orbits.search(impact_pair(0.15, None, 0.5), "RL", guesses=64)
+    found = orbit_search.search(impact_pair(0.15, None, 0.5), "RL", guesses=64)
     state = steady(DEVICE, found[0], pair=jax.tree.map(lambda x: x[0], found.pair))
     assert int(state.status) == Status.UNSTABLE
     assert "status=<Status.UNSTABLE: 9, follow it as a branch" in repr(state).replace("\n", " ")
@@ -154,10 +154,10 @@ def pressed():
 def test_a_pressed_contact_is_what_the_impact_map_flies(pressed, off):
     pair, sequence, knots = pressed
     pair = dataclasses.replace(pair, d=off * pair.d)
-    flown = orbits.solve(pair, sequence, knots)
+    flown = periodic.solve(pair, sequence, knots)
     state = jax.jit(jax.vmap(lambda orbit: steady(DEVICE, orbit, pair=orbit.pair)))(flown)
     # Off its place one of them would meet the wall twice more: that is no orbit, whatever its equations say.
     np.testing.assert_array_equal(state.status, flown.status)
     assert (np.asarray(flown.status) == Status.VIRTUAL).sum() == (off != 1.0)
     good = np.asarray(flown.status) == Status.OK
-    np.testing.assert_allclose(state.P[good], orbits.power(flown, DEVICE)[good], rtol=1e-12)
+    np.testing.assert_allclose(state.P[good], orbit_properties.power(flown, DEVICE)[good], rtol=1e-12)

@@ -21,7 +21,7 @@ from vijax.model import device as devices
 from vijax.model import energy
 from vijax.model import pair as pairs
 from vijax.model.pair import membrane_pair
-from vijax.orbits import continuation, motion, periodic
+from vijax.orbits import motion, orbit_properties, orbit_search, parameter, periodic
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {
@@ -48,7 +48,7 @@ def setting(request) -> Iterator[str]:
 def answers() -> Any:
     """What public functions of each kind say: planes on many threads, Newton with guesses that fail, closed forms."""
     device = vijax.Harvester()
-    found = periodic.search(device.pair(), "RL", guesses=64)
+    found = orbit_search.search(device.pair(), "RL", guesses=64)
     attracting = found[np.abs(np.asarray(found.multipliers)).max(axis=1) < 1]
     path = vijax.trajectory(vijax.impact_pair(0.2, 40.0, 0.5), 0.02, 0.3, periods=5)
     plane = vijax.sweep(d=[0.12, 0.2], kappa=40.0, r=0.5)
@@ -87,7 +87,7 @@ def test_settings_change_nothing_in_the_threads_of_a_program(plain, setting):
 def slopes() -> list[Any]:
     """Derivatives of both kinds of motion by a program's own closures."""
     device = vijax.Harvester()
-    known = periodic.search(device.pair(), "RL", guesses=64)
+    known = orbit_search.search(device.pair(), "RL", guesses=64)
     known = known[np.abs(np.asarray(known.multipliers)).max(axis=1) < 1][0]
     pair = vijax.impact_pair(0.2, 40.0, 0.5)
     return [
@@ -115,7 +115,7 @@ def test_a_door_looks_like_its_function():
 
 
 def test_an_orbit_in_single_precision_is_refused():
-    found = periodic.search(vijax.Harvester().pair(), "RL", guesses=64)[0]
+    found = orbit_search.search(vijax.Harvester().pair(), "RL", guesses=64)[0]
     single = jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == np.float64 else leaf, found)
     with pytest.raises(ValueError, match="orbit must hold 64 bits; got float32"):
         vijax.steady(vijax.Harvester(), single)
@@ -192,10 +192,10 @@ CLOSED_FORMS = {
     "variables.tuned": lambda: variables.tuned(vijax.Harvester(), ("k", "d"), NUMBERS),
     "variables.value_of": lambda: [variables.value_of(DEVICES, name) for name in variables.NAMES],
     "variables.limits": lambda: variables.limits(("k", "d"), {}, vijax.Harvester()),
-    "continuation.value_at": lambda: continuation.value_at(PAIR, "omega", vijax.Harvester()),
-    "continuation.pair_at": lambda: continuation.pair_at(PAIR, "omega", 7.0, vijax.Harvester()),
-    "periodic.depth_unit": lambda: periodic.depth_unit(two_orbits(), DEVICES),
-    "periodic.power": lambda: periodic.power(two_orbits(), vijax.Harvester()),
+    "parameter.value_at": lambda: parameter.value_at(PAIR, "omega", vijax.Harvester()),
+    "parameter.pair_at": lambda: parameter.pair_at(PAIR, "omega", 7.0, vijax.Harvester()),
+    "orbit_properties.depth_unit": lambda: orbit_properties.depth_unit(two_orbits(), DEVICES),
+    "orbit_properties.power": lambda: orbit_properties.power(two_orbits(), vijax.Harvester()),
     "Orbit": lambda: (two_orbits()[:1], two_orbits().count),
     "motion.curve": lambda: motion.curve(vijax.impact_pair(0.2, 40.0, 0.5), NUMBERS, [1, 1], NUMBERS, NUMBERS, NUMBERS),
     "report.describe": lambda: plain_numbers(report.describe(designed())),
@@ -205,7 +205,7 @@ CLOSED_FORMS = {
 
 @cache
 def two_orbits() -> periodic.Orbit:
-    return periodic.search(vijax.Harvester().pair(), "RL", guesses=64)[:2]
+    return orbit_search.search(vijax.Harvester().pair(), "RL", guesses=64)[:2]
 
 
 @cache

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax.orbits import continuation, motion, periodic
+from vijax.orbits import continuation, motion, orbit_properties, orbit_search, periodic, switching, symmetry
 
 DEVICE = vijax.Harvester()
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -39,7 +39,7 @@ def pair(i: int) -> vijax.ImpactPair:
 @pytest.fixture(scope="module")
 def known() -> periodic.Orbit:
     """One attracting orbit of the default device."""
-    found = periodic.search(DEVICE.pair(), "RL", guesses=64)
+    found = orbit_search.search(DEVICE.pair(), "RL", guesses=64)
     return found[np.abs(np.asarray(found.multipliers)).max(axis=1) < 1][:1]
 
 
@@ -80,17 +80,19 @@ CALLS = {
     "trajectory, starts": lambda i, known: vijax.trajectory(pair(i), np.full((2, 4 + i), 0.02), 0.3, periods=5),
     "trajectory, grad": lambda i, known: jax.grad(lambda v: vijax.trajectory(pair(i), 0.02, v, 5).states.u[-1])(0.3),
     "trajectory, rk4": lambda i, known: vijax.trajectory(pair(i), 0.02, 0.3, periods=5 + i, method="rk4", steps=100),
-    "periodic.search": lambda i, known: periodic.search(pair(i), "RL", guesses=60 + i),
-    "periodic.from_state": lambda i, known: periodic.from_state(pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + 40 * i),
-    "periodic.doubled": lambda i, known: periodic.doubled(many(known, i)),
-    "periodic.impacts": lambda i, known: periodic.impacts(many(known, i)),
-    "periodic.labels": lambda i, known: periodic.labels(many(known, i)),
-    "periodic.power": lambda i, known: periodic.power(many(known, i), tuned(omega0(i))),
-    "periodic.path": lambda i, known: periodic.path(many(known, i)),
+    "orbit_search.search": lambda i, known: orbit_search.search(pair(i), "RL", guesses=60 + i),
+    "orbit_search.from_state": lambda i, known: orbit_search.from_state(
+        pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + 40 * i
+    ),
+    "symmetry.doubled": lambda i, known: symmetry.doubled(many(known, i)),
+    "orbit_properties.impacts": lambda i, known: orbit_properties.impacts(many(known, i)),
+    "orbit_properties.labels": lambda i, known: orbit_properties.labels(many(known, i)),
+    "orbit_properties.power": lambda i, known: orbit_properties.power(many(known, i), tuned(omega0(i))),
+    "orbit_properties.path": lambda i, known: orbit_properties.path(many(known, i)),
     "continuation.follow": lambda i, known: continuation.follow(
         many(known, i), "omega", (1.0 + 0.01 * i, 9.0), points=20 + i
     ),
-    "continuation.family": lambda i, known: continuation.family(known, "d", (0.1 + 0.001 * i, 0.3), points=20 + i),
+    "switching.family": lambda i, known: switching.family(known, "d", (0.1 + 0.001 * i, 0.3), points=20 + i),
     "curve": lambda i, known: motion.curve(pair(i), *impacts(5 + i)),
     "motion.states": lambda i, known: motion.states(pair(i), *impacts(5 + i), when=np.linspace(1, 3, 9 + i)),
     "sweep": lambda i, known: vijax.sweep(d=np.linspace(0.1, 0.2, 3 + i), kappa=40.0 + i, r=0.5),

@@ -34,7 +34,7 @@ class Asked:
 
     Attributes:
         pair, device: What the orbits belong to.
-        impacts, guesses, generations: As `periodic.search` and `continuation.family` take them.
+        impacts, guesses, generations: As `orbit_search.search` and `switching.family` take them.
         along, within: The parameter that is followed, and its bounds.
         places: Values of it at which orbits to begin with are looked for, in turn.
     """
@@ -63,7 +63,7 @@ def branches(
         asked = _asked(constants, **given)
         _check_picture(picture, quantity)
     process.keep_compiled()
-    from vijax.orbits import continuation
+    from vijax.orbits import branch_dataset, switching
 
     began = time.perf_counter()
     with progress(2, "stages") as show:
@@ -72,7 +72,7 @@ def branches(
             found = _found(asked)
         show(1, 2)
         waiting("branches, compiled at first")
-        followed = continuation.family(
+        followed = switching.family(
             found, asked.along, asked.within, device=asked.device, generations=asked.generations
         )
         show(2, 2)
@@ -83,14 +83,14 @@ def branches(
 
         plots.save(plots.branches(dataset, quantity), path)
 
-    dataset = continuation.dataset(followed, asked.device)
+    dataset = branch_dataset.dataset(followed, asked.device)
     finish(dataset, _summary(followed, seconds), store, picture, draw, overwrite)
 
 
 def _asked(
     constants: tuple[str, ...], along: str, impacts: str, guesses: int, generations: int, wall: str, **given: Any
 ) -> Asked:
-    from vijax.orbits import continuation, periodic
+    from vijax.orbits import orbit_search, parameter, switching
     from vijax.runtime import checks
 
     name, within = _bounds(along)
@@ -98,12 +98,12 @@ def _asked(
     # Along a quantity of the device it is a device that is given, of Tables I and II unless otherwise.
     start = {} if name in options.DEVICE else _START
     pair, made = at_one_point(take_axes(given, start), device(constants), wall)
-    checks.whole("generations", generations, 0, continuation.MOST_GENERATIONS)
-    walls, _ = periodic.sequences(impacts)
-    periodic.check_guesses(guesses, len(walls))
+    checks.whole("generations", generations, 0, switching.MOST_GENERATIONS)
+    walls, _ = orbit_search.sequences(impacts)
+    orbit_search.check_guesses(guesses, len(walls))
     with about("along"):
-        continuation.check_along(pair, name, within)
-    places = list(_places(float(continuation.value_at(pair, name, made)), name, within, chosen))
+        parameter.check_along(pair, name, within)
+    places = list(_places(float(parameter.value_at(pair, name, made)), name, within, chosen))
     return Asked(pair, made, impacts, guesses, generations, name, within, places)
 
 
@@ -141,11 +141,11 @@ def _places(own: float, name: str, within: tuple[float, float], chosen: bool) ->
 
 def _found(asked: Asked) -> "Orbit":
     """Search for orbits, and take those at the first place that has any."""
-    from vijax.orbits import continuation, periodic
+    from vijax.orbits import orbit_search, parameter
 
     for place in asked.places:
-        pair = continuation.pair_at(asked.pair, asked.along, place, asked.device)
-        if len(found := periodic.search(pair, asked.impacts, guesses=asked.guesses)):
+        pair = parameter.pair_at(asked.pair, asked.along, place, asked.device)
+        if len(found := orbit_search.search(pair, asked.impacts, guesses=asked.guesses)):
             return found
     tried = ", ".join(f"{place:.6g}" for place in asked.places)
     raise ValueError(
@@ -157,11 +157,11 @@ def _found(asked: Asked) -> "Orbit":
 def _summary(followed: "list[Branch]", seconds: float) -> str:
     """Say of each branch in a line: its label, its range, how much of it is stable, what it met, how it ends."""
     from vijax.model.label import label
-    from vijax.orbits import periodic
+    from vijax.orbits import orbit_properties
 
     lines = [pace(sum(len(one.values) for one in followed), seconds, "orbits")]
     for one in followed:
-        counts = periodic.counts(one.orbit)
+        counts = orbit_properties.counts(one.orbit)
         name = Counter(label(counts.period, counts.left, counts.right).tolist()).most_common(1)[0][0]
         met = ", ".join(f"{point.kind} {point.value:.8g}" for point in one.points) or "nothing"
         span = f"{one.along} {one.values.min():.6g} to {one.values.max():.6g}"

@@ -23,7 +23,7 @@ from vijax.design.tolerance import Tolerance, check_tolerances, nodes
 from vijax.design.variables import NAMES, check_names, limits, tuned, values, variables
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
-from vijax.orbits import periodic as orbits
+from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.steady import Steady, steady
 from vijax.planes import estimate
@@ -365,10 +365,10 @@ def _optima(scene: Scene, starts: Met, ends: list[_End], devices: list[Harvester
     width = starts.flown.side.shape[1]
     wide = [np.pad(ends[i].knots, ((0, width - len(ends[i].knots)), (0, 0))) for i in good]
     sequence = starts.some(np.array(good)).flown.sequence(width)
-    found = orbits.solve(jax.vmap(lambda d: d.pair())(many), sequence, jnp.array(wide))
+    found = periodic.solve(jax.vmap(lambda d: d.pair())(many), sequence, jnp.array(wide))
     seen = states(own, found)
     attracts = np.array([found.status[row] == Status.OK == seen[row].status for row in range(len(own))])
-    names = orbits.labels(found)
+    names = orbit_properties.labels(found)
     optima: list[list[Optimum]] = [[] for _ in devices]
     for row in np.flatnonzero(attracts):
         end = ends[good[row]]

@@ -12,8 +12,7 @@ from vijax.design.optimise import Design, Optimum, states
 from vijax.design.variables import tuned, values, variables
 from vijax.model.device import Harvester
 from vijax.model.records import Status
-from vijax.orbits import continuation
-from vijax.orbits import periodic as orbits
+from vijax.orbits import continuation, orbit_properties, periodic
 from vijax.orbits.continuation import Direction
 from vijax.orbits.periodic import Orbit
 from vijax.planes.basins import MOST_STARTS, basin_fractions
@@ -38,7 +37,7 @@ class Edge(NamedTuple):
     """The first bifurcation that the optimum's orbit meets on one side.
 
     Attributes:
-        kind: "fold", "flip", "pitchfork", "grazing ..." (see `continuation.Point`), "none" as far as was looked, or why
+        kind: "fold", "flip", "pitchfork", "grazing ..." (see `events.Point`), "none" as far as was looked, or why
             the branch could not be followed so far (see `continuation.Branch.ends`).
         omega0: Where [rad/s].
         percent: How far that is from the optimum, in percent of its omega0.
@@ -80,7 +79,7 @@ def surroundings(optimum: Optimum, *, starts: int = 2000, reach: float = 0.5, se
     checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best")
     reach, seed = _checked(reach), checks.seed(seed)
     attractors = _attractors(optimum.device, checks.whole("starts", starts, 1, MOST_STARTS), seed)
-    own = float(orbits.power(optimum.orbit, optimum.device)[0])
+    own = float(orbit_properties.power(optimum.orbit, optimum.device)[0])
     share = sum(one.share for one in attractors if math.isclose(one.P, own, rel_tol=_SAME))
     return Surroundings(share, attractors, _edge(optimum, "down", reach), _edge(optimum, "up", reach))
 
@@ -184,7 +183,7 @@ def _followed(optimum: Optimum, device: Harvester) -> Orbit:
     begin, end, orbit = optimum.device.pair(), device.pair(), optimum.orbit
     for step in range(1, _STEPS + 1):
         pair = jax.tree.map(lambda a, b, part=step / _STEPS: jnp.array([a + part * (b - a)]), begin, end)
-        orbit = orbits.solve(pair, orbit.sequence, jnp.nan_to_num(orbit.knots))
+        orbit = periodic.solve(pair, orbit.sequence, jnp.nan_to_num(orbit.knots))
     if int(orbit.status[0]) != Status.OK:
         raise RuntimeError(f"the orbit was lost between two devices that both have it; got {orbit.status}")
     return orbit

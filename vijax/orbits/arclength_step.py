@@ -15,20 +15,10 @@ from jaxtyping import Array, Float, Int
 
 from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting
+from vijax.orbits.parameter import moved
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import linear_solve, tiles
 
-# Powers with which d, kappa and gamma go in a quantity of the device, by Eqs. (37)-(38).
-_POWERS: dict[str, dict[str, float]] = {
-    "omega": {"d": 2, "kappa": -1},
-    "omega0": {"kappa": 1},
-    "k": {"kappa": 0.5},
-    "s": {"d": 1},
-    "A": {"d": -1, "gamma": -1},
-}
-# What moves with each quantity that a branch can be followed along: of the pair itself alone, of the device several.
-MOVED: dict[str, tuple[str, ...]] = {name: (name,) for name in ("d", "kappa", "r", "gamma")}
-MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("gamma",)}
 CLOSE = 1e-11  # size of the last correction
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
 _ROUNDS = 6  # Newton corrections of a step, at most
@@ -50,19 +40,6 @@ class Tests(NamedTuple):
 
 FOLD, PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
 FIRST_END = Tests._fields.index("speed")
-
-
-def moved(pair: ImpactPair, along: str, x: Array, start: Array, steepest: Array) -> ImpactPair:
-    """A pair where a parameter, which was `start` there, is x; `steepest` is g/A, gamma of a vertical tube."""
-    fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
-    if along == "beta":
-        fields["gamma"] = steepest * tiles.library((pair, x)).sin(x)
-    elif along not in _POWERS:
-        fields[along] = x
-    for name, power in _POWERS.get(along, {}).items():
-        if fields[name] is not None:  # as kappa of a rigid wall is
-            fields[name] = fields[name] * (x / start) ** power
-    return ImpactPair(**fields)
 
 
 class Arc(eqx.Module):

@@ -25,14 +25,14 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
     """Branches of orbits over their parameter: stable black, unstable red, with what they met on the way.
 
     Args:
-        dataset: What `vijax.orbits.continuation.dataset` returned.
+        dataset: What `vijax.orbits.branch_dataset.dataset` returned.
         quantity: A variable over impacts, or over points.
 
     Raises:
         ValueError: A quantity that is none.
     """
     check_branch_quantity(quantity)
-    checks.variables("dataset", dataset, (quantity, "stable", "event"), "vijax.orbits.continuation.dataset")
+    checks.variables("dataset", dataset, (quantity, "stable", "event"), "vijax.orbits.branch_dataset.dataset")
     along = dataset[dataset.attrs["along"]]
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.subplots()

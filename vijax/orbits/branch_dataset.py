@@ -1,0 +1,133 @@
+"""Branches as one `xarray.Dataset`: what every orbit is, and what was met."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vijax.model.device import Harvester, one_device, with_constants
+from vijax.model.pair import ImpactPair
+from vijax.model.quantities import AXES
+from vijax.orbits import orbit_properties
+from vijax.orbits.continuation import Branch
+from vijax.orbits.parameter import MOVED
+from vijax.runtime import checks, tiles
+from vijax.runtime.context import door
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@door
+def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Dataset":
+    """Branches as one dataset: what every orbit is, and what was met, padded with NaN.
+
+    Args:
+        branches: Along one parameter.
+        device: Gives A, omega (unless one is the parameter) and the electrical constants; Tables I and II by default.
+
+    Returns:
+        Over (branch, point): the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the label's `period`,
+        `impacts_left`, `impacts_right`, `status`; over (branch, point, impact): `v_in`, `side`, `phase`, `duration`,
+        `depth` [m]; over (branch, event_number): `event`, its `event_value`, and
+        `event_point`, the point nearest to it; over branch: `end_first`, `end_last`.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    if not checks.sequence("branches", branches, Branch, "branches, as continuation.follow returns them"):
+        raise ValueError("branches must hold at least one; got none")
+    device = one_device(device)
+    along = branches[0].along
+    columns = [_columns(branch, device) for branch in branches]
+    found = {name: _padded([column[name] for column in columns]) for name in columns[0]}
+    dims = ("branch", "point", "impact")
+    variables = {name: (dims[: values.ndim], values, _ABOUT[name]) for name, values in found.items() if name != along}
+    events = [[point.kind for point in branch.points] for branch in branches]
+    text = np.dtypes.StringDType()
+    most = max(map(len, events), default=0)
+    kinds = np.array([names + [""] * (most - len(names)) for names in events], dtype=text).reshape(len(branches), most)
+    values = _padded([np.array([point.value for point in branch.points]) for branch in branches])
+    places = _padded([_places(branch) for branch in branches])
+    return xr.Dataset(
+        variables
+        | {"event": (("branch", "event_number"), kinds), "event_value": (("branch", "event_number"), values)}
+        | {"event_point": (("branch", "event_number"), places)}
+        | {f"end_{name}": ("branch", np.array([b.ends[i] for b in branches], dtype=text)) for i, name in _ENDS},
+        coords={along: (("branch", "point"), found[along], _about(along))} | _constants(branches[0]),
+        attrs={
+            "title": "Branches of periodic orbits of a vibro-impact pair",
+            "along": along,
+            "wall": "rigid" if branches[0].orbit.pair.kappa is None else "soft",
+        },
+    )
+
+
+def _about(parameter: str) -> dict[str, str]:
+    axis = AXES[parameter]
+    return {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
+
+
+def _constants(branch: Branch) -> "dict[str, tuple]":
+    """The parameters that do not move."""
+    still = [name for name in ("d", "kappa", "r", "gamma") if name not in MOVED[branch.along]]
+    pair = {name: getattr(branch.orbit.pair, name) for name in still}
+    return {name: ((), float(values[0]), _about(name)) for name, values in pair.items() if values is not None}
+
+
+_ENDS = ((0, "first"), (1, "last"))
+_ABOUT = {
+    "multiplier": {"units": "1", "long_name": "largest modulus of a Floquet multiplier"},
+    "stable": {"units": "1", "long_name": "whether the orbit attracts: 1 or 0"},
+    "P": {"units": "J", "long_name": "energy harvested per half forcing period"},
+    "period": {"units": "1", "long_name": "forcing periods"},
+    "impacts_left": {"units": "1", "long_name": "left impacts in that time"},
+    "impacts_right": {"units": "1", "long_name": "right impacts in that time"},
+    "status": {"units": "1", "long_name": "0: verified by the impact map"},
+    "v_in": {"units": "1", "long_name": "velocity at the onset, in units of A pi / omega"},
+    "side": {"units": "1", "long_name": "wall: -1 left, 1 right"},
+    "phase": {
+        "units": "1",
+        "long_name": "phase of the onset, in half forcing periods",
+    },
+    "duration": {"units": "1", "long_name": "duration of the contact, in half forcing periods"},
+    "depth": {"units": "m", "long_name": "penetration of the membrane"},
+}
+
+
+def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
+    """What the dataset holds of a branch, a row a point."""
+    if branch.along not in ImpactPair.__dataclass_fields__:
+        device = with_constants(device, **{branch.along: tiles.arrays(branch.values[:, None])})
+    hits, label = orbit_properties.impacts(branch.orbit), orbit_properties.counts(branch.orbit)
+    length = orbit_properties.depth_unit(branch.orbit, device)
+    columns = {
+        branch.along: branch.values,
+        "multiplier": np.abs(np.asarray(branch.orbit.multipliers)).max(axis=1),
+        "stable": branch.stable.astype(float),
+        "P": orbit_properties.power(branch.orbit, device),
+        "period": label.period,
+        "impacts_left": label.left,
+        "impacts_right": label.right,
+        "status": branch.orbit.status,
+        "v_in": hits.v_in,
+        "side": hits.side,
+        "phase": hits.t,
+        "duration": hits.duration,
+        "depth": np.asarray(hits.depth) * np.asarray(length),
+    }
+    return {name: np.asarray(values, float) for name, values in columns.items()}
+
+
+def _places(branch: Branch) -> np.ndarray:
+    """Index of the orbit nearest to each thing met: on the right sheet, where a fold has made several."""
+    passed = np.column_stack([np.asarray(orbit_properties.marks(branch.orbit)), branch.values])
+    met = [np.append(np.asarray(orbit_properties.marks(point.orbit))[0], point.value) for point in branch.points]
+    return np.array([np.abs(passed - traits).sum(axis=1).argmin() for traits in met], dtype=float)
+
+
+def _padded(rows: list[np.ndarray]) -> np.ndarray:
+    """Arrays of several shapes as one, NaN beyond each."""
+    shape = np.max([row.shape for row in rows], axis=0)
+    table = np.full((len(rows), *shape), np.nan)
+    for index, row in enumerate(rows):
+        table[index][tuple(slice(size) for size in row.shape)] = row
+    return table

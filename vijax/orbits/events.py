@@ -1,0 +1,123 @@
+"""What happens between two points of a branch: where exactly, and what it is.
+
+A sign change of a test function is located on the arc, and says what it was: a bifurcation, or why the branch ends.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from vijax.orbits import periodic, symmetry
+from vijax.orbits.arclength_step import FIRST_END, FOLD, PLUS, Arc, Tests, advance, unpack
+from vijax.orbits.periodic import Orbit
+
+_ZERO = 1e-3  # part of a test function's ends that is zero
+LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
+# An interval that holds an event is narrowed so often: by false position, with every third step a bisection.
+_NARROWINGS = 40
+_GRAZING = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
+
+
+class Point(NamedTuple):
+    """What a branch met: fold, flip, pitchfork, grazing (and of what), or a bound of the parameter.
+
+    Attributes:
+        kind: "fold", "flip" (a multiplier is -1), "pitchfork" (mirror symmetry breaks), "grazing flight" (an impact
+            appears), "grazing impact" (one vanishes), "grazing contact" (one splits), "grazing exit" (the ball stays).
+        value: Of the parameter.
+        orbit: The orbit there, along a leading axis of one.
+    """
+
+    kind: str
+    value: float
+    orbit: Orbit
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Which test functions change sign."""
+    return np.sign(before) * np.sign(after) < 0
+
+
+def happenings(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """How many things happen between two points; a multiplier that passes +1 at a fold is one of them."""
+    passed = Tests(*changed(before, after).T)
+    ends = np.any(passed[FIRST_END:], axis=0)
+    return (passed.fold | passed.plus).astype(int) + passed.minus + ends
+
+
+class _Event(NamedTuple):
+    """A sign change: the point before it, the arclength from there, of which test function, the point itself."""
+
+    place: int
+    s: float
+    test: str
+    y: np.ndarray
+
+
+def events(arc: Arc, y, tangent, tests, lengths) -> list[_Event]:
+    """What happens between neighbours, up to the first thing that ends the branch."""
+    index, test = np.nonzero(changed(tests[:-1], tests[1:]))
+    if not index.size:
+        return []
+    s, there, zero = _locate(arc, y[index], tangent[index], lengths[index + 1], test, tests[index, test])
+    found = [
+        _Event(int(i), float(at), Tests._fields[t], y)
+        for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
+        # A multiplier that passes +1 at a fold is no second event.
+        if sure and not (t == PLUS and ((index == i) & (test == FOLD)).any())
+    ]
+    ends = [event.s for event in found if event.place == len(y) - 2 and event.test in Tests._fields[FIRST_END:]]
+    return [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
+
+
+def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, test: np.ndarray, low_f: np.ndarray):
+    """Arclengths from points of a branch at which test functions vanish, the points, and which are zeros, no poles."""
+    rows = np.arange(test.size)
+    arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
+
+    def look(s):
+        at = advance(arcs, y, tangent, s)
+        return at.tests[rows, test], at.y
+
+    low, high = np.zeros_like(length), length
+    high_f, best_y = look(high)
+    scale, best, best_f = np.abs(low_f) + np.abs(high_f), high, high_f
+    for trip in range(_NARROWINGS):
+        chord = low - low_f * (high - low) / np.where(high_f == low_f, 1.0, high_f - low_f)
+        inside = (chord > low) & (chord < high) & (trip % 3 != 2)
+        s = np.where(inside, chord, 0.5 * (low + high))
+        f, there = look(s)
+        closer = np.abs(f) < np.abs(best_f)
+        best, best_f, best_y = (
+            np.where(closer, s, best),
+            np.where(closer, f, best_f),
+            np.where(closer[:, None], there, best_y),
+        )
+        left = np.sign(f) == np.sign(low_f)
+        # Illinois: the value at the end that stays counts half.
+        low, high = np.where(left, s, low), np.where(left, high, s)
+        low_f, high_f = np.where(left, f, 0.5 * low_f), np.where(left, 0.5 * high_f, f)
+    return best, best_y, np.abs(best_f) <= _ZERO * scale
+
+
+def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray) -> str:
+    """What a sign change means for this orbit."""
+    test = event.test
+    if test in _GRAZING:
+        return f"grazing {_GRAZING[test]}"
+    if test == "minus":
+        return "pitchfork" if bool(arc.sequence.mirrored) else "flip"
+    if test in ("low", "high"):
+        return test
+    # A branch of mirror pairs turns where the two of a pair meet; a symmetric one passes +1 there without turning.
+    meets = np.asarray(symmetry.symmetric(orbits_at(arc, np.concatenate([event.y[None], neighbours])), LEVEL))
+    turns = test == "fold"
+    return "pitchfork" if meets[0] and turns != meets[1:].all() else "fold"
+
+
+def orbits_at(arc: Arc, ys: np.ndarray) -> Orbit:
+    """Points of a branch as orbits, verified."""
+    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), arc)
+    knots, x = unpack(wide, ys)
+    return periodic.proven(wide.at(x), wide.sequence, knots)

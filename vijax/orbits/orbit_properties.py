@@ -1,0 +1,141 @@
+"""What a periodic orbit says of itself: its label, impacts, power, motion, and what tells it from others."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vijax.model import flow
+from vijax.model.device import Harvester, check_device
+from vijax.model.energy import harvested_energy
+from vijax.model.label import label
+from vijax.model.records import Impact
+from vijax.orbits import shooting
+from vijax.orbits.motion import MOST_SAMPLES, pieces
+from vijax.orbits.periodic import SAME, TILES, Orbit, check_orbit
+from vijax.orbits.symmetry import unfolded
+from vijax.runtime import checks, tiles
+from vijax.runtime.context import door
+
+
+class Counts(NamedTuple):
+    """Label of orbits: impacts on the left, on the right, per forcing periods; n:m/pT."""
+
+    left: Int[np.ndarray, "orbit"]
+    right: Int[np.ndarray, "orbit"]
+    period: Int[np.ndarray, "orbit"]
+
+
+@door
+def counts(orbit: Orbit) -> Counts:
+    """What is in the label of each orbit, over the smallest whole number of periods after which it recurs."""
+    full = jax.tree.map(np.asarray, unfolded(orbit))
+    side, number = full.sequence.side, full.count
+    period = np.round(0.5 * full.sequence.span).astype(int)
+    index = np.arange(side.shape[1])
+    turns = np.ones_like(period)
+    for parts in range(2, int(period.max(initial=1)) + 1):
+        shift = np.where(number % parts == 0, number // parts, 0)[:, None]
+        there = np.minimum(index + shift, side.shape[1] - 1)
+        wait = np.array([1.0, 0.0, 0.0]) * (full.sequence.span / parts)[:, None, None]
+        moved = np.take_along_axis(full.knots, there[..., None], axis=1) - full.knots - wait
+        same = (np.abs(moved).max(axis=2) < SAME) & (np.take_along_axis(side, there, axis=1) == side)
+        recurs = (period % parts == 0) & (shift[:, 0] > 0) & (same | (index >= number[:, None] - shift)).all(axis=1)
+        turns = np.where(recurs, parts, turns)
+    left, right = ((side == wall).sum(axis=1) for wall in (-1, 1))
+    return Counts(left // turns, right // turns, period // turns)
+
+
+@door
+def labels(orbit: Orbit) -> np.ndarray:
+    """Names n:m/pT of orbits."""
+    found = counts(orbit)
+    return label(found.period, found.left, found.right)
+
+
+@door
+def impacts(orbit: Orbit) -> Impact:
+    """The impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
+    return tiles.arrays(tiles.map_tiles(_hits, unfolded(orbit), TILES))
+
+
+@jax.jit
+def _hits(full: Orbit) -> Impact:
+    """The impacts of orbits that are in full."""
+    passage = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots)
+    side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
+    phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
+    blank, wall = jnp.where(side == 0, jnp.nan, 0.0), side.astype(t.dtype)
+    return Impact(
+        n=n.astype(jnp.int32),
+        t=phase + blank,
+        side=side,
+        v_in=wall * speed + blank,
+        v_out=-wall * passage.speed + blank,
+        depth=full.depth,
+        duration=stay,
+        work=full.work,
+    )
+
+
+@door
+def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
+    """Energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
+
+    Args:
+        device: Gives A and omega (the unit of length), omega0 where walls are rigid, and the electrical constants.
+
+    Source: Eq. (36), corrected.
+    """
+    check_device(device)
+    own = tiles.library((check_orbit(orbit), device))
+    orbit, device = jax.tree.map(own.asarray, (orbit, device))
+    energy = own.asarray(harvested_energy(device, orbit.depth * depth_unit(orbit, device)))
+    return tiles.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
+
+
+@door
+def depth_unit(orbit: Orbit, device: Harvester) -> Any:
+    """Metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
+    if orbit.pair.kappa is None:
+        return device.length_unit * device.omega / (flow.PI * device.omega0)
+    return device.length_unit
+
+
+@door
+def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The motion of full orbits to draw: `samples` instants of every contact and of every flight.
+
+    Returns:
+        Time, displacement and velocity, each [orbit, instant], in order; NaN where padded. Velocity jumps at a rigid
+        wall.
+    """
+    samples = checks.whole("samples", samples, 1, MOST_SAMPLES)
+    full = jax.tree.map(np.asarray, unfolded(orbit))
+    rows = tiles.map_tiles(partial(_pieces, samples=samples), full, TILES)
+    real = full.sequence.real[..., None]
+    clock, u, v = (np.where(real, row, np.nan).reshape(len(full), -1) for row in rows)
+    return clock, u, v
+
+
+@partial(jax.jit, static_argnames="samples")
+def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
+    """(t, u, v) [orbit, impact, instant] of orbits that are in full."""
+    until = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots).next_t
+    hits, t = _hits(full), full.knots[..., 0]
+    side = hits.side.astype(t.dtype)
+    return jax.vmap(partial(pieces, samples=samples))(full.pair, t, side, hits.v_in, hits.v_out, hits.duration, until)
+
+
+@door
+def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
+    """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
+    t, speed, stay = np.moveaxis(np.asarray(orbit.knots), -1, 0)
+    signed = np.asarray(orbit.sequence.side) * speed
+    # Odd harmonics are alike for mirror images, (side, t) -> (-side, t + 1); even ones change sign.
+    waves = [wave(np.pi * order * t) for order in (1, 2) for wave in (np.cos, np.sin)]
+    parts = [*(signed * wave for wave in waves), signed + speed, stay * speed]
+    return np.stack([np.nansum(part, axis=-1) for part in parts], axis=-1)
