@@ -409,6 +409,7 @@ CALLS: Table = {
             "direction": CHOICE,
             "device": DEVICE,
             "points": (*COUNT, 10**9),
+            "settings": (3, None, {"max_step": 0.02}),
         },
     ),
     "switching.family": (
@@ -421,6 +422,7 @@ CALLS: Table = {
             "device": DEVICE,
             "generations": (True, 1.5, "3", -1, HUGE),
             "points": (0, 1.5, 10**9),
+            "settings": (3, None),
         },
     ),
     "switching.switch": (

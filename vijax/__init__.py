@@ -17,7 +17,7 @@ One motion: `trajectory` returns a `Trajectory`, impact by impact, differentiabl
 Periodic orbits, stable or not: `find_orbits` from a sequence of impacts, `orbits_from_states` from states; an `Orbit`
 has its Floquet `multipliers`, and `orbit_impacts`, `orbit_labels`, `orbit_power` and `orbit_path` tell more.
 `follow_orbits` gives the `Branch` of each along a parameter, `follow_families` also those that begin on it,
-`branch_dataset` both as a dataset.
+`branch_dataset` both as a dataset; `ContinuationSettings` decide the steps.
 
 The best device: `steady` is the steady state of an orbit, a `Steady` with derivatives; `optimise` finds the `Design`
 that harvests most; `under_tolerances` says what becomes of an `Optimum` when constants scatter as a `Tolerance` says,

@@ -17,6 +17,7 @@ from vijax.model.records import Impact, State, Status
 from vijax.orbits.branch_dataset import dataset as branch_dataset
 from vijax.orbits.continuation import Branch
 from vijax.orbits.continuation import follow as follow_orbits
+from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.orbit_properties import impacts as orbit_impacts
 from vijax.orbits.orbit_properties import labels as orbit_labels
 from vijax.orbits.orbit_properties import path as orbit_path
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Branch",
+    "ContinuationSettings",
     "Design",
     "Harvester",
     "HuntCrossley",

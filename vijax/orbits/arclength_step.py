@@ -19,9 +19,7 @@ from vijax.orbits.parameter import moved
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import linear_solve, tiles
 
-CLOSE = 1e-11  # size of the last correction
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
-_ROUNDS = 6  # Newton corrections of a step, at most
 
 
 class Tests(NamedTuple):
@@ -49,6 +47,9 @@ class Arc(eqx.Module):
         start: The parameter where the orbit began.
         steepest: g/A of the device, gamma of a vertical tube (along="beta" only).
         low, high: Bounds of the parameter; their distance is the unit of its share of the arclength.
+        along: Which parameter moves.
+        newton_tolerance, max_corrections: When a step has arrived; see `ContinuationSettings`. Static, as all else that
+            the compiled loop asks before each correction.
     """
 
     pair: ImpactPair
@@ -58,6 +59,8 @@ class Arc(eqx.Module):
     low: Float[Array, ""]
     high: Float[Array, ""]
     along: str = eqx.field(static=True)
+    newton_tolerance: float = eqx.field(static=True)
+    max_corrections: int = eqx.field(static=True)
 
     def at(self, x: Float[Array, ""]) -> ImpactPair:
         """The pair at a value of the parameter."""
@@ -82,7 +85,7 @@ class _Arrival(NamedTuple):
     y: Float[Array, "unknown"]
     tangent: Float[Array, "unknown"]
     size: Float[Array, ""]
-    trips: Int[Array, ""]
+    corrections: Int[Array, ""]
 
 
 def _correct(arc: Arc, guess, former) -> _Arrival:
@@ -94,10 +97,10 @@ def _correct(arc: Arc, guess, former) -> _Arrival:
         slope = jnp.concatenate([slope, former[None]])
         miss = jnp.append(gap, former @ (at.y - guess))
         step, tangent = jax.vmap(linear_solve.solve, in_axes=(None, 0))(slope, jnp.stack([miss, ahead]))
-        return _Arrival(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.trips + 1)
+        return _Arrival(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.corrections + 1)
 
     def going(at: _Arrival):
-        return (at.size > CLOSE) & (at.size < 1.0) & (at.trips < _ROUNDS)
+        return (at.size > arc.newton_tolerance) & (at.size < 1.0) & (at.corrections < arc.max_corrections)
 
     return lax.while_loop(going, once, _Arrival(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
 
@@ -132,14 +135,14 @@ class Place(NamedTuple):
     tangent: np.ndarray
     tests: np.ndarray
     size: np.ndarray
-    trips: np.ndarray
+    corrections: np.ndarray
 
 
 @jax.jit
 def _compiled(arcs: Arc, y, tangent, length):
     def one(arc, y, tangent, length):
         at = _correct(arc, y + length * tangent, tangent)
-        return Place(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.trips)
+        return Place(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.corrections)
 
     return jax.vmap(one)(arcs, y, tangent, length)
 

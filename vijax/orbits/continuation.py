@@ -11,19 +11,14 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import periodic
-from vijax.orbits.arclength_step import CLOSE, FIRST_END, FOLD, Arc, Place, Tests, advance
+from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, Place, Tests, advance
+from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point, events, happenings, kind_of, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
 from vijax.orbits.periodic import Orbit, check_orbit
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
-_LONGEST, _SHORTEST = 0.01, 1e-9  # arclength of a step; the parameter's range counts as one
-_FIRST = 1e-3
-_CROWDED = 1e-7  # arclength within which several things may happen unresolved
-_BEND = 0.98  # least cosine between the tangents at the ends of a step
-_EASY = 0.2  # share of that bend after which the next step is longer
-_AWAY = 20  # steps before a branch can have closed
 MOST_POINTS = 10**6
 Direction = Literal["up", "down", "both"]
 _WAYS: dict[Direction, tuple[float, ...]] = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
@@ -63,6 +58,7 @@ def follow(
     direction: Direction = "both",
     device: Harvester | None = None,
     points: int = 4000,
+    settings: ContinuationSettings = DEFAULT,
 ) -> list[Branch]:
     """Follow periodic orbits, stable or not, along one parameter, through folds.
 
@@ -75,6 +71,7 @@ def follow(
         device: For a quantity of the device: its other constants, which stay, say at which value of it the orbit is.
             So omega and A follow from d and s, s from d, omega0 and k from kappa, beta from gamma.
         points: Most orbits of a branch each way.
+        settings: Of steps and events; see `ContinuationSettings`.
 
     Returns:
         One branch an orbit. A branch ends where its orbits cease to be real (a grazing), at a bound, or says why else.
@@ -84,16 +81,18 @@ def follow(
             is none.
     """
     checks.choice("direction", direction, _WAYS)
-    points = checks.whole("points", points, 2, MOST_POINTS)
-    arcs, y = set_out(orbit, along, within, device)
+    points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
+    arcs, y = set_out(orbit, along, within, device, settings)
     ahead = np.zeros_like(y)
     ahead[:, -1] = 1.0
     first = advance(arcs, y, ahead, np.zeros(len(orbit)))
-    found = [follow_arcs(arcs, heading(first, sign), along, points) for sign in _WAYS[direction]]
+    found = [follow_arcs(arcs, heading(first, sign), along, points, settings) for sign in _WAYS[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]
 
 
-def set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None):
+def set_out(
+    orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None, settings: ContinuationSettings
+):
     """Arcs and unknowns of the starts; what cannot be followed is refused."""
     if not len(check_orbit(orbit)):
         raise ValueError("orbit must hold an orbit to follow; got none; search with more guesses")
@@ -112,7 +111,18 @@ def set_out(orbit: Orbit, along: str, within: tuple[float, float], device: Harve
     # By NumPy from here on: branches differ in length, and JAX would compile a program for each.
     numbers: Any = (device.g / device.A, low, high)
     start, steepest, low_end, high_end = tiles.arrays((x, *(np.full(size, float(number)) for number in numbers)))
-    arcs = jax.tree.map(np.asarray, Arc(orbit.pair, orbit.sequence, start, steepest, low_end, high_end, along))
+    arcs = Arc(
+        pair=orbit.pair,
+        sequence=orbit.sequence,
+        start=start,
+        steepest=steepest,
+        low=low_end,
+        high=high_end,
+        along=along,
+        newton_tolerance=settings.newton_tolerance,
+        max_corrections=settings.max_corrections,
+    )
+    arcs = jax.tree.map(np.asarray, arcs)
     knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
@@ -124,43 +134,46 @@ def heading(place: Place, sign: float) -> Place:
     return place._replace(tangent=sign * place.tangent, tests=tests)
 
 
-def follow_arcs(arcs: Arc, first: Place, along: str, points: int) -> list["Branch"]:
+def follow_arcs(arcs: Arc, first: Place, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
     """One way from every start: all lanes together until none goes on; a step that does not do is halved."""
-    lanes = first.y.shape[0]
+    lanes, bend = first.y.shape[0], 1 - settings.min_cosine
     passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]
     y, tangent, tests = first.y, first.tangent, first.tests
-    length, going, closed = np.full(lanes, _FIRST), np.full(lanes, True), np.full(lanes, False)
+    length, going, closed = np.full(lanes, settings.first_step), np.full(lanes, True), np.full(lanes, False)
     while going.any():
         there = advance(arcs, y, tangent, length)
         straight = (there.tangent * tangent).sum(axis=1)
         near = np.linalg.norm(there.y - y, axis=1) < 2 * length
-        single = (happenings(tests, there.tests) <= 1) | (length < _CROWDED)
-        good = going & (there.size <= CLOSE) & (straight > _BEND) & near & single
+        single = (happenings(tests, there.tests) <= 1) | (length < settings.crowded_step)
+        good = going & (there.size <= settings.newton_tolerance) & (straight > settings.min_cosine) & near & single
         for lane in np.flatnonzero(good):
             passed[lane].append((there.y[lane], there.tangent[lane], there.tests[lane], length[lane]))
-        easy = (there.trips <= 3) & (straight > 1 - _EASY * (1 - _BEND))
-        longer = np.where(easy, np.minimum(1.5 * length, _LONGEST), length)
+        easy = (there.corrections <= settings.easy_corrections) & (straight > 1 - settings.easy_bend * bend)
+        longer = np.where(easy, np.minimum(settings.growth * length, settings.max_step), length)
         new = (there.y, there.tangent, there.tests)
         y, tangent, tests = (np.where(good[:, None], *pair) for pair in zip(new, (y, tangent, tests), strict=True))
         length = np.where(good, longer, 0.5 * length)
         real = (tests[:, FIRST_END:] > 0).all(axis=1) | ~good
         short = np.array([len(lane) < points for lane in passed])
         # A closed branch comes by its start again, in the same direction.
-        back = np.linalg.norm(y - first.y, axis=1) < _LONGEST
-        home = back & ((tangent * first.tangent).sum(axis=1) > _BEND) & np.array([len(lane) > _AWAY for lane in passed])
+        back = np.linalg.norm(y - first.y, axis=1) < settings.max_step
+        along_start = (tangent * first.tangent).sum(axis=1) > settings.min_cosine
+        home = back & along_start & np.array([len(lane) > settings.closing_steps for lane in passed])
         closed |= going & home
-        going = going & (length > _SHORTEST) & real & short & ~home
+        going = going & (length > settings.min_step) & real & short & ~home
     ends = np.where(closed, "closed", np.where([len(rows) >= points for rows in passed], "points", "lost"))
     lanes_of = [jax.tree.map(lambda x, i=i: x[i], arcs) for i in range(lanes)]
-    return [_branch(arc, rows, along, str(end)) for arc, rows, end in zip(lanes_of, passed, ends, strict=True)]
+    told = zip(lanes_of, passed, ends, strict=True)
+    return [_branch(arc, rows, along, str(end), settings) for arc, rows, end in told]
 
 
-def _branch(arc: Arc, rows: list[tuple], along: str, end: str) -> Branch:
+def _branch(arc: Arc, rows: list[tuple], along: str, end: str, settings: ContinuationSettings) -> Branch:
     """A lane's record as a branch: what was met between its points, and where it ends."""
     y, tangent, tests, lengths = (np.array(column) for column in zip(*rows, strict=True))
     last, met, ys = len(rows), [], y
-    for event in sorted(events(arc, y, tangent, tests, lengths), key=lambda event: (event.place, event.s)):
-        kind = kind_of(arc, event, y[event.place : event.place + 2])
+    found = events(arc, y, tangent, tests, lengths, settings)
+    for event in sorted(found, key=lambda event: (event.place, event.s)):
+        kind = kind_of(arc, event, y[event.place : event.place + 2], settings)
         if event.test in Tests._fields[FIRST_END:]:
             end, last = kind, event.place + 1
             ys = np.concatenate([y[:last], event.y[None]])

@@ -10,12 +10,9 @@ import numpy as np
 
 from vijax.orbits import periodic, symmetry
 from vijax.orbits.arclength_step import FIRST_END, FOLD, PLUS, Arc, Tests, advance, unpack
+from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.periodic import Orbit
 
-_ZERO = 1e-3  # part of a test function's ends that is zero
-LEVEL = 1e-4  # asymmetry of an orbit that turns where it meets its mirror image
-# An interval that holds an event is narrowed so often: by false position, with every third step a bisection.
-_NARROWINGS = 40
 _GRAZING = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
 
@@ -55,12 +52,13 @@ class _Event(NamedTuple):
     y: np.ndarray
 
 
-def events(arc: Arc, y, tangent, tests, lengths) -> list[_Event]:
+def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings) -> list[_Event]:
     """What happens between neighbours, up to the first thing that ends the branch."""
     index, test = np.nonzero(changed(tests[:-1], tests[1:]))
     if not index.size:
         return []
-    s, there, zero = _locate(arc, y[index], tangent[index], lengths[index + 1], test, tests[index, test])
+    before = (y[index], tangent[index], lengths[index + 1])
+    s, there, zero = _locate(arc, *before, test, tests[index, test], settings)
     found = [
         _Event(int(i), float(at), Tests._fields[t], y)
         for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
@@ -71,7 +69,15 @@ def events(arc: Arc, y, tangent, tests, lengths) -> list[_Event]:
     return [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
 
 
-def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, test: np.ndarray, low_f: np.ndarray):
+def _locate(
+    arc: Arc,
+    y: np.ndarray,
+    tangent: np.ndarray,
+    length: np.ndarray,
+    test: np.ndarray,
+    low_f: np.ndarray,
+    settings: ContinuationSettings,
+):
     """Arclengths from points of a branch at which test functions vanish, the points, and which are zeros, no poles."""
     rows = np.arange(test.size)
     arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
@@ -83,9 +89,9 @@ def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, te
     low, high = np.zeros_like(length), length
     high_f, best_y = look(high)
     scale, best, best_f = np.abs(low_f) + np.abs(high_f), high, high_f
-    for trip in range(_NARROWINGS):
+    for iteration in range(settings.max_narrowings):
         chord = low - low_f * (high - low) / np.where(high_f == low_f, 1.0, high_f - low_f)
-        inside = (chord > low) & (chord < high) & (trip % 3 != 2)
+        inside = (chord > low) & (chord < high) & (iteration % 3 != 2)
         s = np.where(inside, chord, 0.5 * (low + high))
         f, there = look(s)
         closer = np.abs(f) < np.abs(best_f)
@@ -98,10 +104,10 @@ def _locate(arc: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray, te
         # Illinois: the value at the end that stays counts half.
         low, high = np.where(left, s, low), np.where(left, high, s)
         low_f, high_f = np.where(left, f, 0.5 * low_f), np.where(left, 0.5 * high_f, f)
-    return best, best_y, np.abs(best_f) <= _ZERO * scale
+    return best, best_y, np.abs(best_f) <= settings.zero_share * scale
 
 
-def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray) -> str:
+def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray, settings: ContinuationSettings) -> str:
     """What a sign change means for this orbit."""
     test = event.test
     if test in _GRAZING:
@@ -111,7 +117,8 @@ def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray) -> str:
     if test in ("low", "high"):
         return test
     # A branch of mirror pairs turns where the two of a pair meet; a symmetric one passes +1 there without turning.
-    meets = np.asarray(symmetry.symmetric(orbits_at(arc, np.concatenate([event.y[None], neighbours])), LEVEL))
+    around = orbits_at(arc, np.concatenate([event.y[None], neighbours]))
+    meets = np.asarray(symmetry.symmetric(around, settings.asymmetry))
     turns = test == "fold"
     return "pitchfork" if meets[0] and turns != meets[1:].all() else "fold"
 

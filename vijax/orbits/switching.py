@@ -1,5 +1,7 @@
 """Switching: the branches that begin at flips and pitchforks, and the family of all that begin on these in turn."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -7,7 +9,8 @@ from vijax.model.device import Harvester, one_device
 from vijax.orbits import orbit_properties, shooting, symmetry
 from vijax.orbits.arclength_step import Place, Tests
 from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, heading, set_out
-from vijax.orbits.events import LEVEL, Point
+from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
+from vijax.orbits.events import Point
 from vijax.orbits.parameter import check_bounds, tilts
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks
@@ -18,7 +21,13 @@ MOST_GENERATIONS = 64
 
 @door
 def switch(
-    point: Point, along: str, within: tuple[float, float], *, device: Harvester | None = None, points: int = 4000
+    point: Point,
+    along: str,
+    within: tuple[float, float],
+    *,
+    device: Harvester | None = None,
+    points: int = 4000,
+    settings: ContinuationSettings = DEFAULT,
 ) -> list[Branch]:
     """Follow the branch that bifurcates at a flip (twice the period) or at a pitchfork of an orbit closed half way.
 
@@ -27,7 +36,7 @@ def switch(
 
     Args:
         point: A flip, or a pitchfork on a branch of orbits closed half way (`symmetry.halved`).
-        along, within, device, points: As in `follow`.
+        along, within, device, points, settings: As in `follow`.
 
     Returns:
         The two ways out: mirror images of each other at a pitchfork, shifted by a period at a flip.
@@ -36,7 +45,7 @@ def switch(
         ValueError: A point at which nothing of the kind begins.
     """
     checks.instance("point", point, Point, "continuation.follow")
-    points = checks.whole("points", points, 2, MOST_POINTS)
+    points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
     if not _begins(point):
         raise ValueError(
             f"point must be a flip, or a pitchfork of orbits closed half way (symmetry.halved); got a {point.kind} of "
@@ -44,14 +53,14 @@ def switch(
         )
     check_bounds(point.orbit.pair, along, within, one_device(device))
     doubled = symmetry.doubled(point.orbit)
-    arcs, y = set_out(doubled, along, within, device)
+    arcs, y = set_out(doubled, along, within, device, settings)
     knots = y[0, :-1].reshape(-1, 3)
     pair, sequence = jax.tree.map(lambda x: x[0], (doubled.pair, doubled.sequence))
     slope = np.asarray(jax.jit(shooting.linearise)(pair, sequence, knots).slope)
     away = np.append(np.linalg.svd(slope)[2][-1], 0.0)[None]
     # Test functions that vanish here would be met again at once.
     first = Place(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
-    return [follow_arcs(arcs, heading(first, sign), along, points)[0] for sign in (1.0, -1.0)]
+    return [follow_arcs(arcs, heading(first, sign), along, points, settings)[0] for sign in (1.0, -1.0)]
 
 
 def _begins(point: Point) -> bool:
@@ -68,42 +77,45 @@ def family(
     device: Harvester | None = None,
     generations: int = 1,
     points: int = 4000,
+    settings: ContinuationSettings = DEFAULT,
 ) -> list[Branch]:
     """The branches of some orbits, and those that bifurcate from them at flips and pitchforks, and so on.
 
     Args:
-        orbit, along, within, device, points: As in `follow`; symmetric orbits are closed half way.
+        orbit, along, within, device, points, settings: As in `follow`; symmetric orbits are closed half way.
         generations: How often to switch; 0 follows the given orbits alone.
 
     Raises:
         ValueError: As `follow`.
     """
     generations = checks.whole("generations", generations, 0, MOST_GENERATIONS)
-    points = checks.whole("points", points, 2, MOST_POINTS)
-    set_out(orbit, along, within, device)
+    points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
+    set_out(orbit, along, within, device, settings)
+    # What follow and switch are told alike.
+    told: Any = {"device": device, "points": points, "settings": settings}
     grown: list[Branch] = []
     for index in range(len(orbit)):
         one = orbit[index : index + 1]
         closed = not tilts(along) and bool(symmetry.symmetric(one)[0])
         one = symmetry.halved(one) if closed else one
-        grown += _new(follow(one, along, within, device=device, points=points), grown)
+        grown += _new(follow(one, along, within, **told), grown, settings)
     youngest = grown
     for _ in range(generations):
         where = [point for branch in youngest for point in branch.points if _begins(point)]
         youngest = []
         for point in where:
-            youngest += _new(switch(point, along, within, device=device, points=points), grown + youngest)
+            youngest += _new(switch(point, along, within, **told), grown + youngest, settings)
         grown = grown + youngest
     return grown
 
 
-def _new(found: list[Branch], known: list[Branch]) -> list[Branch]:
+def _new(found: list[Branch], known: list[Branch], settings: ContinuationSettings) -> list[Branch]:
     """Branches that met something which no known one has met: the same points lie on the same branch."""
     old = [(point.kind, _traits(point)) for branch in known for point in branch.points]
     new = []
     for branch in found:
         met = [(point.kind, _traits(point)) for point in branch.points]
-        seen = [any(kind == k and np.allclose(x, y, atol=LEVEL) for k, y in old) for kind, x in met]
+        seen = [any(kind == k and np.allclose(x, y, atol=settings.asymmetry) for k, y in old) for kind, x in met]
         if not met or not all(seen):
             new.append(branch)
             old += met
