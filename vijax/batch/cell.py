@@ -18,9 +18,11 @@ from vijax.engine.method import Method, Passage
 from vijax.engine.quick_contact import Wall
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
+from vijax.runtime.arrays import AnyArray
 
-Lane = Float[Array, "lane"]
-Mask = Bool[Array, "lane"]
+Lane = Float[AnyArray, "lane"]
+Mask = Bool[AnyArray, "lane"]
+Values = Float[AnyArray, "..."]
 
 TRANSIENT_SHARE = 0.25  # of the periods that a cell without an orbit leaves out of its averages
 BATCHES = 24  # batch means behind a standard error
@@ -66,11 +68,11 @@ class Entry(eqx.Module):
     """
 
     pair: ImpactPair
-    length: Lane
-    speed: Lane
-    u: Lane
-    v: Lane
-    t: Lane | None
+    length: Values
+    speed: Values
+    u: Values
+    v: Values
+    t: Values | None
 
 
 class Tally(eqx.Module):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from vijax.batch.run_records import Asked, Room, Trajectory, begin
 from vijax.engine import exact
@@ -15,6 +15,7 @@ from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
 from vijax.runtime import tiles
+from vijax.runtime.arrays import AnyArray
 
 # The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
 # call, and few enough that the host waits for no long one after every ball has arrived.
@@ -23,12 +24,12 @@ _STRETCH = 64
 _STROBES = (64, 4096)
 
 
-def _time(state: State) -> Float[Array, "..."]:
+def _time(state: State) -> Float[AnyArray, "..."]:
     """Time since phase 0 of period 0."""
     return 2.0 * state.n.astype(state.t.dtype) + state.t
 
 
-def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[Array, ""]) -> tuple:
+def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[AnyArray, ""]) -> tuple:
     """Displacement, velocity and mode at a time `when` after the start of a step."""
     aloft = (when <= out.flight) | out.quiet
     rise, v = flow.flight(pair.gamma, start.t, start.v, jnp.where(aloft, when, 0.0))
@@ -55,14 +56,14 @@ class _Flown(NamedTuple):
 
     begun: State
     out: exact.Outcome
-    idle: Bool[Array, "row step"]
+    idle: Bool[AnyArray, "row step"]
 
 
 class _Reached(NamedTuple):
     """Where runs of the exact engine are, and which of them are over."""
 
     state: State
-    over: Bool[Array, "row"]
+    over: Bool[AnyArray, "row"]
 
 
 @jax.jit
@@ -70,7 +71,7 @@ def _set_out(pair: ImpactPair, u0, v0, t0) -> _Reached:
     return _Reached(jax.vmap(begin)(pair, u0, v0, t0), jnp.zeros(u0.shape, bool))
 
 
-def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[Array, ""], count: int):
+def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArray, ""], count: int):
     """So many steps on, the first of which has a number in the run: where the balls are then, and the `_Flown`."""
 
     def advance(reached: _Reached, index):
@@ -170,7 +171,7 @@ def _balls_at(rows: tuple) -> tuple:
     return jax.vmap(ball_at)(*rows)
 
 
-def _before(clock: Float[Array, "row step"], now: Float[Array, "row period"]) -> Int[Array, "row period"]:
+def _before(clock: Float[AnyArray, "row step"], now: Float[AnyArray, "row period"]) -> Int[AnyArray, "row period"]:
     """The last step of each row that began by then; -1 before all."""
     if tiles.library((clock, now)) is jnp:
         return jax.vmap(partial(jnp.searchsorted, side="right"))(clock, now) - 1

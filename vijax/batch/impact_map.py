@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from vijax.batch import advance
 from vijax.batch.cell import Event, Plan
@@ -17,6 +17,7 @@ from vijax.engine import quick, quick_contact
 from vijax.engine.impact import Ball
 from vijax.model.pair import ImpactPair
 from vijax.runtime import tiles, xla
+from vijax.runtime.arrays import AnyArray
 
 _HORIZON = 64.0  # periods in which an impact must come
 _TILES = (64, 512, 4096)  # balls of one compiled call: a few sizes, so that few programs are compiled
@@ -25,14 +26,14 @@ _TILES = (64, 512, 4096)  # balls of one compiled call: a few sizes, so that few
 class Next(eqx.Module):
     """The next impact of every ball; `real` is false where none comes or the contact never ends."""
 
-    t: Float[Array, "ball"]  # onset, since phase 0 of the period in which the ball set out
-    side: Float[Array, "ball"]
-    v_in: Float[Array, "ball"]
-    v_out: Float[Array, "ball"]
-    duration: Float[Array, "ball"]
-    depth: Float[Array, "ball"]
-    work: Float[Array, "ball"]
-    real: Bool[Array, "ball"]
+    t: Float[AnyArray, "ball"]  # onset, since phase 0 of the period in which the ball set out
+    side: Float[AnyArray, "ball"]
+    v_in: Float[AnyArray, "ball"]
+    v_out: Float[AnyArray, "ball"]
+    duration: Float[AnyArray, "ball"]
+    depth: Float[AnyArray, "ball"]
+    work: Float[AnyArray, "ball"]
+    real: Bool[AnyArray, "ball"]
 
 
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
@@ -53,7 +54,7 @@ def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
 
 @lru_cache(maxsize=16)
 def _compiled(answer: Callable, plan: Plan):
-    def work(request: advance.Request) -> tuple[Next, Bool[Array, "ball"]]:
+    def work(request: advance.Request) -> tuple[Next, Bool[AnyArray, "ball"]]:
         given = answer(plan, request)
         hit, real = given.event.hit, given.event.real & ~given.event.permanent
         onset = 2 * hit.onset_n + hit.onset_t
@@ -73,9 +74,9 @@ def _answered(work: Callable, requests: advance.Request) -> tuple[Next, np.ndarr
 
 def next_impacts(
     pair: ImpactPair,
-    side: Float[Array, "ball"],
-    speed: Float[Array, "ball"],
-    t: Float[Array, "ball"],
+    side: Float[AnyArray, "ball"],
+    speed: Float[AnyArray, "ball"],
+    t: Float[AnyArray, "ball"],
     *,
     level: bool,
 ) -> Next:

@@ -3,12 +3,13 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Int
 
 from vijax.engine import exact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, WithStatus
+from vijax.runtime.arrays import AnyArray
 
 # A contact that outlasts the last period by so many is taken to last for ever.
 HELD = 8
@@ -27,9 +28,9 @@ class Trajectory(WithStatus):
     """
 
     impacts: Impact
-    filled: Int[Array, "..."]
+    filled: Int[AnyArray, "..."]
     states: State
-    status: Int[Array, "..."]
+    status: Int[AnyArray, "..."]
 
 
 class Asked(NamedTuple):
@@ -40,9 +41,9 @@ class Asked(NamedTuple):
         chunks: How often a stepping engine may take `CHUNK` steps.
     """
 
-    periods: Int[Array, ""]
-    max_impacts: Int[Array, ""]
-    chunks: Int[Array, ""]
+    periods: Int[AnyArray, ""]
+    max_impacts: Int[AnyArray, ""]
+    chunks: Int[AnyArray, ""]
 
 
 class Room(NamedTuple):

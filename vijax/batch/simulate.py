@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from vijax.batch import advance, chain, lanes, rows
 from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence, review, settled
@@ -21,6 +21,7 @@ from vijax.model.device import Harvester, check_device
 from vijax.model.membrane import HuntCrossley
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.runtime import checks, export_cache
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(Summary))
@@ -35,10 +36,10 @@ class Scale(eqx.Module):
     kappa = 1, so its length is divided by kappa. Metres per second per unit of speed: likewise.
     """
 
-    length: Float[Array, "cell"]
-    speed: Float[Array, "cell"]
-    length_variant: Float[Array, "variant"]
-    speed_variant: Float[Array, "variant"]
+    length: Float[AnyArray, "cell"]
+    speed: Float[AnyArray, "cell"]
+    length_variant: Float[AnyArray, "variant"]
+    speed_variant: Float[AnyArray, "variant"]
 
 
 def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
@@ -158,8 +159,8 @@ def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, 
 @door
 def summarise(
     pair: ImpactPair,
-    u0: Float[Array, "cell"],
-    v0: Float[Array, "cell"],
+    u0: Float[AnyArray, "cell"],
+    v0: Float[AnyArray, "cell"],
     scale: Scale,
     device: Harvester,
     *,
@@ -225,7 +226,7 @@ def summarise(
     return _run(plan, *given)
 
 
-def _run(plan: Plan, cells: Float[Array, "cell in"], count: Int[Array, ""], settings: Settings) -> Summary:
+def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""], settings: Settings) -> Summary:
     """The summary of a tile, of NumPy's arrays."""
     table = _compiled(plan, _width(cells.shape[0], plan.level))(cells, count, settings)
     return rows.unpack(np.asarray(table), shapes(plan, cells.dtype))
@@ -251,8 +252,8 @@ def blank(count: int, variants: int, dtype: str) -> Summary:
 @door
 def attractors(
     pair: ImpactPair,
-    u0: Float[Array, "cell"],
-    v0: Float[Array, "cell"],
+    u0: Float[AnyArray, "cell"],
+    v0: Float[AnyArray, "cell"],
     *,
     periods: int,
     keep: int,
@@ -311,25 +312,27 @@ def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, keep: i
 class Starts(eqx.Module):
     """Where chains start: displacement, velocity and phase."""
 
-    u: Float[Array, "chain"]
-    v: Float[Array, "chain"]
-    t: Float[Array, "chain"]
+    u: Float[AnyArray, "chain"]
+    v: Float[AnyArray, "chain"]
+    t: Float[AnyArray, "chain"]
 
 
 class Growth(eqx.Module):
     """Units of displacement and of velocity of the cell before, in those of each cell."""
 
-    u: Float[Array, "chain link"]
-    v: Float[Array, "chain link"]
+    u: Float[AnyArray, "chain link"]
+    v: Float[AnyArray, "chain link"]
 
 
-def _succeed(plan: Plan, settings: Settings, cell: Cell, table: Float[Array, "lane in"]) -> Float[Array, "lane in"]:
+def _succeed(
+    plan: Plan, settings: Settings, cell: Cell, table: Float[AnyArray, "lane in"]
+) -> Float[AnyArray, "lane in"]:
     """Rows of the next cells, with the start that the last ones hand on in the place of their growth."""
     end = unload(plan, settings, cell).handover
     return _start(plan, table, end.u, end.v, end.t)
 
 
-def _start(plan: Plan, table: Float[Array, "lane in"], u: Lane, v: Lane, t: Lane) -> Float[Array, "lane in"]:
+def _start(plan: Plan, table: Float[AnyArray, "lane in"], u: Lane, v: Lane, t: Lane) -> Float[AnyArray, "lane in"]:
     """Rows that hold a growth, with the start that it makes of a state."""
     entry = rows.unpack(table, entry_shapes(plan, table.dtype))
     u = chain.within(entry.pair.kappa, entry.pair.d, u * entry.u)
@@ -355,8 +358,8 @@ def follow(
     pair: ImpactPair,
     starts: Starts,
     growth: Growth,
-    length: Float[Array, "chain link"],
-    speed: Float[Array, "chain link"],
+    length: Float[AnyArray, "chain link"],
+    speed: Float[AnyArray, "chain link"],
     device: Harvester,
     *,
     periods: int = 400,

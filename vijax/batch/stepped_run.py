@@ -14,6 +14,7 @@ from vijax.batch.run_records import CHUNK, HELD, Asked, Room, Trajectory, begin
 from vijax.engine.method import Method, repeated
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, Status
+from vijax.runtime.arrays import AnyArray
 
 
 class _Recording(eqx.Module):
@@ -21,12 +22,12 @@ class _Recording(eqx.Module):
 
     carry: Any
     impacts: Impact
-    filled: Int[Array, "lane"]
+    filled: Int[AnyArray, "lane"]
     states: State
     broken: Array
 
 
-def _recording(room: Room, carry: Any, like: Float[Array, "lane"]) -> _Recording:
+def _recording(room: Room, carry: Any, like: Float[AnyArray, "lane"]) -> _Recording:
     """Empty records."""
     lanes = like.shape[0]
     whole = jnp.zeros(lanes, jnp.int32)
@@ -41,7 +42,7 @@ def _recording(room: Room, carry: Any, like: Float[Array, "lane"]) -> _Recording
     return _Recording(carry, impacts, whole, State(x, x, x, k, n), jnp.zeros(lanes, bool))
 
 
-def _write(table: Any, row: Any, index: Int[Array, "lane"], wanted: Array) -> Any:
+def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) -> Any:
     """A table [lane, width] with a row written at each lane's index, where wanted."""
 
     def write(leaf, value):

@@ -5,12 +5,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from vijax.batch.cell import TANGENT_SCALE, Cell, Lane, Mask, Plan, Settings, batch_length, last_period
 from vijax.batch.chain import Handover, hand_over
 from vijax.engine.impact import Ball
 from vijax.model.records import Status
+from vijax.runtime.arrays import AnyArray
 
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
 
@@ -18,24 +19,24 @@ _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a
 class Summary(eqx.Module):
     """What is kept of every cell; nondimensional unless said. Fields not asked for are None."""
 
-    P: Float[Array, "cell variant"] | None  # J per half period
-    P_stderr: Float[Array, "cell variant"] | None
-    energy_ratio: Float[Array, "cell variant"] | None  # largest E_j/W_j
-    deepest: Float[Array, "cell"] | None
-    fastest: Float[Array, "cell"]
-    asymmetry: Float[Array, "cell"] | None  # mean of v_in over the greatest speed
-    period: Int[Array, "cell"]
-    impacts_left: Int[Array, "cell"]
-    impacts_right: Int[Array, "cell"]
-    impacts_per_period: Float[Array, "cell"]
-    restitution: Float[Array, "cell"]
-    restitution_left: Float[Array, "cell"]
-    restitution_right: Float[Array, "cell"]
-    contact_time: Float[Array, "cell"]
-    contact_fraction: Float[Array, "cell"]
-    lyapunov: Float[Array, "cell"] | None
-    periods_run: Float[Array, "cell"]
-    status: Int[Array, "cell"]
+    P: Float[AnyArray, "cell variant"] | None  # J per half period
+    P_stderr: Float[AnyArray, "cell variant"] | None
+    energy_ratio: Float[AnyArray, "cell variant"] | None  # largest E_j/W_j
+    deepest: Float[AnyArray, "cell"] | None
+    fastest: Float[AnyArray, "cell"]
+    asymmetry: Float[AnyArray, "cell"] | None  # mean of v_in over the greatest speed
+    period: Int[AnyArray, "cell"]
+    impacts_left: Int[AnyArray, "cell"]
+    impacts_right: Int[AnyArray, "cell"]
+    impacts_per_period: Float[AnyArray, "cell"]
+    restitution: Float[AnyArray, "cell"]
+    restitution_left: Float[AnyArray, "cell"]
+    restitution_right: Float[AnyArray, "cell"]
+    contact_time: Float[AnyArray, "cell"]
+    contact_fraction: Float[AnyArray, "cell"]
+    lyapunov: Float[AnyArray, "cell"] | None
+    periods_run: Float[AnyArray, "cell"]
+    status: Int[AnyArray, "cell"]
     handover: Handover | None = None  # of chained cells
 
 

@@ -24,6 +24,7 @@ from vijax.model.records import Impact, State
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
+Values = Float[Array, "..."]
 
 
 class Outcome(eqx.Module):
@@ -169,7 +170,7 @@ def step(
     return Outcome(after, impact, flight, stay, stuck & ends, wanted & ~hit, permanent)
 
 
-def start_mode(pair: ImpactPair, u: Scalar, v: Scalar, t: Scalar) -> Scalar:
+def start_mode(pair: ImpactPair, u: Values, v: Values, t: Values) -> Values:
     """Contact side (0: none) of a start: inside a soft wall; on a wall by the velocity, at rest by the acceleration.
 
     A rigid wall holds only a ball that rests on it and is pushed against it. Where the acceleration is zero, or as good

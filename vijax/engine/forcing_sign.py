@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 from vijax.model.flow import PI, Force
 from vijax.runtime.xla import once
 
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
+Values = Float[Array, "..."]
+Flags = Bool[Array, "..."]
 
 
 def snap(dtype: Any) -> float:
@@ -21,11 +21,11 @@ def snap(dtype: Any) -> float:
 class Spell(eqx.Module):
     """A stretch of constant sign of a forcing: its sign and when it ends."""
 
-    positive: Flag
-    end: Scalar
+    positive: Flags
+    end: Values
 
 
-def _half_width(force: Force) -> Scalar:
+def _half_width(force: Force) -> Values:
     """Half the length of the positive stretch of c cos - q sin - g; 0 or 1 where the sign never changes."""
     amplitude = jnp.hypot(force.c, force.q)
     level = force.g / jnp.where(amplitude > 0, amplitude, 1.0)
@@ -34,7 +34,7 @@ def _half_width(force: Force) -> Scalar:
 
 
 @once
-def spell_after(force: Force, s: Scalar) -> Spell:
+def spell_after(force: Force, s: Values) -> Spell:
     """The sign of the forcing just after s, and the end of that stretch; an end within rounding of s counts as past."""
     half = _half_width(force)
     x = s + jnp.arctan2(force.q, force.c) / PI

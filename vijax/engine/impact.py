@@ -3,9 +3,11 @@
 from typing import NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-Lane = Float[Array, "lane"]
+from vijax.runtime.arrays import AnyArray
+
+Lane = Float[AnyArray, "lane"]
 
 
 class Ball(eqx.Module):
@@ -39,4 +41,4 @@ class Arrival(NamedTuple):
     flight: Lane
     speed: Lane
     side: Lane
-    sure: Bool[Array, "lane"]
+    sure: Bool[AnyArray, "lane"]

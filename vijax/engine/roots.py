@@ -13,7 +13,7 @@ from vijax.runtime.xla import share
 
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
-Lane = Float[Array, "lane"]
+Values = Float[Array, "..."]
 
 _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
 
@@ -73,7 +73,7 @@ def converged_step(eps: Any) -> float:
     return float(eps) ** 0.25
 
 
-def householder(f: Lane, f1: Lane, f2: Lane, f3: Lane) -> Lane:
+def householder(f: Values, f1: Values, f2: Values, f3: Values) -> Values:
     """Step of the fourth-order root iteration from f and its first three derivatives; one division."""
     slope, bent = f1 * f1, f * f2
     return -f * (6 * slope - 3 * bent) / (6 * f1 * (slope - bent) + f * f * f3)

@@ -29,6 +29,8 @@ Lane = Float[Array, "lane"]
 Mask = Bool[Array, "lane"]
 Samples = Float[Array, "sample lane"]
 Zeros = Float[Array, "zero lane"]  # the exit, and the crest where it is asked for
+Rows = Float[Array, "*row lane"]
+Powers = Float[Array, "sample *row lane"]
 
 _SAMPLES = 32  # of one pass
 _PASSES = 6  # before a lane is declined
@@ -58,7 +60,7 @@ class _Pass(NamedTuple):
     crest: _Crest
 
 
-def _powers(re: Lane, im: Lane) -> tuple[Samples, Samples]:
+def _powers(re: Rows, im: Rows) -> tuple[Powers, Powers]:
     """Powers 1 to _SAMPLES of a complex number per lane, by doubling."""
     real, imaginary = re[None], im[None]
     while real.shape[0] < _SAMPLES:
@@ -194,7 +196,7 @@ def _contact(m: Membrane, force: Force, speed: Lane) -> _Contact:
     return share(_Contact(m, force, speed, steady, free_cos, free_sin))
 
 
-def _turned(c: _Contact, s: Lane) -> tuple[Lane, Lane, Force]:
+def _turned(c: _Contact, s: Rows) -> tuple[Rows, Rows, Force]:
     """Free part and steady response of the contact with their clocks started at s."""
     decay, turn = jnp.exp(-c.m.zeta * s), c.m.omega1 * s
     cosine, sine = share((decay * jnp.cos(turn), decay * jnp.sin(turn)))
@@ -202,7 +204,7 @@ def _turned(c: _Contact, s: Lane) -> tuple[Lane, Lane, Force]:
     return share((along, across, c.steady.later(s)))
 
 
-def _state(c: _Contact, turned: tuple[Lane, Lane, Force]) -> tuple[Lane, Lane]:
+def _state(c: _Contact, turned: tuple[Rows, Rows, Force]) -> tuple[Rows, Rows]:
     along, across, steady = turned
     w = along + steady.c - steady.g
     return share((w, c.m.omega1 * across - c.m.zeta * along - PI * steady.q))

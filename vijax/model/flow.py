@@ -17,7 +17,7 @@ from vijax.runtime.xla import once, share
 
 PI = math.pi
 
-Scalar = Float[Array, ""]
+Values = Float[Array, "..."]
 
 
 def _alternating(start: int, terms: int) -> tuple[float, ...]:
@@ -32,13 +32,13 @@ class Membrane(eqx.Module):
     one that is not runs three times faster unrolled.
     """
 
-    kappa: Scalar
-    zeta: Scalar
-    omega1: Scalar
+    kappa: Values
+    zeta: Values
+    omega1: Values
     rolled: bool = eqx.field(static=True, default=False)
 
     @property
-    def mu(self) -> Scalar:
+    def mu(self) -> Values:
         """Damping mu = 2 zeta of w'' + mu w' + kappa^2 w = f."""
         return 2 * self.zeta
 
@@ -46,16 +46,16 @@ class Membrane(eqx.Module):
 class Force(eqx.Module):
     """Forcing c cos(pi s) - q sin(pi s) - g at elapsed time s."""
 
-    c: Scalar
-    q: Scalar
-    g: Scalar
+    c: Values
+    q: Values
+    g: Values
 
-    def at(self, s: Scalar) -> Scalar:
+    def at(self, s: Values) -> Values:
         """Value at elapsed time s."""
         sin_s, cos_s, _, _ = half_turn(s)
         return self.c * cos_s - self.q * sin_s - self.g
 
-    def later(self, s: Scalar) -> "Force":
+    def later(self, s: Values) -> "Force":
         """The same forcing with its clock started a time s later."""
         sin_s, cos_s, _, _ = half_turn(s)
         return Force(self.c * cos_s - self.q * sin_s, self.q * cos_s + self.c * sin_s, self.g)
@@ -127,7 +127,7 @@ def wrap_phase(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
 
 
 @once
-def flight(gamma: Scalar, t0: Scalar, v0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+def flight(gamma: Values, t0: Values, v0: Values, s: Values) -> tuple[Values, Values]:
     """Displacement from the start and velocity after flying for a time s from phase t0 at velocity v0.
 
     u - u0 = v0 s - gamma s^2/2 + (cos(pi t0)(1 - cos pi s) - sin(pi t0)(pi s - sin pi s))/pi^2
@@ -139,12 +139,12 @@ def flight(gamma: Scalar, t0: Scalar, v0: Scalar, s: Scalar) -> tuple[Scalar, Sc
     return share((rise, v0 - gamma * s + (cos0 * sin_s - sin0 * versine) / PI))
 
 
-def acceleration(gamma: Scalar, t: Scalar) -> Scalar:
+def acceleration(gamma: Values, t: Values) -> Values:
     """Acceleration in flight, cos(pi t) - gamma."""
     return half_turn(t)[1] - gamma
 
 
-def _contact_series(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+def _contact_series(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
     """Taylor series in s of (w, w'); accurate for max(kappa, pi) s < 1, where the closed form cancels."""
     s = share(s)
 
@@ -167,7 +167,7 @@ def _contact_series(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar
 
 
 @once
-def free_response(m: Membrane, s: Scalar) -> tuple[Scalar, Scalar]:
+def free_response(m: Membrane, s: Values) -> tuple[Values, Values]:
     """Impulse response h of the membrane and its derivative: h'' + mu h' + kappa^2 h = 0, h(0) = 0, h'(0) = 1.
 
     sin(omega1 s)/omega1 is the sinc form: it tends to s as omega1 -> 0 (r -> 0).
@@ -177,7 +177,7 @@ def free_response(m: Membrane, s: Scalar) -> tuple[Scalar, Scalar]:
     return decay * sine, decay * (jnp.cos(m.omega1 * s) - m.zeta * sine)
 
 
-def _driven_response(m: Membrane, h: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+def _driven_response(m: Membrane, h: Values, s: Values) -> tuple[Values, Values]:
     """Responses from rest to cos(pi s), sin(pi s): the divided difference of exp at -zeta +- i omega1 and i pi.
 
     Near kappa = pi, mu = 0 two of the three points meet: the secular form s e^m sinh(z)/z stays accurate there.
@@ -210,7 +210,7 @@ def _driven_response(m: Membrane, h: Scalar, s: Scalar) -> tuple[Scalar, Scalar]
     return (first_re * m.zeta + first_im * far_im) * inverse, (first_im * m.zeta - first_re * far_im) * inverse
 
 
-def _contact_closed(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+def _contact_closed(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
     """(w, w') by the closed form: free response plus Duhamel's integral of the forcing."""
     h, slope = share(free_response(m, s))
     from_cos, from_sin = share(_driven_response(m, h, s))
@@ -222,7 +222,7 @@ def _contact_closed(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar
 
 
 @once
-def oscillate(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> tuple[Scalar, Scalar]:
+def oscillate(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
     """(w, w') at time s of w'' + mu w' + kappa^2 w = force from (w0, z0) at s = 0.
 
     Source: Eqs. (20)-(21) with the constants derived again (physics.md); each regime against mpmath in test_flow.py.
@@ -233,13 +233,13 @@ def oscillate(m: Membrane, force: Force, w0: Scalar, z0: Scalar, s: Scalar) -> t
     return share((jnp.where(short, near[0], far[0]), jnp.where(short, near[1], far[1])))
 
 
-def flight_force(gamma: Scalar, t: Scalar) -> Force:
+def flight_force(gamma: Values, t: Values) -> Force:
     """The forcing cos(pi t) - gamma with its clock started at phase t."""
     sin_t, cos_t, _, _ = half_turn(t)
     return Force(cos_t, sin_t, gamma)
 
 
-def contact_force(gamma: Scalar, side: Scalar, t: Scalar) -> Force:
+def contact_force(gamma: Values, side: Values, t: Values) -> Force:
     """The forcing of the penetration w = side u - d/2 in a contact that begins at phase t."""
     sin_t, cos_t, _, _ = half_turn(t)
     return Force(side * cos_t, side * sin_t, side * gamma)
@@ -259,13 +259,13 @@ def steady_response(m: Membrane, force: Force) -> Force:
     )
 
 
-def flight_matrix(s: Scalar) -> Float[Array, "2 2"]:
+def flight_matrix(s: Values) -> Float[Array, "2 2"]:
     """Tangent map of a flight of length s in (du, du')."""
     one, zero = jnp.ones_like(s), jnp.zeros_like(s)
     return jnp.array([[one, s], [zero, one]])
 
 
-def contact_matrix(m: Membrane, s: Scalar) -> Float[Array, "2 2"]:
+def contact_matrix(m: Membrane, s: Values) -> Float[Array, "2 2"]:
     """Tangent map of a whole contact of duration s in (du, du'), from flight to flight; its determinant is exp(-mu s).
 
     The saltations at onset [[1, 0], [-mu, 1]] and exit [[1, 0], [mu, 1]] (physics.md) around the fundamental matrix
@@ -275,6 +275,6 @@ def contact_matrix(m: Membrane, s: Scalar) -> Float[Array, "2 2"]:
     return jnp.array([[slope, h], [-m.kappa * m.kappa * h, slope + m.mu * h]])
 
 
-def rigid_matrix(r: Scalar, a: Scalar, v_in: Scalar) -> Float[Array, "2 2"]:
+def rigid_matrix(r: Values, a: Values, v_in: Values) -> Float[Array, "2 2"]:
     """Saltation matrix of a rigid impact in (du, du'): det = r^2, and it grows as 1/v_in at grazing."""
     return jnp.array([[-r, jnp.zeros_like(r)], [(1 + r) * a / v_in, -r]])

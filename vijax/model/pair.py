@@ -7,16 +7,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from vijax.model import units
 from vijax.model.quantities import check
 from vijax.model.units import Given
 from vijax.runtime import checks
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
 
-Real = float | Float[Array, "..."]
+Real = float | Float[AnyArray, "..."]
 
 
 class ImpactPair(eqx.Module):
@@ -31,37 +32,37 @@ class ImpactPair(eqx.Module):
         gamma: Gravity along the axis over the forcing amplitude, g sin(beta)/A.
     """
 
-    d: Float[Array, "..."]
-    kappa: Float[Array, "..."] | None
-    r: Float[Array, "..."]
-    gamma: Float[Array, "..."]
+    d: Float[AnyArray, "..."]
+    kappa: Float[AnyArray, "..."] | None
+    r: Float[AnyArray, "..."]
+    gamma: Float[AnyArray, "..."]
 
     @property
     @door
-    def mu(self) -> Float[Array, "..."]:
+    def mu(self) -> Float[AnyArray, "..."]:
         """Damping of w'' + mu w' + kappa^2 w = f, by the calibration of Eq. (19)."""
         return 2 * self.zeta
 
     @property
     @door
-    def zeta(self) -> Float[Array, "..."]:
+    def zeta(self) -> Float[AnyArray, "..."]:
         """Decay rate mu/2 of a free contact."""
         return self._soft_kappa() * damping_ratio(self.r)
 
     @property
     @door
-    def omega1(self) -> Float[Array, "..."]:
+    def omega1(self) -> Float[AnyArray, "..."]:
         """Damped frequency sqrt(kappa^2 - zeta^2) = kappa pi/sqrt(pi^2 + ln^2 r): from r, as the difference cancels."""
         return self._soft_kappa() * math.pi / jnp.sqrt(math.pi**2 + jnp.log(self.r) ** 2)
 
-    def _soft_kappa(self) -> Float[Array, "..."]:
+    def _soft_kappa(self) -> Float[AnyArray, "..."]:
         if self.kappa is None:
             raise ValueError("kappa must be a number for a membrane's damping and frequency; got None (a rigid wall)")
         return self.kappa
 
 
 @door
-def damping_ratio(r: Real) -> Float[Array, "..."]:
+def damping_ratio(r: Real) -> Float[AnyArray, "..."]:
     """Ratio c/(2 sqrt(k m_b)) = mu/(2 kappa) whose free contact has restitution r.
 
     -ln r/sqrt(pi^2 + ln^2 r), in [0, 1): every contact is underdamped.
@@ -83,20 +84,20 @@ class MembranePair(eqx.Module):
     It stays put while omega moves, where (d, kappa) follows a curve d kappa^2 = 1/A* = const.
     """
 
-    g_star: Float[Array, "..."]
-    A_star: Float[Array, "..."]
-    omega_star: Float[Array, "..."]
-    c_star: Float[Array, "..."]
+    g_star: Float[AnyArray, "..."]
+    A_star: Float[AnyArray, "..."]
+    omega_star: Float[AnyArray, "..."]
+    c_star: Float[AnyArray, "..."]
 
     @property
     @door
-    def length_unit(self) -> Float[Array, "..."]:
+    def length_unit(self) -> Float[AnyArray, "..."]:
         """Units of u per unit of x: d."""
         return (self.omega_star / math.pi) ** 2 / self.A_star
 
     @property
     @door
-    def time_unit(self) -> Float[Array, "..."]:
+    def time_unit(self) -> Float[AnyArray, "..."]:
         """Units of t per unit of t*: 1/kappa."""
         return self.omega_star / math.pi
 

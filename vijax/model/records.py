@@ -6,8 +6,9 @@ from collections import Counter
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.checks import is_concrete
 
 
@@ -65,21 +66,21 @@ class WithStatus(eqx.Module):
 class State(eqx.Module):
     """Where the ball is: displacement, velocity, phase t in [0, 2), periods completed, and the mode (-1, 0, +1)."""
 
-    u: Float[Array, "..."]
-    v: Float[Array, "..."]
-    t: Float[Array, "..."]
-    n: Int[Array, "..."]
-    mode: Int[Array, "..."]
+    u: Float[AnyArray, "..."]
+    v: Float[AnyArray, "..."]
+    t: Float[AnyArray, "..."]
+    n: Int[AnyArray, "..."]
+    mode: Int[AnyArray, "..."]
 
 
 class Impact(eqx.Module):
     """One finished impact. `work` is the energy given to the membrane per unit mass, in squared velocity units."""
 
-    n: Int[Array, "..."]
-    t: Float[Array, "..."]
-    side: Int[Array, "..."]
-    v_in: Float[Array, "..."]
-    v_out: Float[Array, "..."]
-    depth: Float[Array, "..."]
-    duration: Float[Array, "..."]
-    work: Float[Array, "..."]
+    n: Int[AnyArray, "..."]
+    t: Float[AnyArray, "..."]
+    side: Int[AnyArray, "..."]
+    v_in: Float[AnyArray, "..."]
+    v_out: Float[AnyArray, "..."]
+    depth: Float[AnyArray, "..."]
+    duration: Float[AnyArray, "..."]
+    work: Float[AnyArray, "..."]

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting
-from vijax.orbits.parameter import moved
+from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import linear_solve, tiles
 
@@ -54,15 +54,15 @@ class Arc(eqx.Module):
 
     pair: ImpactPair
     sequence: Sequence
-    start: Float[Array, ""]
-    steepest: Float[Array, ""]
-    low: Float[Array, ""]
-    high: Float[Array, ""]
+    start: Values
+    steepest: Values
+    low: Values
+    high: Values
     along: str = eqx.field(static=True)
     newton_tolerance: float = eqx.field(static=True)
     max_corrections: int = eqx.field(static=True)
 
-    def at(self, x: Float[Array, ""]) -> ImpactPair:
+    def at(self, x: Values) -> ImpactPair:
         """The pair at a value of the parameter."""
         return moved(self.pair, self.along, x, self.start, self.steepest)
 

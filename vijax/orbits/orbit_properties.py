@@ -18,6 +18,7 @@ from vijax.orbits.motion import MOST_SAMPLES, pieces
 from vijax.orbits.periodic import SAME, TILES, Orbit, check_orbit
 from vijax.orbits.symmetry import unfolded
 from vijax.runtime import checks, tiles
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
 
 
@@ -82,7 +83,7 @@ def _hits(full: Orbit) -> Impact:
 
 
 @door
-def power(orbit: Orbit, device: Harvester) -> Float[Array, "orbit"]:
+def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
     """Energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
 
     Args:

@@ -9,14 +9,17 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Float
 
 from vijax.model import units
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import check
 from vijax.runtime import checks, tiles
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
+
+Values = Float[AnyArray, "..."]
 
 # Powers with which d, kappa and gamma go in a quantity of the device, by Eqs. (37)-(38).
 _POWERS: dict[str, dict[str, float]] = {
@@ -31,7 +34,7 @@ MOVED: dict[str, tuple[str, ...]] = {name: (name,) for name in ("d", "kappa", "r
 MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("gamma",)}
 
 
-def moved(pair: ImpactPair, along: str, x: Array, start: Array, steepest: Array) -> ImpactPair:
+def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Values) -> ImpactPair:
     """A pair where a parameter, which was `start` there, is x; `steepest` is g/A, gamma of a vertical tube."""
     fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
     if along == "beta":

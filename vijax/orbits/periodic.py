@@ -16,6 +16,7 @@ from vijax.model.records import Status, WithStatus
 from vijax.orbits import shooting
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks, context, tiles, xla
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
 
 _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
@@ -38,15 +39,15 @@ class Orbit(WithStatus):
 
     pair: ImpactPair
     sequence: Sequence
-    knots: Float[Array, "orbit impact 3"]
-    depth: Float[Array, "orbit impact"]
-    work: Float[Array, "orbit impact"]
-    multipliers: Complex[Array, "orbit 2"]
-    residual: Float[Array, "orbit"]
-    status: Int[Array, "orbit"]
+    knots: Float[AnyArray, "orbit impact 3"]
+    depth: Float[AnyArray, "orbit impact"]
+    work: Float[AnyArray, "orbit impact"]
+    multipliers: Complex[AnyArray, "orbit 2"]
+    residual: Float[AnyArray, "orbit"]
+    status: Int[AnyArray, "orbit"]
 
     @property
-    def count(self) -> Int[Array, "orbit"]:
+    def count(self) -> Int[AnyArray, "orbit"]:
         """Impacts until it closes (half of all where it closes onto its mirror image)."""
         return self.sequence.real.sum(axis=-1, dtype=jnp.int32)
 
@@ -73,7 +74,7 @@ def check_orbit(orbit: Any) -> Orbit:
 
 
 @door
-def solve(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
+def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Orbit:
     """The periodic orbits near some guesses, thousands in one call, on every core.
 
     Args:
@@ -104,7 +105,7 @@ def guessed(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.
 
 
 @door
-def proven(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Orbit:
+def proven(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Orbit:
     """Orbits from knots that solve the equations already, even where Newton is singular: points of a branch."""
     return _by_tiles(partial(_tile, _compiled(_measured), _level(pair)), (pair, sequence, knots))
 
@@ -136,26 +137,26 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
 class _Claim(NamedTuple):
     """Knots that are to be an orbit's, and where the ball is to fly from the end of every contact."""
 
-    knots: Float[Array, "orbit impact 3"]
-    residual: Float[Array, "orbit"]
-    multipliers: Complex[Array, "orbit 2"]
+    knots: Float[AnyArray, "orbit impact 3"]
+    residual: Float[AnyArray, "orbit"]
+    multipliers: Complex[AnyArray, "orbit 2"]
     passage: shooting.Passage
-    phase: Float[Array, "orbit impact"]
-    periods: Float[Array, "orbit impact"]
+    phase: Float[AnyArray, "orbit impact"]
+    periods: Float[AnyArray, "orbit impact"]
 
 
-def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[Array, "orbit impact 3"]) -> _Claim:
+def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[AnyArray, "orbit impact 3"]) -> _Claim:
     knots, residual = shooting.newton(pair, sequence, guess)
     touches = (sequence.real & (knots[..., 1] < _TOUCH)).any(axis=1)
     return _claim(pair, sequence, knots, jnp.where(touches, jnp.inf, residual))
 
 
-def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> _Claim:
+def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> _Claim:
     residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
     return _claim(pair, sequence, knots, residual)
 
 
-def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[Array, "orbit"]) -> _Claim:
+def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"]) -> _Claim:
     around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
     passage = jax.vmap(shooting.passages)(pair, sequence, knots)
     return _Claim(knots, residual, shooting.floquet(around, sequence.mirrored), passage, *flow.wrap_phase(passage.t))

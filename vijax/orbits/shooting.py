@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.runtime import linear_solve
+from vijax.runtime.arrays import AnyArray
 
 Knots = Float[Array, "impact 3"]
 """Onset time, speed into the wall (> 0) and contact time of each impact."""
@@ -36,12 +37,12 @@ class Sequence(eqx.Module):
         mirrored: Whether it closes onto its mirror image (gamma = 0, p odd).
     """
 
-    side: Int[Array, "impact"]
-    span: Float[Array, ""]
-    mirrored: Bool[Array, ""]
+    side: Int[AnyArray, "*orbit impact"]
+    span: Float[AnyArray, "*orbit"]
+    mirrored: Bool[AnyArray, "*orbit"]
 
     @property
-    def real(self) -> Bool[Array, "impact"]:
+    def real(self) -> Bool[AnyArray, "*orbit impact"]:
         """Which impacts are there."""
         return self.side != 0
 
@@ -172,7 +173,7 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactP
 class Passage(NamedTuple):
     """The end of each contact and the impact that is to follow it."""
 
-    side: Float[Array, "impact"]
+    side: Float[AnyArray, "impact"]
     speed: Float[Array, "impact"]  # away from the wall
     t: Float[Array, "impact"]
     next_side: Float[Array, "impact"]
