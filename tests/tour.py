@@ -1,0 +1,91 @@
+"""A small run of every kind, with all annotations of vijax checked as it goes: `python tests/tour.py [kind ...]`.
+
+They are checked where the package is imported under jaxtyping's hook: not in every test, but in a process of its own
+(`test_annotations`). Tests of the doors, which give wrong types on purpose, would not pass under it, and programs that
+are read from the disk are not traced and not checked.
+"""
+
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from beartype import BeartypeConf, beartype
+from jaxtyping import TypeCheckError, install_import_hook
+
+_checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float, as to mypy
+
+
+def checked(function):
+    """The function with its annotations checked, but for one made within another: that would be done at every call.
+
+    It takes twice as long as all the rest.
+    """
+    return function if "<locals>" in function.__qualname__ else _checked(function)
+
+
+def planes(vijax, np, jax):
+    """Level, inclined and rigid maps, a refined one, a stepping engine, comparisons, basins, an orbit diagram."""
+    plane = {"d": np.linspace(0.1, 0.3, 3), "kappa": [5.0, 50.0], "r": 0.5}
+    vijax.sweep(**plane, periods=40)
+    vijax.sweep(d=[0.1, 0.2], kappa=10, r=0.5, gamma=[0.05, 0.3], periods=40)
+    vijax.sweep(d=[0.1, 0.2], wall="rigid", r=0.5, periods=40, A=[1.0, 2.0], omega=3.0)
+    vijax.sweep(d=0.2, kappa=5.0, periods=4, method="rk4")
+    vijax.sweep(**plane | {"d": np.linspace(0.1, 0.3, 9)}, periods=20, refine=1)
+    vijax.compare(**plane, periods=40, tolerance=0.1)
+    vijax.basins(d=0.2, kappa=3.0, r=0.5, u0=[0.0, 0.05], v0=[0.1, 0.3], periods=60)
+    vijax.basin_fractions(d=0.2, kappa=3.0, r=0.5, starts=4, periods=60)
+    vijax.orbit_diagram(along="d", values=[0.2, 0.21], kappa=[5.0, 50.0], r=0.5, direction="both", periods=40, keep=4)
+
+
+def motions(vijax, np, jax):
+    """Trajectories by every engine, many at once, and the derivative of one."""
+    pair = vijax.impact_pair(0.2, 5.0, 0.5)
+    for method in ("exact", "ode", "rk4"):
+        vijax.trajectory(pair, 0.0, 0.3, periods=3, method=method)
+    vijax.trajectory(vijax.impact_pair([0.2, 0.3], None, 0.5), np.array([0.0, 0.1]), 0.3, periods=3, t0=0.5)
+    jax.grad(lambda v: vijax.trajectory(pair, 0.0, v, periods=1).states.v[-1])(0.3)
+
+
+def orbits(vijax, np, jax):
+    """A branch through a fold, a family, orbits from states, a steady state and its gradient."""
+    found = vijax.find_orbits(vijax.impact_pair(0.19, None, 0.5), "RLL", guesses=32)
+    (one,) = vijax.follow_orbits(found[:1], "d", (0.18, 0.2), direction="up", points=8)
+    vijax.branch_dataset([one])
+    vijax.follow_families(found[:1], "d", (0.185, 0.195), points=4)
+    u, v = np.array([[0.0, 0.1], [0.3, -0.2]])
+    found = vijax.orbits_from_states(vijax.impact_pair(0.2, 5.0, 0.5), u, v, settle=40)
+    vijax.orbit_impacts(found), vijax.orbit_labels(found), vijax.orbit_path(found)
+    device = vijax.Harvester(omega=5 * np.pi, s=0.25, A=2.0)
+    vijax.orbit_power(found, device)
+    jax.jacrev(lambda pair: vijax.steady(device, found[0], pair=pair).P)(jax.tree.map(lambda x: x[0], found.pair))
+
+
+def designs(vijax, np, jax):
+    """A design, and what tolerances make of it."""
+    device = vijax.Harvester(omega=10 * np.pi, s=0.006, A=3.0, V=1700.0)
+    best = vijax.optimise(device, steps=128, balls=1, impacts=2).best
+    vijax.under_tolerances(best, [vijax.Tolerance("omega0", 0.05)])
+
+
+KINDS = {kind.__name__: kind for kind in (planes, motions, orbits, designs)}
+
+
+def main(names):
+    """Run these kinds, or all."""
+    with install_import_hook("vijax", f"{Path(__file__).stem}.{checked.__name__}"):
+        import jax
+        import numpy as np
+
+        import vijax.public
+        from vijax.model import flow
+        from vijax.runtime import export_cache
+    with suppress(TypeCheckError):
+        flow.wrap_phase(0.5)  # no array
+        raise SystemExit("annotations are not checked")
+    export_cache.cache_folder = lambda: None
+    for name in names or KINDS:
+        KINDS[name](vijax, np, jax)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
