@@ -68,9 +68,10 @@ class Force(eqx.Module):
 def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
     """The soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
     decrement = 0.0 - jnp.log(pair.r)  # +0 at r = 1: a free half cycle that begins at -0 would be over at once
-    scale = pair.kappa / jnp.sqrt(PI**2 + decrement * decrement)
+    kappa = pair._soft_kappa()
+    scale = kappa / jnp.sqrt(PI**2 + decrement * decrement)
     # Else every loop that needs omega1 makes its own, and some lanes of a loop round PI - omega1 once and others twice.
-    return share(Membrane(pair.kappa, decrement * scale, PI * scale, rolled))
+    return share(Membrane(kappa, decrement * scale, PI * scale, rolled))
 
 
 # On |x| <= pi/4 the first neglected term is below 1e-17 of the sum.
