@@ -58,7 +58,8 @@ import numpy as np
 
 import vijax
 from vijax.design import optimise
-from vijax.design.optimise import Design, Optimum
+from vijax.design.optimise import Design
+from vijax.design.optimum import Optimum
 from vijax.design.survey import survey
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy

@@ -16,7 +16,7 @@ import xarray as xr
 
 import vijax
 from vijax.batch import simulate
-from vijax.design import optimise, report
+from vijax.design import optimise, optimum, report
 from vijax.design.report import lines, table
 from vijax.design.robustness import surroundings, weighted
 from vijax.design.tolerance import Tolerance, nodes
@@ -69,10 +69,10 @@ def a_design() -> optimise.Design:
     return optimise.Design((), ("omega0",), {"omega0": (20.0, 400.0)}, "P", (), 0, 0)
 
 
-def an_optimum() -> optimise.Optimum:
+def an_optimum() -> optimum.Optimum:
     """An optimum of which no more than the orbit is known."""
     path = np.zeros((1, 1))
-    return optimise.Optimum({}, vijax.Harvester(), an_orbit(), "1:1", 0.0, None, {}, (), "maximum", 0, path, path[0])
+    return optimum.Optimum({}, vijax.Harvester(), an_orbit(), "1:1", 0.0, None, {}, (), "maximum", 0, path, path[0])
 
 
 def a_map() -> xr.Dataset:

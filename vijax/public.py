@@ -4,8 +4,9 @@ from typing import TYPE_CHECKING
 
 from vijax.batch.run_records import Trajectory
 from vijax.batch.trajectory import trajectory
-from vijax.design.optimise import Design, Optimum, optimise
+from vijax.design.optimise import Design, optimise
 from vijax.design.optimise import under as under_tolerances
+from vijax.design.optimum import Optimum
 from vijax.design.robustness import Surroundings, surroundings
 from vijax.design.robustness import weighted as weigh_basins
 from vijax.design.tolerance import Tolerance

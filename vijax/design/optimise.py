@@ -6,10 +6,10 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 
 import itertools
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +19,10 @@ from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
 from vijax.design.multistart import Effort, Looked, Met, find
 from vijax.design.objective import OBJECTIVES, Batch, Objective, Scene
+from vijax.design.optimum import End, Optimum, verified
 from vijax.design.tolerance import Tolerance, check_tolerances, nodes
-from vijax.design.variables import NAMES, check_names, limits, tuned, values, variables
+from vijax.design.variables import NAMES, check_names, limits, values, variables
 from vijax.model.device import Harvester, one_device
-from vijax.model.records import Status
-from vijax.orbits import orbit_properties, periodic
-from vijax.orbits.periodic import Orbit
-from vijax.orbits.steady import Steady, steady
 from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
 from vijax.runtime import checks, context, tiles, xla
@@ -35,46 +32,8 @@ _LOG = logging.getLogger(__name__)
 _RADIUS = 0.2  # of a step, in the logarithm of a quantity
 _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
-_FEW = (16, 256)  # optima of one
-_SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
 _MOST_LOOKS, _MOST_STEPS, _MOST_IMPACTS = 10**5, 10**7, 256
 _BALL = 1000  # bytes that a survey keeps of a ball
-_ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """A design at which an ascent ended, verified.
-
-    Attributes:
-        values: The tuned quantities by name.
-        device: The device that has them.
-        orbit: Its orbit, along a leading axis of one; multipliers are its own.
-        label: n:m/pT of the orbit.
-        height: The objective.
-        state: Energies, depths, margins' parts, condition and clearance of the nominal device; see `Steady`.
-        gradient: Derivative of the objective's logarithm in the logarithm of each quantity (in an inclination itself).
-        active: What holds it there: constraints at which impact, bounds of which quantity.
-        stopped: "maximum"; "supremum", where the objective rises up to the end of the orbit, which no orbit attains;
-            "looks", when these were spent; "stalled", where no step is higher though the gradient is not zero: at a
-            kink, such as a worst case has where two devices are alike; "weighted", of `robustness.weighted`.
-        looks: Evaluations of objective with gradient that it took.
-        path: Accepted points [look, quantity], the start first, and the objective there.
-        heights: See `path`.
-    """
-
-    values: dict[str, float]
-    device: Harvester
-    orbit: Orbit
-    label: str
-    height: float
-    state: Steady
-    gradient: dict[str, float]
-    active: tuple[str, ...]
-    stopped: str
-    looks: int
-    path: np.ndarray
-    heights: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -196,7 +155,7 @@ def optimise_all(
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
     starts, looked = find(devices, tune, box, objective, far)
     ends = _climbed(scene, starts, box, looks)
-    optima = _optima(scene, starts, ends, devices, looks)
+    optima = verified(scene, starts, ends, devices, looks)
     return [
         Design(
             optima=tuple(optima[owner]),
@@ -298,25 +257,10 @@ def _compiled(looks: int):
     return jax.jit(climb, compiler_options=xla.compiler_options())
 
 
-class _End(NamedTuple):
-    """Where a start ended; arrays without the leading axis of starts."""
-
-    z: np.ndarray
-    height: float
-    gradient: np.ndarray
-    margins: np.ndarray  # of the nominal device and all nodes, [node, two an impact]; then lower and upper bounds
-    knots: np.ndarray
-    lost: bool
-    settled: bool
-    looks: int
-    path: np.ndarray
-    heights: np.ndarray
-
-
-def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[_End]:
+def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[End]:
     """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
     count, work = (starts.flown.side != 0).sum(axis=1), _compiled(looks)
-    ends: list[_End | None] = [None] * count.size
+    ends: list[End | None] = [None] * count.size
 
     def part(some: np.ndarray, width: int, tile: tiles.Tile) -> None:
         rows = some[tile.rows]
@@ -328,7 +272,7 @@ def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[_En
         )
         path, heights, z = np.asarray(end.path), np.asarray(end.heights), np.asarray(end.z)
         for row, index in enumerate(rows[: tile.real]):
-            ends[index] = _End(
+            ends[index] = End(
                 z[row],
                 float(np.exp(seen.value[row])) if seen.there[row] else np.nan,
                 seen.gradient[row],
@@ -351,90 +295,3 @@ def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[_En
     with context.pool(tiles.workers()) as pool:
         list(pool.map(lambda job: part(*job), jobs))
     return [end for end in ends if end is not None]
-
-
-def _optima(scene: Scene, starts: Met, ends: list[_End], devices: list[Harvester], looks: int) -> list[list[Optimum]]:
-    """What was reached for every device: admissible, verified, each optimum once, the best first."""
-    owner = starts.owner
-    good = [i for i, end in enumerate(ends) if end.margins.min() >= 0 and np.isfinite(end.height)]
-    good = [i for rows in _apart(good, ends, owner) for i in rows]
-    if not good:
-        return [[] for _ in devices]
-    own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
-    many = jax.tree.map(lambda *x: jnp.array(x), *own)
-    width = starts.flown.side.shape[1]
-    wide = [np.pad(ends[i].knots, ((0, width - len(ends[i].knots)), (0, 0))) for i in good]
-    sequence = starts.some(np.array(good)).flown.sequence(width)
-    found = periodic.solve(jax.vmap(lambda d: d.pair())(many), sequence, jnp.array(wide))
-    seen = states(own, found)
-    attracts = np.array([found.status[row] == Status.OK == seen[row].status for row in range(len(own))])
-    names = orbit_properties.labels(found)
-    optima: list[list[Optimum]] = [[] for _ in devices]
-    for row in np.flatnonzero(attracts):
-        end = ends[good[row]]
-        there = np.isfinite(end.heights)
-        optima[owner[good[row]]].append(
-            Optimum(
-                values=dict(zip(scene.names, np.asarray(values(scene.names, end.z)).tolist(), strict=True)),
-                device=own[row],
-                orbit=found[row : row + 1],
-                label=str(names[row]),
-                height=end.height,
-                state=seen[row],
-                gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
-                active=_active(scene, end, found.sequence.side[row]),
-                stopped=_reason(end, looks),
-                looks=end.looks,
-                path=np.asarray(values(scene.names, end.path[there])),
-                heights=np.exp(end.heights[there]),
-            )
-        )
-    return optima
-
-
-def _reason(end: _End, looks: int) -> str:
-    if end.lost:
-        return "supremum"
-    if end.settled:
-        return "maximum"
-    return "looks" if end.looks >= looks else "stalled"
-
-
-def _apart(good: list[int], ends: list[_End], owner: np.ndarray) -> Iterator[list[int]]:
-    """Ends that differ, of every owner, the highest first."""
-    for own in np.unique(owner[good]):
-        kept: list[int] = []
-        for i in sorted((i for i in good if owner[i] == own), key=lambda i: -ends[i].height):
-            if all(np.abs(ends[i].z - ends[k].z).max() > _SAME for k in kept):
-                kept.append(i)
-        yield kept
-
-
-@lru_cache(maxsize=1)
-def _compiled_states():
-    return jax.jit(jax.vmap(steady), compiler_options=xla.compiler_options())
-
-
-@door
-def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
-    """The steady state of every device on its known orbit, in padded tiles."""
-    given, found = jax.tree.map(lambda *x: np.array(x), *devices), []
-    for tile in tiles.tiles(len(orbit), _FEW):
-        some = _compiled_states()(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
-        some = jax.tree.map(np.asarray, some)
-        found += [jax.tree.map(lambda x, row=row: x[row], some) for row in range(tile.real)]
-    return found
-
-
-def _active(scene: Scene, end: _End, side: Any) -> tuple[str, ...]:
-    """What holds an end where it is."""
-    count, width = len(scene.names), end.knots.shape[0]
-    margins, low, high = np.split(end.margins, [end.margins.size - 2 * count, end.margins.size - count])
-    words = []
-    for node, kind, impact in np.argwhere(margins.reshape(-1, 2, width) < _ACTIVE):
-        what = ("penetration limit", "energy given to the membrane")[kind]
-        wall = "left" if side[impact] < 0 else "right"
-        words.append(f"{what} at the {wall} wall" + (" at an end of the tolerance" if node else ""))
-    words += [f"lower bound of {name}" for name, room in zip(scene.names, low, strict=True) if room < _ACTIVE]
-    words += [f"upper bound of {name}" for name, room in zip(scene.names, high, strict=True) if room < _ACTIVE]
-    return tuple(dict.fromkeys(words))

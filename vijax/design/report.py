@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vijax.design.objective import OBJECTIVES
-from vijax.design.optimise import Design, Optimum, Spread
+from vijax.design.optimise import Design, Spread
+from vijax.design.optimum import Optimum
 from vijax.design.robustness import Surroundings
 from vijax.design.tolerance import Tolerance
 from vijax.design.variables import LINEAR, constant, value_of

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax.design.optimise import Design, Optimum, states
+from vijax.design.optimise import Design
+from vijax.design.optimum import Optimum, states
 from vijax.design.variables import tuned, values, variables
 from vijax.model.device import Harvester
 from vijax.model.records import Status
