@@ -21,7 +21,8 @@ has its Floquet `multipliers`, and `orbit_impacts`, `orbit_labels`, `orbit_power
 
 The best device: `steady` is the steady state of an orbit, a `Steady` with derivatives; `optimise` finds the `Design`
 that harvests most; `under_tolerances` says what becomes of an `Optimum` when constants scatter as a `Tolerance` says,
-`surroundings` what lies around it (`Surroundings`), `weigh_basins` which is best if its basin counts.
+`surroundings` what lies around it (`Surroundings`), `weigh_basins` which is best if its basin counts; `DesignSettings`
+decide where ascents begin and how they climb.
 
 Pictures: `plots`, which is loaded, and matplotlib with it, when it is first asked for.
 """

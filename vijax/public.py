@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from vijax.batch.run_records import Trajectory
 from vijax.batch.trajectory import trajectory
+from vijax.design.design_settings import DesignSettings
 from vijax.design.optimise import Design, optimise
 from vijax.design.optimise import under as under_tolerances
 from vijax.design.optimum import Optimum
@@ -42,6 +43,7 @@ __all__ = [
     "Branch",
     "ContinuationSettings",
     "Design",
+    "DesignSettings",
     "Harvester",
     "HuntCrossley",
     "Impact",

@@ -15,11 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-_MEMORY = 8  # pairs of points that L-BFGS keeps
-_FIRST, _LAST = 0.03, 1e-9  # weight of the barrier
+from vijax.design.design_settings import DEFAULT, DesignSettings
+
 _CONVERGED = 1e-6  # weight at which a maximum is one to six digits
-_FALL, _HASTE = 0.1, 1.5  # of the weight: at least by this factor, and to this power, as the path is smoother nearby
-_NEAR = 0.95  # share of the way to a constraint that one step may go
 _ARRIVED = 1e-8  # a step this short is the last
 _STUCK = 1e-9  # so is a trial refused this near
 
@@ -82,15 +80,23 @@ class Climb(eqx.Module):
 
 
 class _Task(NamedTuple):
-    """What stays the same on every way: what is looked at, the bounds, the most looks, optax's memory of curvature."""
+    """What stays the same on every way: what is looked at, bounds, most looks, optax's memory, settings."""
 
     look: Callable[..., Look]
     box: Box
     looks: int
     lbfgs: Any
+    settings: DesignSettings
 
 
-def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory: Any, box: Box, looks: int) -> Climb:
+def ascend(
+    look: Callable[..., Look],
+    z: Float[Array, "start variable"],
+    memory: Any,
+    box: Box,
+    looks: int,
+    settings: DesignSettings = DEFAULT,
+) -> Climb:
     """Climb from every start, under jit.
 
     Args:
@@ -99,10 +105,11 @@ def ascend(look: Callable[..., Look], z: Float[Array, "start variable"], memory:
         memory: Of the starts.
         box: Their bounds.
         looks: Evaluations that a start may take, the first one included.
+        settings: Of the barrier, how near a step may come to a constraint, and how much curvature is kept.
     """
     import optax  # here, as importing vijax must not load it
 
-    task = _Task(look, box, looks, optax.scale_by_lbfgs(_MEMORY))
+    task = _Task(look, box, looks, optax.scale_by_lbfgs(settings.curvature_pairs), settings)
     start = _begun(task, z, memory)
     return lax.while_loop(lambda c: c.going.any() & (c.trip < looks), partial(_advance, task), start)
 
@@ -116,7 +123,7 @@ def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb
     return Climb(
         z=z,
         seen=blank._replace(memory=memory),
-        weight=jnp.full(starts, _FIRST, z.dtype),
+        weight=jnp.full(starts, task.settings.first_barrier, z.dtype),
         step=jnp.zeros_like(z),
         pace=jnp.ones(starts, z.dtype),
         going=jnp.ones(starts, bool),
@@ -135,9 +142,9 @@ def _advance(task: _Task, c: Climb) -> Climb:
     trial = c.z + jnp.where(c.going, c.pace, 0.0)[:, None] * c.step
     seen = _view(task, trial, c.z, c.seen.memory)
     better = c.going & seen.there & (_higher(c, seen) | (c.trip == 0))
-    turns = _turns(c, seen)
+    turns = _turns(task, c, seen)
     falls = turns | (better & (c.pace == 1) & _little(c))
-    weight = jnp.where(falls, jnp.maximum(jnp.minimum(_FALL * c.weight, c.weight**_HASTE), _LAST), c.weight)
+    weight = jnp.where(falls, _lighter(task.settings, c.weight), c.weight)
     # Curvature compares gradients of one function: that before, under the new weight; none across the border, nor where
     # it turns.
     state = c.state._replace(updates=-_gradient(c.seen, weight))
@@ -146,7 +153,7 @@ def _advance(task: _Task, c: Climb) -> Climb:
     z, now = _choose_all(better, (trial, seen), (c.z, c.seen))
     step, state = _choose_all(better | turns, _aim(task, z, now, weight, state), (c.step, c.state))
     length = jnp.abs(step).max(axis=1)
-    settled = better & (length <= _ARRIVED) & (weight <= _LAST)
+    settled = better & (length <= _ARRIVED) & (weight <= task.settings.last_barrier)
     refused = 0.5 * c.pace * jnp.abs(c.step).max(axis=1) / jnp.maximum(length, _STUCK)
     pace = jnp.minimum(jnp.where(better, 2 * c.pace, refused), 1.0)
     count = c.looks + c.going.astype(jnp.int32)
@@ -166,6 +173,12 @@ def _advance(task: _Task, c: Climb) -> Climb:
     )
 
 
+def _lighter(settings: DesignSettings, weight: Float[Array, "start"]) -> Float[Array, "start"]:
+    """Give the next weight of the barrier: w <- min(0.1 w, w**1.5) by default, and not below the last."""
+    falls = jnp.minimum(settings.barrier_factor * weight, weight**settings.barrier_power)
+    return jnp.maximum(falls, settings.last_barrier)
+
+
 def _view(task: _Task, z, near, memory) -> Look:
     """What is seen, with the bounds among the constraints."""
     seen = task.look(z, near, memory)
@@ -182,12 +195,12 @@ def _little(c: Climb) -> Bool[Array, "start"]:
     return c.going & _inside(c.seen) & (promised < c.weight)
 
 
-def _turns(c: Climb, trial: Look) -> Bool[Array, "start"]:
+def _turns(task: _Task, c: Climb, trial: Look) -> Bool[Array, "start"]:
     """Which may have to turn back: converged at an edge beyond which there is no point.
 
     The barrier may have pushed them there; with less of it the way may lead elsewhere.
     """
-    return _little(c) & ~trial.there & (c.weight > _LAST)
+    return _little(c) & ~trial.there & (c.weight > task.settings.last_barrier)
 
 
 def _forgotten(task: _Task, z) -> Any:
@@ -202,7 +215,7 @@ def _aim(task: _Task, z, seen: Look, weight, state):
     with jax.numpy_dtype_promotion("standard"):
         found, straight = (jax.vmap(task.lbfgs.update)(-ahead, of, z) for of in (state, _forgotten(task, z)))
     step, after = _choose_all((found[0] * ahead).sum(axis=1) < 0, found, straight)
-    return _shortened(-step, seen, task.box.radius), after
+    return _shortened(task, -step, seen), after
 
 
 def converged(c: Climb) -> Bool[Array, "start"]:
@@ -240,10 +253,11 @@ def _higher(c: Climb, trial: Look) -> Bool[Array, "start"]:
     return jnp.where(before > 0, (after > 0) & (gain > 0), after > before)
 
 
-def _shortened(step, seen: Look, radius: float) -> Float[Array, "start variable"]:
+def _shortened(task: _Task, step, seen: Look) -> Float[Array, "start variable"]:
     """As far along a step as the trust region and the linearised constraints allow."""
     closing = -(seen.slopes * step[:, None]).sum(axis=2)
     limited = (seen.margins > 0) & (closing > 0)
-    share = jnp.where(limited, _NEAR * seen.margins / jnp.where(limited, closing, 1.0), 1.0)
+    share = jnp.where(limited, task.settings.max_approach * seen.margins / jnp.where(limited, closing, 1.0), 1.0)
+    radius = task.box.radius
     share = jnp.minimum(share.min(axis=1), radius / jnp.maximum(jnp.abs(step).max(axis=1), radius))
     return jnp.minimum(share, 1.0)[:, None] * step

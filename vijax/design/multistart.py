@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from vijax.design.design_settings import DEFAULT, DesignSettings
 from vijax.design.survey import Flown, Survey, survey
 from vijax.design.variables import moving, tuned, values
 from vijax.model.device import Harvester
@@ -23,23 +24,18 @@ from vijax.model.records import Status
 from vijax.runtime import tiles
 
 _TILES = (512, 4096, 32768)  # cells of one compiled call
-_LONGEST = 8  # forcing periods of an orbit
 _REACH = 0.49, 0.6  # of the gap that the ball's displacement may take, and its velocity
-_LEVELS = (0.2, 0.5, 0.8)  # of the other tuned quantities, in parts of their bounds
-_BESIDE = 256  # parts of the first quantity's bounds: of attractors of a kind the best climbs as far as one away
-_MANY = 8  # impacts: orbits of more live in narrow windows, where no climb leads far
-_NARROW = 0.8  # of the best: an orbit of many impacts that promises less is not climbed, nor chaos looked at closer
-_DENSE = 8  # times as many cells as before about a step that is looked at closer
 _HOPELESS = -1e3  # score of what breaks a constraint, before what it lacks
 
 
 class Effort(NamedTuple):
-    """Of a survey: values of the first quantity, starts at each, most impacts of an orbit, periods of a start."""
+    """Of a survey: values of the first quantity, starts at each, most impacts, periods of a start, settings."""
 
     steps: int
     balls: int
     impacts: int
     periods: int
+    settings: DesignSettings = DEFAULT
 
 
 class Looked(NamedTuple):
@@ -110,7 +106,7 @@ def find(
         objective: Of `OBJECTIVES`; starts for tolerances are those for P.
         effort: How far to look.
     """
-    first, levels = _first(tune), _levels(tune)
+    first, levels = _first(tune), _levels(tune, effort)
     steps = 1 if first is None else effort.steps
     owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
     scene = _Scene(devices, tune, box, effort)
@@ -127,7 +123,7 @@ def find(
             closer = _look(scene, again, draws[1])
             more = closer.met(closer.found.orbits(effort.impacts))
             met = jax.tree.map(lambda *x: np.concatenate(x), met, more)
-    chosen = _promising(met, objective, len(devices), max(1, steps // _BESIDE))
+    chosen = _promising(met, objective, len(devices), steps, effort.settings)
     return met.some(chosen), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
 
 
@@ -164,11 +160,11 @@ def _first(tune: tuple[str, ...]) -> int | None:
     return next((i for i, name in enumerate(tune) if moving(name)), None)
 
 
-def _levels(tune: tuple[str, ...]) -> np.ndarray:
+def _levels(tune: tuple[str, ...], effort: Effort) -> np.ndarray:
     """Values [level, quantity] of the others, in parts of their bounds."""
-    first = _first(tune)
+    first, levels = _first(tune), effort.settings.other_levels
     return np.array(
-        list(itertools.product(*((0.5,) if i == first or not moving(x) else _LEVELS for i, x in enumerate(tune))))
+        list(itertools.product(*((0.5,) if i == first or not moving(x) else levels for i, x in enumerate(tune))))
     )
 
 
@@ -190,7 +186,7 @@ class _Seen(NamedTuple):
 def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
     """Survey some places, the ball of each starting where its number's draw says."""
     devices, tune, box, effort = scene
-    first, parts = _first(tune), _levels(tune)[places.level]
+    first, parts = _first(tune), _levels(tune, effort)[places.level]
     if first is not None:
         parts[:, first] = places.part
     low, high = box[places.owner].swapaxes(0, 1)
@@ -198,7 +194,7 @@ def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
     given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
     every, pair = tiles.map_tiles(lambda rows: _cells(*rows, tune), (given, z), _TILES)
     u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
-    found = survey(pair, u0 * pair.d, v0, longest=_LONGEST, periods=effort.periods)
+    found = survey(pair, u0 * pair.d, v0, longest=effort.settings.max_period, periods=effort.periods)
     step = np.round(places.part * (effort.steps - 1)).astype(int)
     return _Seen(found, every, z, places, step)
 
@@ -215,19 +211,19 @@ def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, cells
 
     Cells of a device, so many at most, are spread evenly over these steps, and over each of them.
     """
-    good = _promise(unrest, objective).total > most[unrest.owner] + math.log(_NARROW)
+    good = _promise(unrest, objective).total > most[unrest.owner] + math.log(effort.settings.min_promise)
     owner, level, step = np.unique(np.column_stack([unrest.owner, unrest.level, unrest.step])[good], axis=0).T
     places = [_Places(*np.zeros((4, 0), int))]
     for one in np.unique(owner):
         here = np.flatnonzero(owner == one)
-        number = np.arange(min(here.size * _DENSE * effort.balls, cells))
+        number = np.arange(min(here.size * effort.settings.closer_cells * effort.balls, cells))
         index, turn = here[number % here.size], number // here.size
         part = (step[index] + (turn + 0.5) / (turn.max() + 1) - 0.5) / (effort.steps - 1)
         places.append(_Places(owner[index], level[index], np.clip(part, 0.0, 1.0), number))
     return jax.tree.map(lambda *x: np.concatenate(x), *places)
 
 
-def _promising(met: Met, objective: str, devices: int, reach: int) -> np.ndarray:
+def _promising(met: Met, objective: str, devices: int, steps: int, settings: DesignSettings) -> np.ndarray:
     """Indices of the attractors to climb from: the best of their kind as far as so many steps away.
 
     A kind is given by span and impacts; the walls may change places where the tube is level.
@@ -236,9 +232,9 @@ def _promising(met: Met, objective: str, devices: int, reach: int) -> np.ndarray
     score = np.where(promise.lacks < 0, _HOPELESS + promise.lacks, promise.value)
     left, right = _impacts(met.flown)
     kind = np.column_stack([met.owner, met.level, met.flown.span, left, right])
-    found = highest(kind, met.step, score, reach)
-    enough = promise.total > _most(promise, met.owner, devices)[met.owner] + math.log(_NARROW)
-    return found[(enough | (left + right <= _MANY))[found]]
+    found = highest(kind, met.step, score, max(1, steps // settings.min_steps_apart))
+    enough = promise.total > _most(promise, met.owner, devices)[met.owner] + math.log(settings.min_promise)
+    return found[(enough | (left + right <= settings.max_sure_impacts))[found]]
 
 
 def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) -> np.ndarray:

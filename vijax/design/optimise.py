@@ -17,6 +17,7 @@ import numpy as np
 
 from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
+from vijax.design.design_settings import DEFAULT, DesignSettings, check_settings
 from vijax.design.multistart import Effort, Looked, Met, find
 from vijax.design.objective import OBJECTIVES, Batch, Objective, Scene
 from vijax.design.optimum import End, Optimum, verified
@@ -29,7 +30,6 @@ from vijax.runtime import checks, context, tiles, xla
 from vijax.runtime.context import door
 
 _LOG = logging.getLogger(__name__)
-_RADIUS = 0.2  # of a step, in the logarithm of a quantity
 _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
 _MOST_LOOKS, _MOST_STEPS, _MOST_IMPACTS = 10**5, 10**7, 256
@@ -77,12 +77,13 @@ def optimise(
     balls: int = 8,
     impacts: int = 16,
     periods: int = 200,
+    settings: DesignSettings = DEFAULT,
 ) -> Design:
     """Find the admissible designs of one device that harvest most, the best first.
 
     Args:
         device: Where quantities that are not tuned are taken from; Tables I and II unless given.
-        tune, bounds, objective, tolerances, samples, looks, steps, balls, impacts, periods: As in
+        tune, bounds, objective, tolerances, samples, looks, steps, balls, impacts, periods, settings: As in
             `vijax.design.optimise.optimise_all`, which takes many devices at once.
 
     Raises:
@@ -100,6 +101,7 @@ def optimise(
         balls=balls,
         impacts=impacts,
         periods=periods,
+        settings=settings,
     )[0]
 
 
@@ -117,6 +119,7 @@ def optimise_all(
     balls: int = 8,
     impacts: int = 16,
     periods: int = 200,
+    settings: DesignSettings = DEFAULT,
 ) -> list[Design]:
     """The admissible designs that harvest most, each device's tuned quantities between bounds.
 
@@ -137,6 +140,7 @@ def optimise_all(
         balls: Starts from which it looks at each of them; more meet attractors with small basins.
         impacts: Of an orbit, at most: longer ones are not looked for. Fewer are compiled and climb faster.
         periods: Forcing periods that each of them may take.
+        settings: Of survey, ascent and verification; see `DesignSettings`.
 
     Returns:
         One `Design` a device.
@@ -147,15 +151,18 @@ def optimise_all(
     devices = checks.sequence("devices", devices, Harvester, "vijax.Harvester records")
     tune, bounds = checks.words("tune", tune, NAMES), {} if bounds is None else bounds
     scatter = check_tolerances(tolerances)
-    looks, far = checks.whole("looks", looks, 2, _MOST_LOOKS), effort(steps, balls, impacts, periods)
+    looks, far = (
+        checks.whole("looks", looks, 2, _MOST_LOOKS),
+        effort(steps, balls, impacts, periods)._replace(settings=check_settings(settings)),
+    )
     box = check(devices, tune, bounds, objective, scatter)
     if (asked := expected(len(devices), far)).long:
         _LOG.warning("a long run begins: %s", asked)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
     starts, looked = find(devices, tune, box, objective, far)
-    ends = _climbed(scene, starts, box, looks)
-    optima = verified(scene, starts, ends, devices, looks)
+    ends = _climbed(scene, starts, box, looks, settings)
+    optima = verified(scene, starts, ends, devices, looks, settings)
     return [
         Design(
             optima=tuple(optima[owner]),
@@ -249,17 +256,17 @@ def check(
 
 
 @lru_cache(maxsize=8)
-def _compiled(looks: int):
+def _compiled(looks: int, settings: DesignSettings):
     def climb(scene: Scene, batch: Batch) -> Climb:
-        box = Box(batch.low, batch.high, _RADIUS)
-        return ascend(partial(aims.look, scene, batch), batch.z, aims.begin(scene, batch), box, looks)
+        box = Box(batch.low, batch.high, settings.max_step)
+        return ascend(partial(aims.look, scene, batch), batch.z, aims.begin(scene, batch), box, looks, settings)
 
     return jax.jit(climb, compiler_options=xla.compiler_options())
 
 
-def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int) -> list[End]:
+def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int, settings: DesignSettings) -> list[End]:
     """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
-    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(looks)
+    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(looks, settings)
     ends: list[End | None] = [None] * count.size
 
     def part(some: np.ndarray, width: int, tile: tiles.Tile) -> None:

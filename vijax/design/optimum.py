@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vijax.design.design_settings import DesignSettings
 from vijax.design.multistart import Met
 from vijax.design.objective import Scene
 from vijax.design.variables import tuned, values
@@ -25,8 +26,6 @@ from vijax.runtime import tiles, xla
 from vijax.runtime.context import door
 
 _FEW = (16, 256)  # optima of one compiled call
-_SAME = 1e-4  # two optima nearer than this, in the logarithm of a quantity, are one
-_ACTIVE = 1e-6  # a constraint whose margin's logarithm is below is active
 
 
 @dataclass(frozen=True)
@@ -79,11 +78,18 @@ class End(NamedTuple):
     heights: np.ndarray
 
 
-def verified(scene: Scene, starts: Met, ends: list[End], devices: list[Harvester], looks: int) -> list[list[Optimum]]:
+def verified(
+    scene: Scene,
+    starts: Met,
+    ends: list[End],
+    devices: list[Harvester],
+    looks: int,
+    settings: DesignSettings,
+) -> list[list[Optimum]]:
     """What was reached for every device: admissible, verified, each optimum once, the best first."""
     owner = starts.owner
     good = [i for i, end in enumerate(ends) if end.margins.min() >= 0 and np.isfinite(end.height)]
-    good = [i for rows in _apart(good, ends, owner) for i in rows]
+    good = [i for rows in apart(good, ends, owner, settings.same_optimum) for i in rows]
     if not good:
         return [[] for _ in devices]
     own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
@@ -108,7 +114,7 @@ def verified(scene: Scene, starts: Met, ends: list[End], devices: list[Harvester
                 height=end.height,
                 state=seen[row],
                 gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
-                active=_active(scene, end, found.sequence.side[row]),
+                active=_active(scene, end, found.sequence.side[row], settings.active_margin),
                 stopped=_reason(end, looks),
                 looks=end.looks,
                 path=np.asarray(values(scene.names, end.path[there])),
@@ -126,12 +132,19 @@ def _reason(end: End, looks: int) -> str:
     return "looks" if end.looks >= looks else "stalled"
 
 
-def _apart(good: list[int], ends: list[End], owner: np.ndarray) -> Iterator[list[int]]:
-    """Ends that differ, of every owner, the highest first."""
+def apart(good: list[int], ends: list[End], owner: np.ndarray, same: float) -> Iterator[list[int]]:
+    """Give the ends that differ, of every owner, the highest first.
+
+    Args:
+        good: Indices of the ends that may be told.
+        ends: All of them.
+        owner: Which device each belongs to.
+        same: Distance within which two are one, in the logarithm of a quantity.
+    """
     for own in np.unique(owner[good]):
         kept: list[int] = []
         for i in sorted((i for i in good if owner[i] == own), key=lambda i: -ends[i].height):
-            if all(np.abs(ends[i].z - ends[k].z).max() > _SAME for k in kept):
+            if all(np.abs(ends[i].z - ends[k].z).max() > same for k in kept):
                 kept.append(i)
         yield kept
 
@@ -152,15 +165,15 @@ def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
     return found
 
 
-def _active(scene: Scene, end: End, side: Any) -> tuple[str, ...]:
+def _active(scene: Scene, end: End, side: Any, near: float) -> tuple[str, ...]:
     """What holds an end where it is."""
     count, width = len(scene.names), end.knots.shape[0]
     margins, low, high = np.split(end.margins, [end.margins.size - 2 * count, end.margins.size - count])
     words = []
-    for node, kind, impact in np.argwhere(margins.reshape(-1, 2, width) < _ACTIVE):
+    for node, kind, impact in np.argwhere(margins.reshape(-1, 2, width) < near):
         what = ("penetration limit", "energy given to the membrane")[kind]
         wall = "left" if side[impact] < 0 else "right"
         words.append(f"{what} at the {wall} wall" + (" at an end of the tolerance" if node else ""))
-    words += [f"lower bound of {name}" for name, room in zip(scene.names, low, strict=True) if room < _ACTIVE]
-    words += [f"upper bound of {name}" for name, room in zip(scene.names, high, strict=True) if room < _ACTIVE]
+    words += [f"lower bound of {name}" for name, room in zip(scene.names, low, strict=True) if room < near]
+    words += [f"upper bound of {name}" for name, room in zip(scene.names, high, strict=True) if room < near]
     return tuple(dict.fromkeys(words))

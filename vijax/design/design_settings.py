@@ -1,0 +1,101 @@
+"""How the best device is sought: what a user may set, and what breaks when it moves."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from vijax.runtime import checks
+
+_MOST_COUNT = 10**6
+_MOST_PERIOD = 1000  # forcing periods of an orbit
+
+Rule = tuple[str, Callable[[float], bool]]
+_SHARE: Rule = ("a number between 0 and 1", lambda x: 0 < x < 1)
+_NUMBERS: dict[str, Rule] = {
+    "min_promise": ("a positive number of at most 1", lambda x: 0 < x <= 1),
+    "max_step": ("a positive number of at most 10", lambda x: 0 < x <= 10),
+    "max_approach": _SHARE,
+    "first_barrier": ("a positive number of at most 1", lambda x: 0 < x <= 1),
+    "last_barrier": ("a positive number of at most 1e-6", lambda x: 0 < x <= 1e-6),
+    "barrier_factor": _SHARE,
+    "barrier_power": ("a number from 1 to 2", lambda x: 1 <= x <= 2),
+    "same_optimum": _SHARE,
+    "active_margin": _SHARE,
+}
+_COUNTS = ("min_steps_apart", "max_sure_impacts", "closer_cells", "curvature_pairs")
+
+
+@dataclasses.dataclass(frozen=True)
+class DesignSettings:
+    """What decides where ascents begin, how they climb, and which of their ends are told.
+
+    Variables are logarithms of the tuned quantities (an inclination itself); heights are logarithms of the objective.
+
+    Attributes:
+        max_period: Forcing periods of an orbit, at most, 8. Longer ones live in windows that few starts meet; each
+            period more is recorded of every chaotic motion.
+        other_levels: Values of all tuned quantities but the first at which a survey looks, in parts of their bounds,
+            0.2, 0.5 and 0.8. Their number, to the power of the other quantities, multiplies the cells of a survey.
+        min_steps_apart: Of this many parts of the first quantity's bounds, 256, the best attractor of a kind climbs as
+            far as one part away. With fewer, kinds that have two hills may lose one; with more, many climb one hill.
+        max_sure_impacts: Impacts of an orbit up to which it climbs whatever it promises, 8. Orbits of more live in
+            narrow windows, where no climb leads far.
+        min_promise: Share of the best that an orbit of more impacts has to promise to be climbed from, and chaos to be
+            looked at closer, 0.8. A smaller one spends time on what cannot win.
+        closer_cells: Times as many cells as before about a step that is looked at closer, 8. With fewer, narrow windows
+            of periodic motion in chaos are missed.
+        max_step: Longest step of an ascent, 0.2. Longer ones leave the branch of their orbit, and are halved until they
+            do not.
+        max_approach: Share of the way to a constraint that one step may go, 0.95.
+        curvature_pairs: Pairs of points from which L-BFGS knows the curvature, 8.
+        first_barrier: Weight of the logarithmic barrier at first, 0.03. With less, ascents run into constraints early
+            and crawl along them.
+        last_barrier: Weight at last, 1e-9: about how far below the maximum an end at a constraint stays.
+        barrier_factor: The weight falls at least by this factor, 0.1.
+        barrier_power: And to this power, 1.5, as the path is smoother near its end. With 2, steps overshoot more.
+        same_optimum: Two optima nearer than this are one, 1e-4. Much less, and ends of one hill count as several.
+        active_margin: A constraint is told as active whose margin's logarithm is below, 1e-6.
+
+    Raises:
+        ValueError: A value that cannot be.
+    """
+
+    max_period: int = 8
+    other_levels: tuple[float, ...] = (0.2, 0.5, 0.8)
+    min_steps_apart: int = 256
+    max_sure_impacts: int = 8
+    min_promise: float = 0.8
+    closer_cells: int = 8
+    max_step: float = 0.2
+    max_approach: float = 0.95
+    curvature_pairs: int = 8
+    first_barrier: float = 0.03
+    last_barrier: float = 1e-9
+    barrier_factor: float = 0.1
+    barrier_power: float = 1.5
+    same_optimum: float = 1e-4
+    active_margin: float = 1e-6
+
+    def __post_init__(self) -> None:
+        self._set("max_period", checks.whole("max_period", self.max_period, 1, _MOST_PERIOD))
+        self._set("other_levels", tuple(_level(one) for one in checks.numbers("other_levels", self.other_levels).flat))
+        for name, (must, holds) in _NUMBERS.items():
+            self._set(name, checks.real(name, getattr(self, name), must, holds))
+        for name in _COUNTS:
+            self._set(name, checks.whole(name, getattr(self, name), 1, _MOST_COUNT))
+
+    def _set(self, name: str, value: Any) -> None:
+        """Put the plain value in place of the one given, as a frozen record lets only itself do."""
+        object.__setattr__(self, name, value)
+
+
+def _level(value: Any) -> float:
+    return checks.real("other_levels", float(value), "numbers from 0 to 1", lambda x: 0 <= x <= 1)
+
+
+DEFAULT = DesignSettings()
+
+
+def check_settings(settings: DesignSettings) -> DesignSettings:
+    """Return the settings, if they are some; a record of them holds only what can be."""
+    return checks.instance("settings", settings, DesignSettings, "vijax.DesignSettings(...)")
