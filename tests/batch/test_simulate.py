@@ -299,7 +299,7 @@ def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     assert found.periods_run < 1000
 
 
-@pytest.mark.parametrize("gamma", [0.0, 0.3])
+@pytest.mark.parametrize("gamma", [0.1, 0.3])
 def test_single_precision_finds_the_same_periods(gamma):
     # It had called every seventh of these cells by twice its period: the decay of a flip, taken for the orbit.
     axes = {"d": np.linspace(0.05, 0.3, 36), "kappa": np.geomspace(3, 400, 36), "r": 0.5, "gamma": gamma}

@@ -24,17 +24,16 @@ ROOT = SCRIPTS.parent
 DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram", "basins": "basins", "branch": "branch", "design": "design"}
 PAGES = [*DOORS, "compare"]
 PLANE = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
+# The other pages are the same functions with the same options, as the next test holds.
 RUNS = {
     "sweep": (PLANE, "grid", PLANE),
     "compare": ([*PLANE, "--tolerance", "5%"], "grid", [*PLANE, "--compare", "rigid", "--tolerance", "5%"]),
     "basins": (same := ["--d", "0.2", "--kappa", "3", "--periods", "200", "--v0=-0.6:0.6:12"], "basins", same),
-    "orbit-diagram": (same := ["--along", "d=0.3:0.2:3", "--periods", "120", "--keep", "2"], "orbit_diagram", same),
     "branch": (
         same := [*shlex.split("--wall rigid --A 100 --guesses 32 --generations 0 --along omega=4.8Hz:5.2Hz")],
         "branch",
         same,
     ),
-    "design": (same := shlex.split("--d 0.12 --tune kappa --bounds kappa=390:410 --steps 4 --balls 2"), "design", same),
 }
 
 
@@ -79,7 +78,6 @@ def timeless(said):
 
 @pytest.mark.parametrize("name", RUNS)
 def test_the_command_and_the_script_write_and_say_the_same(folder, capsys, monkeypatch, name):
-    monkeypatch.setattr("vijax.cli.design._POINTS", 8)
     arguments, script, given = RUNS[name]
     ends = []
     for place, run in (

@@ -1,4 +1,4 @@
-"""A small run of every kind, with all annotations of vijax checked as it goes: `python tests/tour.py [kind ...]`.
+"""A small run of every kind with all annotations checked: `python tests/annotations/tour.py [kind ...]`.
 
 They are checked where the package is imported under jaxtyping's hook: not in every test, but in a process of its own
 (`test_annotations`). Tests of the doors, which give wrong types on purpose, would not pass under it, and programs that
@@ -24,15 +24,20 @@ def checked(function):
 
 
 def planes(vijax, np, jax):
-    """Level, inclined and rigid maps, a refined one, a stepping engine, comparisons, basins, an orbit diagram."""
+    """Level, inclined and rigid maps, basins."""
     plane = {"d": np.linspace(0.1, 0.3, 3), "kappa": [5.0, 50.0], "r": 0.5}
     vijax.sweep(**plane, periods=40)
     vijax.sweep(d=[0.1, 0.2], kappa=10, r=0.5, gamma=[0.05, 0.3], periods=40)
     vijax.sweep(d=[0.1, 0.2], wall="rigid", r=0.5, periods=40, A=[1.0, 2.0], omega=3.0)
+    vijax.basins(d=0.2, kappa=3.0, r=0.5, u0=[0.0, 0.05], v0=[0.1, 0.3], periods=60)
+
+
+def more_planes(vijax, np, jax):
+    """A refined map, a stepping engine, a comparison, shares of basins, an orbit diagram."""
+    plane = {"d": np.linspace(0.1, 0.3, 3), "kappa": [5.0, 50.0], "r": 0.5}
     vijax.sweep(d=0.2, kappa=5.0, periods=4, method="rk4")
     vijax.sweep(**plane | {"d": np.linspace(0.1, 0.3, 9)}, periods=20, refine=1)
     vijax.compare(**plane, periods=40, tolerance=0.1)
-    vijax.basins(d=0.2, kappa=3.0, r=0.5, u0=[0.0, 0.05], v0=[0.1, 0.3], periods=60)
     vijax.basin_fractions(d=0.2, kappa=3.0, r=0.5, starts=4, periods=60)
     vijax.orbit_diagram(along="d", values=[0.2, 0.21], kappa=[5.0, 50.0], r=0.5, direction="both", periods=40, keep=4)
 
@@ -67,7 +72,7 @@ def designs(vijax, np, jax):
     vijax.under_tolerances(best, [vijax.Tolerance("omega0", 0.05)])
 
 
-KINDS = {kind.__name__: kind for kind in (planes, motions, orbits, designs)}
+KINDS = {kind.__name__: kind for kind in (planes, more_planes, motions, orbits, designs)}
 
 
 def main(names):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 
-# A tour of designs takes a minute: `python tests/tour.py designs`.
+# The other kinds take a minute and more: `python tests/annotations/tour.py` is the whole tour.
 @pytest.mark.parametrize("kind", ["planes", "motions", "orbits"])
 def test_annotations_are_true_of_a_run(kind):
     tour = Path(__file__).parent / "tour.py"
