@@ -299,10 +299,9 @@ def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     assert found.periods_run < 1000
 
 
-@pytest.mark.parametrize("gamma", [0.1, 0.3])
-def test_single_precision_finds_the_same_periods(gamma):
+def test_single_precision_finds_the_same_periods():
     # It had called every seventh of these cells by twice its period: the decay of a flip, taken for the orbit.
-    axes = {"d": np.linspace(0.05, 0.3, 36), "kappa": np.geomspace(3, 400, 36), "r": 0.5, "gamma": gamma}
+    axes = {"d": np.linspace(0.05, 0.3, 36), "kappa": np.geomspace(3, 400, 36), "r": 0.5, "gamma": 0.1}
     double, single = (sweep(**axes, outputs=["period"], dtype=kind).period.values for kind in ("float64", "float32"))
     periodic = double > 0
     assert periodic.sum() > 900
