@@ -19,8 +19,11 @@ from vijax.runtime.xla import share
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
 _ROUNDS = 8  # Newton rounds on one candidate
 _SHORT = 8  # longest period, in forcing periods, of an orbit whose surroundings are taken to be wide
-_GAIN = 1e3  # at most is what rounding gains in solving for Newton's step
-_WITHIN = 0.3  # of Newton's first step is left for the second where the first one was within the orbit's reach
+# Solving for Newton's step multiplies rounding. A step that stalls has arrived for that reason up to this multiple of
+# the tolerance, and above it for another.
+_GAIN = 1e3
+# Newton's second step is below this part of the first one where the ball was within the orbit's reach.
+_WITHIN = 0.3
 
 
 def grain(settings: Settings) -> Float[Array, ""] | float:
@@ -72,7 +75,7 @@ def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
     c = cell.candidate
     if c is None:
         return None, jnp.zeros_like(kept)
-    lag = (hit.onset_n - c.anchor_n) + 0.5 * (hit.onset_t - c.anchor_t)  # in periods
+    lag = (hit.onset_n - c.anchor_n) + 0.5 * (hit.onset_t - c.anchor_t)  # counted in forcing periods
     period = jnp.round(lag)
     near = (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < c.tolerance) & (period >= 1)
     found = kept & ~c.tracing & near & (period <= MAX_PERIOD)

@@ -11,20 +11,16 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from vijax.engine.impact import Arrival, Ball, Hit
 from vijax.engine.method import Method, Passage
 from vijax.engine.quick_contact import Wall
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.runtime.arrays import AnyArray
+from vijax.runtime.arrays import Lane, Mask, Values
 
-Lane = Float[AnyArray, "lane"]
-Mask = Bool[AnyArray, "lane"]
-Values = Float[AnyArray, "..."]
-
-TRANSIENT_SHARE = 0.25  # of the periods that a cell without an orbit leaves out of its averages
+TRANSIENT_SHARE = 0.25  # a cell without an orbit leaves this share of its periods out of its averages
 BATCHES = 24  # batch means behind a standard error
 TANGENT_SCALE = 2.0**40  # the tangent map is kept between 1/TANGENT_SCALE and this, the rest in an exponent
 
@@ -86,9 +82,9 @@ class Tally(eqx.Module):
     fastest: Lane
     momentum: Lane | None  # sum of v_in, signed
     deepest: Lane | None
-    energy: Float[Array, "lane variant"] | None  # of the running batch
-    energy_past: Float[Array, "lane variant"] | None  # of the full batches
-    energy_square: Float[Array, "lane variant"] | None  # of their sums, squared
+    energy: Float[Array, "lane variant"] | None  # what the running batch has harvested so far
+    energy_past: Float[Array, "lane variant"] | None  # what all full batches have harvested
+    energy_square: Float[Array, "lane variant"] | None  # the squares of what each full batch has harvested, added up
     ratio: Float[Array, "lane variant"] | None
     stuck: Mask | None
 

@@ -37,7 +37,7 @@ class Summary(eqx.Module):
     lyapunov: Float[AnyArray, "cell"] | None
     periods_run: Float[AnyArray, "cell"]
     status: Int[AnyArray, "cell"]
-    handover: Handover | None = None  # of chained cells
+    handover: Handover | None = None  # chained cells alone have one
 
 
 def shapes(plan: Plan, dtype: Any) -> Any:

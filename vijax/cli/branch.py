@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 _FILES = ("branch.zarr", "branch.png")
 _START = {"d": "0.2", "kappa": "400"}
-_PARTS = (1 / 2, 1 / 4, 3 / 4, 1 / 8, 3 / 8, 5 / 8, 7 / 8)  # of the bounds: where orbits to begin with are looked for
+# Orbits to begin with are looked for at these parts of the way between the bounds, in this order.
+_PARTS = (1 / 2, 1 / 4, 3 / 4, 1 / 8, 3 / 8, 5 / 8, 7 / 8)
 
 
 @dataclass(frozen=True)

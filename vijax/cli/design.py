@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vijax.model.device import Harvester
 
 _FILES = ("design.json", "design.png")
-_POINTS, _NEAR = 320, 160  # of the picture, and of its close view
+_POINTS, _NEAR = 320, 160  # the picture shows P at so many points, its close view at so many more
 _OVER_TOLERANCES = ("mean", "worst")
 _BASINS = 2000  # starts that show what attracts at the optimum
 _STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the last

@@ -13,7 +13,7 @@ from vijax.cli.closing import pace
 T = TypeVar("T")
 
 _WAITING = logging.getLogger("vijax.waiting")
-_MANY = 10_000  # from here on a bar counts by thousands
+_MANY = 10_000  # a bar of so many counts by thousands
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from vijax.model.records import Status
 from vijax.runtime import tiles
 
 _TILES = (512, 4096, 32768)  # cells of one compiled call
-_REACH = 0.49, 0.6  # of the gap that the ball's displacement may take, and its velocity
+_REACH = 0.49, 0.6  # a ball starts within this part of the gap, and with at most this velocity
 _HOPELESS = -1e3  # score of what breaks a constraint, before what it lacks
 
 
@@ -110,7 +110,7 @@ def find(
     steps = 1 if first is None else effort.steps
     owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
     scene = _Scene(devices, tune, box, effort)
-    cells = owner.size // len(devices)  # of a device
+    cells = owner.size // len(devices)  # every device has as many
     # The same for every device, whatever the others are: designs of one do not depend on them.
     draws = np.random.default_rng(0).uniform(-1, 1, (2, cells)), np.random.default_rng(1).uniform(-1, 1, (2, cells))
     places = _Places(owner, level, step / max(steps - 1, 1), np.arange(owner.size) % cells)

@@ -24,9 +24,9 @@ OBJECTIVES: dict[str, str] = {
     "mean": "mean of P over the tolerances, a device whose orbit is lost counting nothing [J]",
     "worst": "least P over the tolerances [J]",
 }
-_STEPS = 4  # from the nominal orbit to that of a device off by its tolerance
-_TRIPS = 16  # of Newton's search for an orbit near a known one: lost ones take them all
-_SHARP = 300.0  # of the soft minimum whose gradient stands for that of the worst case
+_STEPS = 4  # so many lead from the nominal orbit to that of a device off by its tolerance
+_TRIPS = 16  # Newton's search near a known orbit gives up after so many: lost ones take them all
+_SHARP = 300.0  # how nearly the soft minimum, whose gradient stands for the worst case's, is the minimum
 _MOST = 20.0  # logarithms of margins end here: no contact, no voltage
 
 

@@ -69,7 +69,7 @@ class End(NamedTuple):
     z: np.ndarray
     height: float
     gradient: np.ndarray
-    margins: np.ndarray  # of the nominal device and all nodes, [node, two an impact]; then lower and upper bounds
+    margins: np.ndarray  # [node, two an impact], the nominal device first; then lower and upper bounds
     knots: np.ndarray
     lost: bool
     settled: bool

@@ -21,8 +21,8 @@ from vijax.runtime import checks
 from vijax.runtime.context import door
 
 _SAME = 1e-6  # relative difference of P within which an attractor is the optimum's own orbit
-_POINTS = 17  # of a line search, coarse and then fine
-_STEPS = 8  # in which an orbit follows its device
+_POINTS = 17  # a line search looks at so many, first coarsely, then finely
+_STEPS = 8  # an orbit follows its device in so many steps
 
 
 class Neighbour(NamedTuple):

@@ -10,7 +10,7 @@ from vijax.model.device import CONSTANTS
 from vijax.runtime import checks
 
 _MOST_SAMPLES = 10**5
-_NODES = {1: 17, 2: 9, 3: 5}  # of each constant, by the number of them
+_NODES = {1: 17, 2: 9, 3: 5}  # how many nodes a constant has, by the number of constants
 
 
 # beta, often zero, has no relative tolerance.

@@ -6,16 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from vijax.engine.forcing_sign import Spell, snap, spell_after
 from vijax.engine.roots import bracketed_root
 from vijax.model import flow
 from vijax.model.flow import PI, Force, Membrane
+from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import once, share
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 
 _ARRIVED = 2.0**-30  # relative step of the approach after which Newton's last one is exact
 PATIENCE = 20_000  # stages (about free half cycles) of one contact; only r = 1 comes near

@@ -2,13 +2,11 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
+from vijax.runtime.arrays import Scalar
 from vijax.runtime.xla import share
 
-Scalar = Float[Array, ""]
-
-_ROUNDS = 5  # of a root; a crossing that is missed by too much is located again, on a shorter step
+_ROUNDS = 5  # a root takes so many; a crossing that they miss is located again, on a shorter step
 
 
 class Point(eqx.Module):

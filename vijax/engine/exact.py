@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from vijax.engine.contact_search import PATIENCE, exit_and_crest, first_return
 from vijax.engine.flight_search import next_wall
@@ -21,10 +21,7 @@ from vijax.model import energy, flow
 from vijax.model.flow import Membrane
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
-Values = Float[Array, "..."]
+from vijax.runtime.arrays import Flag, Scalar, Values
 
 
 class Outcome(eqx.Module):

@@ -3,15 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
 
 from vijax.engine.forcing_sign import spell_after
 from vijax.engine.roots import bracketed_root
 from vijax.model import flow
 from vijax.model.flow import Force
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
+from vijax.runtime.arrays import Flag, Scalar
 
 
 class _Scan(eqx.Module):
@@ -30,7 +27,7 @@ def next_turn(force: Force, s: Scalar) -> Scalar:
     return spell_after(force, s).end
 
 
-LONGEST_PIECE = 1.0  # of a flight that is looked at at once, where the acceleration has no zero
+LONGEST_PIECE = 1.0  # a flight whose acceleration has no zero is looked at in pieces of at most this length
 
 
 def monotone_piece(

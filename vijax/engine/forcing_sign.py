@@ -4,13 +4,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
 
 from vijax.model.flow import PI, Force
+from vijax.runtime.arrays import Flags, Values
 from vijax.runtime.xla import once
-
-Values = Float[Array, "..."]
-Flags = Bool[Array, "..."]
 
 
 def snap(dtype: Any) -> float:
@@ -42,7 +39,7 @@ def spell_after(force: Force, s: Values) -> Spell:
     inside = jnp.abs(x) < half
     left = jnp.where(inside, half - x, jnp.where(x < 0, -half - x, 2 - half - x))
     over = left < snap(s.dtype) * (1 + jnp.abs(s))
-    length = jnp.where(inside, 2 - 2 * half, 2 * half)  # of the next stretch
+    length = jnp.where(inside, 2 - 2 * half, 2 * half)  # how long the next stretch is
     constant = (half <= 0) | (half >= 1)
     left = jnp.where(constant, jnp.inf, jnp.where(over, left + length, left))
     positive = jnp.where(constant, half >= 1, inside ^ over)

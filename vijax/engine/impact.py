@@ -3,11 +3,9 @@
 from typing import NamedTuple
 
 import equinox as eqx
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from vijax.runtime.arrays import AnyArray
-
-Lane = Float[AnyArray, "lane"]
+from vijax.runtime.arrays import AnyArray, Lane
 
 
 class Ball(eqx.Module):

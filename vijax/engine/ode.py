@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Int
 
 from vijax.engine.dense_output import Dense, Point, dense_output, root
 from vijax.engine.method import Ode, Passage, decided
@@ -24,10 +24,9 @@ from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair
 from vijax.model.records import Impact, State
+from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
 Solver = Any  # a Runge-Kutta solver of diffrax
 
 _LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
@@ -100,7 +99,7 @@ class Motion(eqx.Module):
     steps: Int[Array, ""]
 
 
-_CREST = 2.0  # as an aim
+_CREST = 2.0  # an aim that is no wall: the deepest point of a contact
 
 
 def _solver(engine: Ode, recorded: bool) -> Solver:

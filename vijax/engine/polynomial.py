@@ -8,14 +8,12 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from vijax.model.flow import PI, horner
+from vijax.runtime.arrays import Lane
 from vijax.runtime.xla import once, share
 
-Lane = Float[Array, "lane"]
-
-REACH = 1.65  # of sine and cosine, in radians
+REACH = 1.65  # sine and cosine hold up to so many radians
 EXP_REACH = 2.4
 _QUARTER = 0.25 * EXP_REACH
 

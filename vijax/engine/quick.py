@@ -27,7 +27,7 @@ class Quick(NamedTuple):
 
     hit: Hit
     arrival: Arrival
-    sure: Bool[Array, "lane"]  # of all of the hit
+    sure: Bool[Array, "lane"]  # whether all of the hit is certain
     never: Bool[Array, "lane"]  # will meet no wall again
 
 

@@ -284,7 +284,8 @@ def touch(wall: Wall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bo
     turn_sine, turn_cosine = turn * (1 - twist * (1 / 6)), 1 - twist * (0.5 - twist * (1 / 24))
     sine, cosine = at.sine * turn_cosine + at.cosine * turn_sine, at.cosine * turn_cosine - at.sine * turn_sine
     short = guess.short
-    sine, cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)  # from the reference to the onset
+    # So far they count from the course's reference, half or a whole free contact after the onset.
+    sine, cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)
     rot = wall.zeta * step
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
     return share((Exit(duration, out, sine, cosine, decay), depth, sure))

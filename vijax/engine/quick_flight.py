@@ -12,7 +12,7 @@ from vijax.engine.roots import converged_step, householder, single
 from vijax.model.flow import PI
 from vijax.runtime.xla import share
 
-_ROUNDS = 3  # in single precision, before the one in double
+_ROUNDS = 3  # so many run in single precision, before the one in double
 _NEAR = 64  # roundings within which an extremum may be on either side of a wall
 
 
@@ -53,7 +53,7 @@ class Flight(eqx.Module):
 class _Stretch(NamedTuple):
     """The monotone stretch of a flight that ends at a wall, in the frame where the ball starts downwards."""
 
-    up: Bool[Array, "lane"]  # to the upper wall
+    up: Bool[Array, "lane"]  # whether it ends at the upper wall
     periods: Lane  # before it begins
     doubt: Bool[Array, "lane"]  # an extremum on the way may be a graze or a miss
 

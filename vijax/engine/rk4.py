@@ -15,17 +15,17 @@ Source: the scheme behind the paper's figures, Eq. (38).
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from vijax.engine.method import Passage, Rk4, decided
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
+from vijax.runtime.arrays import Scalar
 from vijax.runtime.xla import share
 
-Scalar = Float[Array, ""]
-_ON_GRID = 1e-6  # of a step: a start so little before a sample is at it
+_ON_GRID = 1e-6  # a start that is so small a part of a step before a sample counts as at it
 
 
 class Motion(eqx.Module):

@@ -7,13 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
 
+from vijax.runtime.arrays import Flag, Scalar, Values
 from vijax.runtime.xla import share
-
-Scalar = Float[Array, ""]
-Flag = Bool[Array, ""]
-Values = Float[Array, "..."]
 
 _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from vijax.engine.exact import stick_speed
 from vijax.engine.impact import Arrival, Ball, Hit
@@ -23,18 +23,17 @@ from vijax.engine.roots import converged_step, householder
 from vijax.model import energy, flow
 from vijax.model.flow import PI, Force, Membrane
 from vijax.model.pair import ImpactPair
+from vijax.runtime.arrays import Lane, Mask
 from vijax.runtime.xla import share
 
-Lane = Float[Array, "lane"]
-Mask = Bool[Array, "lane"]
 Samples = Float[Array, "sample lane"]
 Zeros = Float[Array, "zero lane"]  # the exit, and the crest where it is asked for
 Rows = Float[Array, "*row lane"]
 Powers = Float[Array, "sample *row lane"]
 
-_SAMPLES = 32  # of one pass
+_SAMPLES = 32  # a pass takes so many
 _PASSES = 6  # before a lane is declined
-_ZOOM = 1 / 16  # of the sampling step where a pass met a doubt
+_ZOOM = 1 / 16  # where a pass met a doubt, the next one samples so much more closely
 _FINEST = 1 / 16  # longest sampling step, in half periods of the forcing and of the membrane
 _NONE = float(_SAMPLES)
 
@@ -42,7 +41,7 @@ _NONE = float(_SAMPLES)
 class _Crest(NamedTuple):
     """Where a contact is deepest so far."""
 
-    when: Lane  # of the highest sample
+    when: Lane  # when the highest sample was
     step: Lane
     height: Lane
     rival: Lane  # how high another maximum could be

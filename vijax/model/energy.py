@@ -6,19 +6,19 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from vijax.model import units
 from vijax.model.device import Harvester, check_device
 from vijax.model.flow import half_turn
 from vijax.model.units import Given
 from vijax.runtime import checks
+from vijax.runtime.arrays import Values
 from vijax.runtime.context import door
 from vijax.runtime.tiles import elementwise
 from vijax.runtime.xla import once
 
 PI = math.pi
-Values = Float[Array, "..."]
 
 
 @door

@@ -13,11 +13,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vijax.model.pair import ImpactPair
+from vijax.runtime.arrays import Values
 from vijax.runtime.xla import once, share
 
 PI = math.pi
-
-Values = Float[Array, "..."]
 
 
 def _alternating(start: int, terms: int) -> tuple[float, ...]:

@@ -5,12 +5,10 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from vijax.model.pair import ImpactPair, Real
 from vijax.runtime import checks
-
-Values = Float[Array, "..."]
+from vijax.runtime.arrays import Values
 
 
 class Spring(eqx.Module):

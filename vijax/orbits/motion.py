@@ -13,7 +13,7 @@ from vijax.model.pair import ImpactPair, check_pair
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
-MOST_SAMPLES = 10**6  # of a piece
+MOST_SAMPLES = 10**6  # a piece of the motion may be asked for at so many instants
 
 
 class Curve(NamedTuple):

@@ -9,17 +9,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from vijax.model import units
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import check
 from vijax.runtime import checks, tiles
-from vijax.runtime.arrays import AnyArray
+from vijax.runtime.arrays import Values
 from vijax.runtime.context import door
-
-Values = Float[AnyArray, "..."]
 
 # Powers with which d, kappa and gamma go in a quantity of the device, by Eqs. (37)-(38).
 _POWERS: dict[str, dict[str, float]] = {
@@ -42,7 +39,7 @@ def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Valu
     elif along not in _POWERS:
         fields[along] = x
     for name, power in _POWERS.get(along, {}).items():
-        if fields[name] is not None:  # as kappa of a rigid wall is
+        if fields[name] is not None:  # a rigid wall has no kappa
             fields[name] = fields[name] * (x / start) ** power
     return ImpactPair(**fields)
 

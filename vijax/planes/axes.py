@@ -55,9 +55,9 @@ START = (0.05853, -0.47898)
 _START_REACH = 0.49
 
 _FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
-_MOST_VALUES = 10**7  # of an axis: the largest planes have some 10^6 a side
-_MOST_CELLS = 10**12  # of a plane, whose store is then some 80 TB
-_BYTES = 8  # of a number
+_MOST_VALUES = 10**7  # an axis may have so many: the largest planes have some 10^6 a side
+_MOST_CELLS = 10**12  # a plane may have so many, its store being some 80 TB then
+_BYTES = 8  # a number takes so many
 _MOST_TEXT = 32 * _MOST_VALUES  # bytes of a file that holds them
 
 

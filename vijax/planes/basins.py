@@ -29,7 +29,7 @@ __all__ = ["basin_fractions", "basins", "label"]
 
 SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
 _START_POINTS = 256
-MOST_STARTS = 10**7  # of a cell
+MOST_STARTS = 10**7  # a cell may have so many
 # Invariants of polished orbits agree to 3e-11 from start to start on a dozen planes of 4096 starts, and differ between
 # attractors by 2e-2 and more. In single precision an orbit passes for one of twice its period: there is no `dtype`.
 _SAME = 1e-6

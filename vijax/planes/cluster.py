@@ -123,7 +123,7 @@ def _joined(address: str) -> "Iterator[Client]":
         ) from None
     try:
         client = dask.Client(address, timeout=_ANSWER, set_as_default=False)
-    except TypeError as error:  # of TLS without certificates
+    except TypeError as error:  # which TLS without certificates raises
         raise ValueError(
             f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
         ) from None

@@ -21,7 +21,7 @@ from vijax.runtime.tiles import places
 _HOUR, _GIGABYTES = 3600.0, 10e9
 # Seconds of a cell and a period by two slow cores; rk4 at 1000 steps.
 _SLOW = {"exact level": 2e-7, "exact inclined": 2e-6, "ode": 2e-5, "rk4": 2e-6}
-_RECORDED = 1e-5  # of cells whose impacts are recorded
+_RECORDED = 1e-5  # the same where the cells' impacts are recorded
 _LEAST_TIMED = 2.0  # seconds, for a pace that is worth keeping
 _UNITS = (("days", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
 _FILE = "paces.json"
@@ -89,7 +89,7 @@ class Watch:
         file = _file()
         if file is not None and ended - began >= _LEAST_TIMED:
             pace = (ended - began) / ((last - first) * _periods(planned))
-            with suppress(OSError):  # of a closed or full folder: what was run is worth more than how fast
+            with suppress(OSError):  # a folder may be closed or full; what was run is worth more than how fast it ran
                 file.parent.mkdir(parents=True, exist_ok=True)
                 write_json(_paces() | {_kind(planned): pace}, file)
 

@@ -18,7 +18,7 @@ from vijax.runtime.files import write_json
 LIST = "vijax.json"
 TILES = Path("status", "tiles")
 _LONGEST = 1 << 30  # bytes of a list: that of a map in ten million files
-_PART = re.compile(r"\.(\w+)\.\d+\.part(\.json)?")  # of `files.beside`
+_PART = re.compile(r"\.(\w+)\.\d+\.part(\.json)?")  # what `files.beside` names a file that is being written
 
 
 def fingerprint(content: bytes) -> str:
@@ -38,7 +38,7 @@ def fault(file: Path, expected: str | None) -> str:
         _check_way(file)
         return "is missing"
     if not file.is_file():
-        return "is no regular file"  # to read a pipe would take for ever
+        return "is no regular file"  # which must not be read: a pipe would take for ever
     if not str(expected).startswith(f"{file.stat().st_size} bytes"):
         return "is not what was written"
     try:

@@ -19,7 +19,7 @@ from vijax.runtime.files import replacing
 if TYPE_CHECKING:
     import xarray as xr
 
-_SHOWN = 3  # of the settings that differ
+_SHOWN = 3  # so many of the settings that differ are named
 
 
 def write(planned: Plan, tile: Mapping[str, int], birth: str, path: Path) -> None:

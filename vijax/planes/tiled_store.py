@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
 SMALLEST_TILE, LARGEST_TILE = 1024, 32768
 _SHARES = 2  # tiles of a small plane for everyone who takes some: blocks do not cost the same
-_ROUNDING = 1.1  # of such a share: halves of odd lengths are rounded up
+_ROUNDING = 1.1  # such a share may be so much larger, as halves of odd lengths are rounded up
 _LARGEST_CHUNK = 1 << 21  # numbers: of many variants a tile has fewer cells
 _LONGEST_BIRTH = 100  # characters: of a lock file that somebody wrote over no more are read
 _LOG = logging.getLogger(__name__)

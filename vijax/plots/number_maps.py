@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # A wider scale would say more about its faintest cells than about those worth building.
 _DECADES = 4
 _ALL_DECADES = 8  # where inadmissible cells are shown too
-_ENOUGH = 0.1  # of the cells shown: fewer admissible ones do not choose the colours
+_ENOUGH = 0.1  # a smaller share of admissible cells among those shown does not choose the colours
 _WIDE = 30  # ratio of the largest to the smallest number from which on their scale is logarithmic
 
 
@@ -40,7 +40,7 @@ _LINE: dict[str, Any] = {
 _DOT: dict[str, Any] = {"marker": ".", "markersize": 1.3, "color": "black", "mew": 0, "linestyle": "none"}
 _CROSS: dict[str, Any] = {"marker": "x", "markersize": 3.0, "color": "red", "mew": 0.7, "linestyle": "none"}
 _OUTLINE: dict[str, Any] = _LINE | {"color": "red", "linewidth": 1.2}
-_SINGLE = {"markersize": 4.0}  # of a mark that is not one of thousands
+_SINGLE = {"markersize": 4.0}  # a mark that is not one of thousands may be larger
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "red", "mec": "white", "linestyle": "none"}
 
 

@@ -1,4 +1,4 @@
-"""What annotations call an array where it need not be JAX's.
+"""What annotations call arrays: where one need not be JAX's, and the shapes that occur everywhere.
 
 Records of cells are made by NumPy on the host, as JAX would compile a program for every shape, are traced in programs,
 and stand for their own shapes where a layout is asked for. `Float[AnyArray, ...]` says so, `Float[Array, ...]` of
@@ -9,8 +9,17 @@ from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 if TYPE_CHECKING:
     AnyArray = jax.Array  # else mypy asks of every operator and method what it does to each kind
 else:
     AnyArray = jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct
+
+# One number or truth of one ball; one a lane; any number of them.
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+Lane = Float[AnyArray, "lane"]
+Mask = Bool[AnyArray, "lane"]
+Values = Float[AnyArray, "..."]
+Flags = Bool[AnyArray, "..."]
