@@ -42,9 +42,8 @@ from peers import rk4
 import vijax
 from vijax.batch.run_records import Trajectory
 from vijax.engine import exact
-from vijax.engine.method import Ode
+from vijax.engine.ode import Ode
 from vijax.model import flow
-from vijax.model.membrane import Linear
 from vijax.model.pair import ImpactPair, damping_ratio
 from vijax.model.records import State
 
@@ -149,7 +148,7 @@ def located(solver: str) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.nda
 
     @jax.jit
     def both(kappa, dt):
-        method = Ode(solver, jnp.asarray(1e-10), jnp.asarray(1e-12), Linear(), dt)
+        method = Ode(solver, jnp.asarray(1e-10), jnp.asarray(1e-12), dt)
 
         def last(kappa):
             pair = vijax.impact_pair(D_REGULAR, kappa, R)

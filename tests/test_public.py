@@ -15,7 +15,7 @@ import pytest
 
 import vijax
 from vijax.design import objective
-from vijax.engine import method
+from vijax.engine import method_choice
 from vijax.model import pair
 from vijax.orbits import continuation
 from vijax.planes import axes, orbit_diagram, sweep
@@ -28,9 +28,9 @@ ROOMS = [room.name for room in pkgutil.walk_packages(vijax.__path__, "vijax.")]
 CHOICES = {
     "direction": {continuation.Direction, orbit_diagram.Direction},
     "dtype": {axes.Precision},
-    "method": {method.MethodName},
+    "method": {method_choice.MethodName},
     "objective": {objective.Objective},
-    "solver": {method.SolverName},
+    "solver": {method_choice.SolverName},
     "until": {sweep.Until},
     "wall": {pair.Walls},
 }
@@ -115,7 +115,7 @@ def test_every_argument_shows_and_has_a_type(name):
 
 def test_choices_are_those_that_the_doors_allow():
     assert get_args(objective.Objective) == tuple(objective.OBJECTIVES)
-    assert get_args(method.MethodName) == tuple(method.OPTIONS)
+    assert get_args(method_choice.MethodName) == tuple(method_choice.OPTIONS)
     assert get_args(continuation.Direction) == tuple(continuation._WAYS)
     assert get_args(orbit_diagram.Direction) == tuple(orbit_diagram._WAYS)
     assert set(axes.Axes.__annotations__) == set(axes.AXES)

@@ -1,4 +1,4 @@
-"""Trips: what a lane that declined has kept is what the careful step finds from where the lane stands."""
+"""What a lane that declined has kept is what the careful step finds from where the lane stands."""
 
 from functools import partial
 
@@ -14,17 +14,7 @@ from vijax.model.pair import ImpactPair
 from vijax.runtime import xla
 
 CELLS, STEPS = 2048, 60
-PLAN = Plan(
-    until="window",
-    stepping=None,
-    rigid=False,
-    level=True,
-    deep=True,
-    energies=False,
-    asymmetry=False,
-    tangent=False,
-    variants=1,
-)
+PLAN = Plan(until="window", deep=True, tangent=False)
 SETTINGS = Settings(
     periods=jnp.asarray(1000.0),
     transient=jnp.asarray(0.0),

@@ -12,17 +12,7 @@ from vijax.batch.cell import Plan, Settings
 from vijax.batch.summary import shapes, unload
 from vijax.model.device import Harvester
 
-LEAST = Plan(
-    until="attractor",
-    stepping=None,
-    rigid=False,
-    level=True,
-    deep=False,
-    energies=False,
-    asymmetry=False,
-    tangent=True,
-    variants=3,
-)
+LEAST = Plan(variants=3)
 
 
 @pytest.mark.parametrize("leading", [1, 2])

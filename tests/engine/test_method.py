@@ -1,15 +1,22 @@
 """Methods by name: the door, maps by every method, membranes without a closed form."""
 
+from dataclasses import replace
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array
 
 import vijax
-from vijax import HuntCrossley, sweep
-from vijax.engine.method import OPTIONS, Ode, choose, record
+from vijax import Harvester, HuntCrossley, sweep
+from vijax.batch.simulate import Scale, summarise
+from vijax.engine.method import HELD, Method, Passage
+from vijax.engine.method_choice import OPTIONS, choose, record
+from vijax.engine.ode import Ode
 from vijax.model.membrane import Linear
 from vijax.model.pair import ImpactPair, impact_pair
-from vijax.model.records import Status
+from vijax.model.records import Impact, State, Status
 
 PLANE = {"d": np.linspace(0.08, 0.3, 6), "kappa": np.geomspace(4, 300, 6), "r": 0.5, "u0": 0.0, "v0": 0.4}
 
@@ -112,6 +119,111 @@ def test_unstable_steps_are_said():
     assert int(blown["status"]) == vijax.Status.NONFINITE
 
 
+# --- a method of one's own --------------------------------------------------------------------------------------------
+
+
+class Sample(eqx.Module):
+    """The carry of a leapfrog: the last sample, and when its contact and its flight began."""
+
+    u: Array
+    v: Array
+    k: Array
+    n: Array
+    mode: Array
+    onset_t: Array
+    onset_n: Array
+    v_in: Array
+    depth: Array
+    left: Array
+
+
+def time(n, t):
+    return 2.0 * n.astype(t.dtype) + t
+
+
+class Leapfrog(Method[Sample]):
+    """Half a kick, a drift, half a kick; the contact decided by the sign of a sample. All starts are at phase 0."""
+
+    steps: float
+
+    def start(self, pair, state, *, deep, tangent):
+        """The carry of a start; of greatest depths and tangent maps it knows none."""
+        zero = 0 * state.u
+        return Sample(
+            state.u, state.v, zero, state.n, state.mode, state.t, state.n, state.v, zero, time(state.n, state.t)
+        )
+
+    def push(self, pair, wall, m, k):
+        """The acceleration at a sample."""
+        side = jnp.where(m.u < 0, -1.0, 1.0)
+        w = side * m.u - 0.5 * pair.d
+        forcing = jnp.cos(2 * jnp.pi * k / self.steps) - pair.gamma
+        return forcing + jnp.where(w > 0, side * wall(w, side * m.v), 0.0)
+
+    def step(self, pair, wall, m, *, recorded=False):
+        """The next sample."""
+        h = 2 / self.steps
+        middle = m.v + 0.5 * h * self.push(pair, wall, m, m.k)
+        new = replace(m, u=m.u + h * middle, v=middle)
+        new = replace(new, v=middle + 0.5 * h * self.push(pair, wall, new, m.k + 1))
+        over = m.k + 1 >= self.steps
+        k, n = jnp.where(over, 0.0, m.k + 1), m.n + over.astype(m.n.dtype)
+        w, t = jnp.abs(new.u) - 0.5 * pair.d, k * h
+        mode = jnp.where(w > 0, jnp.sign(new.u), 0.0).astype(m.mode.dtype)
+        onset, exits = (mode != 0) & (m.mode == 0), (mode == 0) & (m.mode != 0)
+        now, begun = time(n, t), time(m.onset_n, m.onset_t)
+        impact = Impact(m.onset_n, m.onset_t, m.mode, m.v_in, new.v, m.depth, now - begun, 0 * t)
+        passage = Passage(impact, begun - m.left, State(new.u, new.v, t, n, mode), None)
+        new = replace(
+            new,
+            k=k,
+            n=n,
+            mode=mode,
+            onset_t=jnp.where(onset, t, m.onset_t),
+            onset_n=jnp.where(onset, n, m.onset_n),
+            v_in=jnp.where(onset, new.v, m.v_in),
+            depth=jnp.where(onset, w, jnp.maximum(m.depth, w)),
+            left=jnp.where(exits, now, m.left),
+        )
+        return new, passage, exits
+
+    def ball(self, pair, m):
+        """The last sample."""
+        return State(m.u, m.v, 2 * m.k / self.steps, m.n, m.mode)
+
+    def most_steps(self, periods, max_impacts):
+        """As many as there are samples."""
+        return int(self.steps) * (periods + HELD)
+
+
+LEAPFROG = Leapfrog(4000.0)
+
+
+def test_a_trajectory_by_a_method_of_ones_own():
+    pair = impact_pair(0.2, 20.0, 0.5)
+    exact, found = (vijax.trajectory(pair, 0.0, 0.4, 2, method=method) for method in ("exact", LEAPFROG))
+    np.testing.assert_allclose(found.states.u, exact.states.u, atol=1e-3)  # worst measured: 6e-4
+    assert np.array_equal(found.impacts.side, exact.impacts.side)
+    np.testing.assert_allclose(found.impacts.duration, exact.impacts.duration, atol=2 / LEAPFROG.steps)
+
+
+def test_a_plane_by_a_method_of_ones_own():
+    d = jnp.asarray([0.1, 0.2, 0.3])
+    one = jnp.ones_like(d)
+    pair, scale = ImpactPair(d, 20 * one, 0.5 * one, 0 * one), Scale(one, one, jnp.ones(1), jnp.ones(1))
+    told = {"periods": 2, "until": "window", "outputs": frozenset({"deepest"}), "method": LEAPFROG}
+    found = summarise(pair, 0 * one, 0.4 * one, scale, Harvester(), **told)
+    impacts = vijax.trajectory(pair, 0.0, 0.4, 2).impacts
+    np.testing.assert_array_equal(found.impacts_per_period, (impacts.side != 0).sum(axis=1) / 2)
+    for name, true in (
+        ("fastest", np.nanmax(np.abs(impacts.v_in), axis=1)),
+        ("deepest", np.nanmax(impacts.depth, axis=1)),
+        ("contact_time", np.nanmean(impacts.duration, axis=1)),
+    ):
+        np.testing.assert_allclose(getattr(found, name), true, rtol=1e-2, err_msg=name)
+    assert record(LEAPFROG) == {"steps": 4000.0, "membrane": "linear"}
+
+
 # --- Hunt and Crossley ------------------------------------------------------------------------------------------------
 
 
@@ -156,7 +268,7 @@ def test_contacts_of_a_membrane_without_closed_form():
     law = HuntCrossley(0.8)
     pair = impact_pair([0.2, 0.15], [40.0, 150.0], 0.5, [0.0, 0.05])
     pair = ImpactPair(pair.d, pair.kappa, None, pair.gamma)
-    ran = vijax.trajectory(pair, 0.02, 0.3, 4, method=Ode("Dopri8", 1e-10, 1e-12, law))
+    ran = vijax.trajectory(pair, 0.02, 0.3, 4, method=Ode("Dopri8", 1e-10, 1e-12, law=law))
     for lane in range(2):
         for k in (0, 3):
             hit = {

@@ -1,4 +1,4 @@
-"""The stepping engines through the same cases as the exact one: accuracy, orders, events, seam, gradients."""
+"""Methods that step, through the same cases as the exact engine: accuracy, orders, events, seam, gradients."""
 
 import diffrax
 import jax
@@ -9,7 +9,8 @@ from helpers import reference_trajectories
 
 import vijax
 from vijax.engine import dense_output, ode
-from vijax.engine.method import Ode, Rk4
+from vijax.engine.ode import Ode
+from vijax.engine.rk4 import Rk4
 from vijax.model import flow
 from vijax.model.membrane import Linear
 from vijax.model.pair import ImpactPair, impact_pair, membrane_pair
@@ -17,13 +18,13 @@ from vijax.model.records import State, Status
 
 LANES, PERIODS, ROOM = 8, 6, 48  # the one shape in which trajectories are compiled
 FIELDS = ("t", "v_in", "v_out", "depth", "duration", "work")
-FINE = Ode("Dopri8", 1e-10, 1e-12, Linear())
+FINE = Ode("Dopri8", 1e-10, 1e-12)
 # Largest error of the first 8 impacts of the reference trajectories, about ten times what was measured.
 METHODS = {
     "exact": (None, 1e-12),
     "Dopri8": (FINE, 2e-10),
-    "Tsit5": (Ode("Tsit5", 1e-8, 1e-10, Linear()), 2e-6),
-    "Kvaerno5": (Ode("Kvaerno5", 1e-8, 1e-10, Linear()), 1e-5),
+    "Tsit5": (Ode("Tsit5", 1e-8, 1e-10), 2e-6),
+    "Kvaerno5": (Ode("Kvaerno5", 1e-8, 1e-10), 1e-5),
 }
 
 
@@ -86,20 +87,20 @@ def slope(steps, sizes):
 
 @pytest.mark.parametrize("solver", LADDERS)
 def test_located_events_keep_the_order_of_the_solver(solver):
-    sizes = [errors(Ode(solver, 1e-11, 1e-11, Linear(), dt=2.0 / steps)) for steps in LADDERS[solver]]
+    sizes = [errors(Ode(solver, 1e-11, 1e-11, dt=2.0 / steps)) for steps in LADDERS[solver]]
     assert slope(LADDERS[solver], sizes) > ORDERS[solver] - 0.3, sizes
 
 
 def test_samples_without_events_are_of_first_order():
     steps = (200, 400, 800, 1600)
-    assert abs(slope(steps, [errors(Rk4(count, Linear())) for count in steps]) - 1) < 0.3
+    assert abs(slope(steps, [errors(Rk4(count)) for count in steps]) - 1) < 0.3
 
 
 def test_samples_are_of_fourth_order_away_from_the_walls_and_know_no_other_time():
     steps = 64
-    free = follow([(1.0, 8.0, 0.5, 0.0, -1 / np.pi**2, 0.0)], Rk4(steps, Linear()))
+    free = follow([(1.0, 8.0, 0.5, 0.0, -1 / np.pi**2, 0.0)], Rk4(steps))
     assert np.abs(free.states.u + 1 / np.pi**2).max() < 1e-7
-    hits = follow(REGULAR, Rk4(steps, Linear())).impacts
+    hits = follow(REGULAR, Rk4(steps)).impacts
     for time_of in (hits.t, hits.duration):
         samples = time_of[np.isfinite(time_of)] * steps / 2
         assert np.abs(samples - np.round(samples)).max() < 1e-9
@@ -107,7 +108,7 @@ def test_samples_are_of_fourth_order_away_from_the_walls_and_know_no_other_time(
 
 # --- events -----------------------------------------------------------------------------------------------------------
 
-COARSE = Ode("Tsit5", 1e-3, 1e-5, Linear())  # steps that see several events
+COARSE = Ode("Tsit5", 1e-3, 1e-5)  # steps that see several events
 
 
 def assert_agreement(cases, method, tolerance, t0=0.0, count=6):
@@ -154,7 +155,7 @@ def test_a_velocity_that_turns_twice_in_one_step_is_seen():
     cases = [(0.2, 40.0, 0.5, 0.0, 0.1 - gap, -0.004) for gap in (2e-5, 1e-4)]
     exact = follow(cases, None, 0.38)
     assert np.all(time(exact.impacts)[:, 0] < 0.7)
-    ran = follow(cases, Ode("Tsit5", 1e-8, 1e-10, Linear(), dt=0.25), 0.38)
+    ran = follow(cases, Ode("Tsit5", 1e-8, 1e-10, dt=0.25), 0.38)
     assert np.abs(ran.impacts.t[:, 0] - exact.impacts.t[:, 0]).max() < 1e-3
 
 
@@ -199,9 +200,9 @@ def passages(method, case, count, **wanted):
     """The first finished impacts of one start, by `start` and `step` alone."""
     d, kappa, r, gamma, u, v = (jnp.asarray(x) for x in case)
     pair, whole = ImpactPair(d, kappa, r, gamma), jnp.int32(0)
-    m = ode.start(method, pair, State(u, v, jnp.zeros_like(u), whole, whole), **wanted)
+    m = method.start(pair, State(u, v, jnp.zeros_like(u), whole, whole), **wanted)
     wall = method.law.wall(pair)
-    step = jax.jit(lambda m: ode.step(method, pair, wall, m))
+    step = jax.jit(lambda m: method.step(pair, wall, m))
     found = []
     while len(found) < count:
         m, passage, finished = step(m)
@@ -287,11 +288,11 @@ def test_derivatives_forward_and_reverse_over_twenty_impacts():
     def forward(method):
         return np.asarray(jax.jit(jax.vmap(lambda w: jax.jvp(vector(method), (x,), (w,))[1]))(directions))
 
-    exact, found = forward(None), forward(Ode("Dopri8", 1e-11, 1e-13, Linear()))
+    exact, found = forward(None), forward(Ode("Dopri8", 1e-11, 1e-13))
     size = np.abs(exact).max(axis=(0, 1), keepdims=True)
     assert np.isfinite(exact).all()
     assert (np.abs(found - exact) / size).max() < 1e-6
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(IMPACTS, len(FIELDS))))
-    tight = Ode("Dopri8", 1e-11, 1e-13, Linear())
+    tight = Ode("Dopri8", 1e-11, 1e-13)
     gradient = jax.jit(jax.grad(lambda x: jnp.sum(vector(tight)(x) * weights)))(x)
     assert np.allclose(gradient, np.einsum("wif,if->w", found, weights), rtol=1e-9)

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import requires
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from jax import monitoring
 
 import vijax
+from vijax.model.records import State
 from vijax.runtime import export_cache, xla
 
 PACKAGE = Path(vijax.__file__).parent
@@ -66,6 +68,23 @@ def test_another_program_or_shape_is_another_one(folder, changed):
     assert called(**changed)[1] == 1
     assert called(**changed)[1] == 0
     assert len(list(folder.iterdir())) == 2
+
+
+class Theirs(eqx.Module):
+    """A record whose source the digest does not see: a method that a user wrote."""
+
+    y: jax.Array
+
+
+def test_programs_of_somebody_elses_records_are_traced_every_time(folder):
+    """What the record does may have changed since."""
+    for _ in range(2):
+        work = Work()
+        export_cache.Program(lambda x, theirs, work=work: work({"x": x, "y": theirs.y}), "wave")(X, Theirs(X))
+        assert work.traced == 1
+    assert not folder.exists()
+    export_cache.Program(lambda x, ours: ours.u * x, "wave")(X, State(X, X, X, X, X))
+    assert len(list(folder.iterdir())) == 1
 
 
 def test_a_program_without_kernels_is_another_one(folder, monkeypatch):

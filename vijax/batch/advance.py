@@ -1,28 +1,23 @@
-"""One step of every lane: the quick or the sampled step, with a service for what they decline; or a solver step."""
+"""One impact of every lane by the exact engine: the quick or the sampled step, a service for what they decline."""
 
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
-from types import ModuleType
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vijax.batch.attractor_search import review
-from vijax.batch.cell import Cell, Course, Event, Lane, Mask, Plan, Settings, last_period
+from vijax.batch.cell import Cell, Event, Lane, Mask, Plan, Settings, last_period
 from vijax.batch.lanes import choose
 from vijax.batch.tally import add_event
 from vijax.engine import exact, quick, sampled
 from vijax.engine.impact import Arrival, Ball, Hit
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.model.records import State, Status
-from vijax.runtime.xla import share
+from vijax.model.records import State
 
-_QUIET = 64  # periods beyond the last one in which the end of a flight is still looked for
+QUIET = 64  # periods beyond the last one in which the end of a flight is still looked for
 _FOR_EVER = 1e7  # half periods
-_STEPS = 20_000  # steps per period before a cell of a stepping engine is stopped
 
 
 def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
@@ -49,7 +44,7 @@ def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
 
 def knows_arrival(plan: Plan) -> bool:
     """Whether a declined lane's flight is known: it is nearly always the contact, of soft walls, that is declined."""
-    return plan.level and not plan.rigid and plan.stepping is None
+    return plan.level and not plan.rigid
 
 
 class Request(eqx.Module):
@@ -86,7 +81,7 @@ def sampled_answer(plan: Plan, request: Request) -> Answer:
 def careful_answer(plan: Plan, request: Request) -> Answer:
     """`exact.step` on every lane."""
     pair, ball, held = request.pair, request.ball, request.held
-    horizon = 2 * (jnp.maximum(request.end - ball.n, 0.0) + _QUIET)
+    horizon = 2 * (jnp.maximum(request.end - ball.n, 0.0) + QUIET)
     state = State(ball.u, ball.v, ball.t, jnp.zeros(ball.n.shape, jnp.int32), held.astype(jnp.int32))
     out = jax.vmap(partial(exact.step, deep=plan.deep))(pair, state, horizon)
     matrix = None
@@ -95,7 +90,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
         matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
     after = out.state
     # A flight that drifts comes to a wall after the horizon.
-    late = out.quiet & ~_neutral(pair, ball)
+    late = out.quiet & ~neutral(pair, ball)
     hit = Hit(
         onset_t=out.impact.t,
         onset_n=jnp.where(late, jnp.inf, ball.n + out.impact.n.astype(ball.n.dtype)),
@@ -113,7 +108,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
     return Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
 
 
-def _neutral(pair: ImpactPair, ball: Ball) -> Mask:
+def neutral(pair: ImpactPair, ball: Ball) -> Mask:
     """Whether a flight that nothing stops stays within the gap for as good as ever."""
     drift = ball.v - jnp.sin(flow.PI * ball.t) / flow.PI
     return jnp.abs(drift) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
@@ -132,72 +127,3 @@ def settle(plan: Plan, settings: Settings, cell: Cell, answer: Answer, served: M
         held=jnp.where(left, 0.0, cell.held),
     )
     return add_event(plan, settings, cell, event)
-
-
-def _stepping(plan: Plan) -> ModuleType:
-    """The room of the stepping engine, loaded when it is first asked for: diffrax takes a second."""
-    return import_module(f"vijax.engine.{plan.stepping}")
-
-
-def set_off(plan: Plan, settings: Settings, pair: ImpactPair, ball: Ball, held: Lane) -> Course:
-    """Lanes of a stepping engine at the start of a run or of a round."""
-    engine, method = _stepping(plan), settings.method
-    whole = ball.n.astype(jnp.int32)
-    state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
-    carry = jax.vmap(partial(engine.start, method, deep=plan.deep, tangent=plan.tangent))(pair, state)
-    wall = jax.vmap(method.law.wall)(pair)
-    _, passage, _ = jax.eval_shape(jax.vmap(partial(engine.step, method)), pair, wall, carry)
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), passage)
-    return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
-
-
-def solver_step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
-    """One solver step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
-    old = cell.course
-    step = partial(_stepping(plan).step, settings.method)
-    carry, passage, finished = share(jax.vmap(step)(cell.pair, old.wall, old.carry))
-    blocked = old.waits & finished
-    new = Course(
-        old.wall,
-        choose(blocked, old.carry, carry),
-        old.waits | finished,
-        choose(finished & ~blocked, passage, old.passage),
-    )
-    return replace(cell, course=new)
-
-
-def stepping_review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
-    """Fold the impacts that wait, end flights and contacts that outlast the run, and review what has stopped."""
-    course, carry, passage = cell.course, cell.course.carry, cell.course.passage
-    impact, after = passage.impact, passage.after
-    waits = course.waits & cell.running
-    # A round of a candidate orbit may begin close to the end and go on beyond it.
-    end = last_period(plan, settings, cell.since)
-    late = carry.n.astype(cell.count.dtype) - jnp.maximum(end, cell.ball.n)
-    idle = cell.running & ~course.waits
-    out = idle & (carry.mode == 0) & (late >= (_QUIET if cell.candidate is not None else 0))
-    quiet = out & _neutral(cell.pair, cell.ball)
-    permanent = idle & (carry.mode != 0) & (late >= _QUIET)
-    hit = Hit(
-        onset_t=impact.t,
-        onset_n=jnp.where(out, jnp.inf, impact.n.astype(impact.t.dtype)),
-        side=impact.side.astype(impact.t.dtype),
-        v_in=impact.v_in,
-        v_out=impact.v_out,
-        flight=passage.flight,
-        duration=impact.duration,
-        after=Ball(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
-        depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
-        work=impact.work if plan.deep else None,
-        tangent=passage.tangent,
-    )
-    cell = add_event(plan, settings, cell, Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
-    if plan.stepping == "ode":  # the steps of the other are counted by its clock
-        spent = cell.running & (carry.steps.astype(cell.count.dtype) > _STEPS * (end + 1))
-        status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
-        cell = replace(cell, running=cell.running & ~spent, status=status)
-    stopped = ~cell.running
-    cell = review(plan, settings, cell)
-    again = set_off(plan, settings, cell.pair, cell.ball, jnp.zeros_like(cell.count))
-    course = replace(course, waits=jnp.zeros_like(waits))
-    return replace(cell, course=choose(stopped & cell.running, again, course))

@@ -11,7 +11,6 @@ from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, S
 from vijax.batch.chain import depart
 from vijax.batch.lanes import choose
 from vijax.engine.impact import Ball, Hit
-from vijax.engine.method import Ode
 from vijax.model import flow
 from vijax.model.records import Status
 from vijax.runtime.xla import share
@@ -28,7 +27,7 @@ _WITHIN = 0.3
 
 def grain(settings: Settings) -> Float[Array, ""] | float:
     """How far a round started from one point may end apart: nothing but where a solver chooses its steps."""
-    return settings.method.rtol if isinstance(settings.method, Ode) else 0.0
+    return 0.0 if settings.method is None else settings.method.grain
 
 
 def recurrence(dtype, grain=0.0):

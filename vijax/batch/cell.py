@@ -26,22 +26,33 @@ TANGENT_SCALE = 2.0**40  # the tangent map is kept between 1/TANGENT_SCALE and t
 
 
 class Plan(eqx.Module):
-    """What a run is asked for: the static choices that select a compiled program."""
+    """What a run is asked for: the static choices that select a compiled program.
 
-    until: str = eqx.field(static=True)
-    stepping: str | None = eqx.field(static=True)  # the room of the stepping engine, None for the exact one
-    rigid: bool = eqx.field(static=True)
-    level: bool = eqx.field(static=True)  # gamma = 0 everywhere
-    deep: bool = eqx.field(static=True)
-    energies: bool = eqx.field(static=True)
-    asymmetry: bool = eqx.field(static=True)
-    tangent: bool = eqx.field(static=True)
-    variants: int = eqx.field(static=True)
-    chained: bool = eqx.field(static=True, default=False)  # a cell starts in the last one's state (`chain`)
+    Attributes:
+        until: "attractor" or "window".
+        rigid: Whether the walls are.
+        level: Whether gamma is 0 everywhere.
+        deep: Whether greatest depths and works are wanted.
+        energies: Whether what is harvested is wanted; needs `deep`.
+        asymmetry: Whether the mean of v_in is wanted.
+        tangent: Whether the tangent map is wanted; the search for an attractor needs it.
+        variants: How many devices share the motion of a cell.
+        chained: Whether a cell starts in the last one's state (`chain`).
+    """
+
+    until: str = eqx.field(static=True, default="attractor")
+    rigid: bool = eqx.field(static=True, default=False)
+    level: bool = eqx.field(static=True, default=True)
+    deep: bool = eqx.field(static=True, default=False)
+    energies: bool = eqx.field(static=True, default=False)
+    asymmetry: bool = eqx.field(static=True, default=False)
+    tangent: bool = eqx.field(static=True, default=True)
+    variants: int = eqx.field(static=True, default=1)
+    chained: bool = eqx.field(static=True, default=False)
 
 
 class Settings(eqx.Module):
-    """What a run is asked for: the traced numbers."""
+    """What a run is asked for: the traced numbers, and the method that steps; None for the exact engine."""
 
     periods: Float[Array, ""]
     transient: Float[Array, ""]
@@ -112,7 +123,7 @@ class Candidate(eqx.Module):
 
 
 class Course(eqx.Module):
-    """A lane of a stepping engine: its wall, the engine's carry, and the last impact if it waits to be folded."""
+    """A lane of a method that steps: its wall, the method's carry, and the last impact if it waits to be added."""
 
     wall: Any
     carry: Any

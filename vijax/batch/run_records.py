@@ -11,8 +11,6 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, WithStatus
 from vijax.runtime.arrays import AnyArray
 
-# A contact that outlasts the last period by so many is taken to last for ever.
-HELD = 8
 # A differentiated run computes so many steps twice: it remembers only where a chunk began and what it decided.
 CHUNK = 64
 
@@ -38,7 +36,7 @@ class Asked(NamedTuple):
 
     Attributes:
         periods, max_impacts: As asked for.
-        chunks: How often a stepping engine may take `CHUNK` steps.
+        chunks: How often a method may take `CHUNK` steps.
     """
 
     periods: Int[AnyArray, ""]

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vijax.batch import advance, chain, lanes, rows
+from vijax.batch import advance, chain, lanes, rows, solver_steps
 from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence, review, settled
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
 from vijax.batch.summary import Summary, shapes, unload
 from vijax.engine import exact, quick_contact
 from vijax.engine.impact import Arrival, Ball
-from vijax.engine.method import Method, Ode
+from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device
 from vijax.model.membrane import HuntCrossley
 from vijax.model.pair import ImpactPair, check_pair
@@ -50,11 +50,11 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     held = exact.start_mode(pair, ball.u, ball.v, ball.t)
     start = settings.transient + zero
     eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None
-    attractor = plan.until == "attractor"
+    attractor, method = plan.until == "attractor", settings.method
     return Cell(
         pair=pair,
-        wall=quick_contact.prepare(pair) if plan.level and plan.stepping is None else None,
-        course=advance.set_off(plan, settings, pair, ball, held) if plan.stepping else None,
+        wall=quick_contact.prepare(pair) if plan.level and method is None else None,
+        course=None if method is None else solver_steps.set_off(method, plan, pair, ball, held),
         length=entry.length,
         speed=entry.speed,
         ball=ball,
@@ -62,7 +62,7 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
         running=~no,
         declined=no,
         hard=no,
-        arrival=Arrival(zero, zero, zero, no) if advance.knows_arrival(plan) else None,
+        arrival=Arrival(zero, zero, zero, no) if advance.knows_arrival(plan) and method is None else None,
         done=no,
         status=jnp.zeros(d.shape, jnp.int32),
         count=zero,
@@ -85,18 +85,21 @@ def entry_shapes(plan: Plan, dtype: Any) -> Entry:
 
 
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
-    entry = entry_shapes(plan, settings.periods.dtype)
+    entry, method = entry_shapes(plan, settings.periods.dtype), settings.method
     program = lanes.Program(
         load=lambda table: load(plan, settings, rows.unpack(table, entry)),
-        step=partial(advance.solver_step if plan.stepping else advance.step, plan, settings),
-        review=partial(advance.stepping_review if plan.stepping else review, plan, settings),
+        step=partial(advance.step, plan, settings),
+        review=partial(review, plan, settings),
         stopped=lambda cell: ~cell.running,
         done=lambda cell: cell.done,
         unload=lambda cell: rows.pack(unload(plan, settings, cell)),
-        arithmetic=settings.method is None or settings.method.arithmetic,
     )
-    if plan.stepping:
-        return program
+    if method is not None:
+        return program._replace(
+            step=partial(solver_steps.step, method),
+            review=partial(solver_steps.review_steps, method, plan, settings),
+            arithmetic=method.arithmetic,
+        )
     return program._replace(
         service=lanes.Service(
             declined=lambda cell: cell.declined,
@@ -142,7 +145,7 @@ def tolerances(dtype: str) -> dict[str, float]:
 def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, Any], method: Method | None) -> None:
     """Raise ValueError unless a tile of cells can be run: one-dimensional arrays of one length."""
     if not isinstance(method, Method | None):
-        raise ValueError(f"method must be a record of vijax.engine.method.choose, or None; got {checks.shown(method)}")
+        raise ValueError(f"method must be a vijax.engine.method.Method, or None; got {checks.shown(method)}")
     # Whoever carries cells of a Hunt-Crossley membrane has NaN for r.
     lossy = method is None or not isinstance(method.law, HuntCrossley)
     checks.known("pair", check_pair(pair if lossy else dataclasses.replace(pair, r=None)))
@@ -203,7 +206,6 @@ def summarise(
     dtype = pair.d.dtype
     plan = Plan(
         until=until,
-        stepping=None if method is None else "ode" if isinstance(method, Ode) else "rk4",
         rigid=pair.kappa is None,
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=bool(outputs & DEEP),
@@ -234,17 +236,7 @@ def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""]
 
 def blank(count: int, variants: int, dtype: str) -> Summary:
     """A summary without content of so many cells: which shape and kind of number each field has."""
-    plan = Plan(
-        until="attractor",
-        stepping=None,
-        rigid=False,
-        level=True,
-        deep=True,
-        energies=True,
-        asymmetry=True,
-        tangent=True,
-        variants=variants,
-    )
+    plan = Plan(deep=True, energies=True, asymmetry=True, variants=variants)
     like = shapes(plan, np.dtype(dtype))
     return rows.unpack(np.zeros((count, rows.width(like)), dtype), like)
 
@@ -281,18 +273,8 @@ def attractors(
 
 def _chained(pair: ImpactPair) -> Plan:
     """The plan of cells whose ends are wanted."""
-    return Plan(
-        until="attractor",
-        stepping=None,
-        rigid=pair.kappa is None,
-        level=bool((np.asarray(pair.gamma) == 0).all()),
-        deep=True,
-        energies=True,
-        asymmetry=False,
-        tangent=True,
-        variants=1,
-        chained=True,
-    )
+    level = bool((np.asarray(pair.gamma) == 0).all())
+    return Plan(rigid=pair.kappa is None, level=level, deep=True, energies=True, chained=True)
 
 
 def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, keep: int) -> Settings:

@@ -1,7 +1,6 @@
-"""Runs of engines that step through time, recorded: all lanes step together."""
+"""Runs of methods that step through time, recorded: all lanes step together."""
 
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 import equinox as eqx
@@ -10,8 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax.batch.run_records import CHUNK, HELD, Asked, Room, Trajectory, begin
-from vijax.engine.method import Method, repeated
+from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory, begin
+from vijax.engine.method import HELD, Method, repeated
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, Status
 from vijax.runtime.arrays import AnyArray
@@ -52,14 +51,13 @@ def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) ->
     return jax.tree.map(write, table, row)
 
 
-@partial(jax.jit, static_argnames=("name", "room"))
-def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, name: str, room: Room) -> Trajectory:
-    """Stepping engines: all lanes step together, each until its last period is over and its last contact has ended."""
-    engine = import_module(f"vijax.engine.{name}")
+@partial(jax.jit, static_argnames="room")
+def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Trajectory:
+    """All lanes step together, each until its last period is over and its last contact has ended."""
     periods, max_impacts, chunks = asked
     begun = jax.vmap(begin)(pair, u0, v0, t0)
     wall = jax.vmap(method.law.wall)(pair)
-    carry = jax.vmap(partial(engine.start, method, deep=True, tangent=False))(pair, begun)
+    carry = jax.vmap(partial(method.start, deep=True, tangent=False))(pair, begun)
     start = _recording(room, carry, u0)
 
     def runs(r: _Recording):
@@ -70,11 +68,11 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, n
 
     def advance(r: _Recording) -> _Recording:
         going = runs(r)
-        carry, passage, ended = jax.vmap(partial(engine.step, method, recorded=True))(pair, wall, r.carry)
+        carry, passage, ended = jax.vmap(partial(method.step, recorded=True))(pair, wall, r.carry)
         impact = passage.impact
         real = going & ended & (impact.n < periods)
         strobe = going & (carry.n > r.carry.n) & (carry.n <= periods)
-        ball = jax.vmap(lambda pair, m: engine.ball(pair, method, m))(pair, carry)
+        ball = jax.vmap(method.ball)(pair, carry)
         return _Recording(
             carry=jax.tree.map(lambda new, old: jnp.where(going, new, old), carry, r.carry),
             impacts=_write(r.impacts, impact, r.filled, real),

@@ -11,26 +11,18 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax.batch.exact_run import exact_run, exact_traced
-from vijax.batch.run_records import CHUNK, HELD, Asked, Room, Trajectory
+from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory
 from vijax.batch.stepped_run import stepped_run
-from vijax.engine.method import Method, MethodName, Rk4, SolverName, choose
+from vijax.engine.method import Method
+from vijax.engine.method_choice import MethodName, SolverName, choose
 from vijax.model.membrane import HuntCrossley, Law
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
-# An adaptive solver that takes more steps than this per impact and period is stopped.
-_STEPS = 256
 _IMPACT, _STATE = 56, 32  # bytes of a record
 # Starts fly together in calls of few sizes, so that few programs are compiled.
 _TILES = (1, 8, 64, 512, 4096)
-
-
-def _steps(method: Method | None, periods: int, max_impacts: int) -> int:
-    """Most steps of a stepping engine."""
-    if method is None:
-        return 0
-    return int(method.steps) * (periods + HELD) if isinstance(method, Rk4) else _STEPS * (periods + max_impacts)
 
 
 def _wall(pair: ImpactPair) -> str:
@@ -90,7 +82,7 @@ def trajectory(
         periods: The motion is followed to t = 2 periods.
         t0: Time of the start, in [0, 2 periods).
         max_impacts: Room for impacts; 16 a period and 16 more unless given.
-        method: "exact", "ode" or "rk4", as in `sweep`; or the record of a stepping method (`vijax.engine.method`).
+        method: "exact", "ode" or "rk4", as in `sweep`; or a `vijax.engine.method.Method`.
         solver, rtol, atol, membrane, steps: As in `sweep`. With a `HuntCrossley` membrane the pair's r is None.
 
     Returns:
@@ -120,7 +112,7 @@ def _followed(
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves((pair, starts))))
     rows = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), shape).reshape(-1), (pair, starts))
     most = _most(periods) if max_impacts is None else max_impacts
-    chunks = -(-_steps(method, periods, most) // CHUNK)
+    chunks = 0 if method is None else -(-method.most_steps(periods, most) // CHUNK)
     numbers: Any = (np.int32(number) for number in (periods, most, chunks))
     asked = Asked(*numbers)
     wide = tiles.padded(periods)
@@ -131,8 +123,7 @@ def _followed(
         work = partial(exact_traced, asked, room=room)
     else:
         method = jax.tree.map(lambda x: jnp.asarray(x, dtype), method)
-        name = "rk4" if isinstance(method, Rk4) else "ode"
-        work = partial(stepped_run, asked, method, name=name, room=room)
+        work = partial(stepped_run, asked, method, room=room)
     return tiles.map_tiles(lambda row: work(row[0], *row[1]), rows, _TILES), shape
 
 

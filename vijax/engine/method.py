@@ -1,34 +1,27 @@
-"""The methods that integrate a cell: the numbers each one is told, and the door that checks them."""
+"""What a run asks of a method that steps through time: `Method`, of which `rk4.Rk4` is the shortest example.
 
-import math
-from collections.abc import Callable, Mapping
+The exact engine is none: it has no steps.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
-import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vijax.model.membrane import HuntCrossley, Law, Linear
-from vijax.model.pair import Real
+from vijax.model.membrane import Law, Linear, Wall
+from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
-from vijax.runtime import checks
+from vijax.runtime.arrays import Flag, Scalar
 
-MethodName = Literal["exact", "ode", "rk4"]
-SolverName = Literal["Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5"]
-SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
-OPTIONS: dict[MethodName, tuple[str, ...]] = {
-    "exact": (),
-    "ode": ("solver", "rtol", "atol", "membrane"),
-    "rk4": ("steps", "membrane"),
-}
-_DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
-_STEPS = 1000
-_FEWEST_STEPS, _MOST_STEPS = 8, 10**6
-_FINEST = 8  # roundings: no error estimate is worth anything below
-
+# A method that chooses its steps and takes more of them per impact and period is stopped.
+_PER_IMPACT = 256
+# A contact that outlasts the last period of a recorded run by so many is taken to last for ever.
+HELD = 8
 
 _DECISION = "decision"
 
@@ -54,7 +47,7 @@ def _is_decision(primitive: Any, /, *_: Any, **params: Any) -> bool:
 
 
 class Passage(eqx.Module):
-    """A finished impact of a stepping engine: from the exit of the last contact to the exit of this one.
+    """A finished impact of a method that steps: from the exit of the last contact to the exit of this one.
 
     Attributes:
         impact: The impact.
@@ -69,105 +62,86 @@ class Passage(eqx.Module):
     tangent: tuple[Any, ...] | None
 
 
-class Ode(eqx.Module):
-    """An adaptive Runge-Kutta method of diffrax with located events.
+@runtime_checkable
+class Carry(Protocol):
+    """What a run reads of a method's carry, which is a record of the method's own making."""
+
+    @property
+    def n(self) -> Array:
+        """Periods completed."""
+
+    @property
+    def mode(self) -> Array:
+        """The wall that the ball is inside of, -1 or +1; 0 in flight."""
+
+    @property
+    def onset_n(self) -> Array:
+        """The period in which its last contact began."""
+
+    @property
+    def depth(self) -> Array:
+        """Its greatest depth in this contact so far."""
+
+
+C = TypeVar("C", bound=Carry)
+
+
+class Method(eqx.Module, Generic[C]):
+    """A method that steps through time: its numbers, and the three functions that a run calls.
+
+    A subclass is a method of its own: `summarise` and `trajectory` take a record of it. Its functions are written for
+    one lane, of scalars; `batch` maps them over lanes, which all step together. A step decides nothing by Python's
+    `if`, and what becomes of a motion that cannot go on is an impact of NaN.
 
     Attributes:
-        solver: One of `SOLVERS`.
-        rtol, atol: Tolerances of position and velocity, step by step.
-        law: The membrane.
-        dt: A constant step instead, for measuring orders of convergence.
+        law: The membrane; the linear one unless given.
     """
 
-    solver: str = eqx.field(static=True)
-    rtol: Real
-    atol: Real
-    law: Law
-    dt: Real | None = None
+    law: Law = eqx.field(default_factory=Linear, kw_only=True)
+
+    @abstractmethod
+    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> C:
+        """Make the carry of a start, in flight or inside a wall (then a contact without onset, which is no impact).
+
+        Args:
+            pair: One cell (scalars), soft.
+            state: Where the ball is; its mode is believed.
+            deep: Whether greatest depths and works are wanted.
+            tangent: Whether tangent maps are wanted.
+        """
+
+    @abstractmethod
+    def step(self, pair: ImpactPair, wall: Wall, carry: C, *, recorded: bool = False) -> tuple[C, Passage, Flag]:
+        """Try one step.
+
+        Args:
+            pair: One cell (scalars).
+            wall: Its membrane, (w, w') -> acceleration.
+            carry: From `start` or an earlier step.
+            recorded: For trajectories: a step ends at phase 0, and can be differentiated in reverse.
+
+        Returns:
+            The carry after it, and the impact that this step finished, meaningless unless the flag says that it did.
+        """
+
+    @abstractmethod
+    def ball(self, pair: ImpactPair, carry: C) -> State:
+        """Say where the ball of a carry is."""
 
     @property
     def arithmetic(self) -> bool:
-        """Whether a step calls no library: the implicit solvers leave their linear systems to LAPACK."""
-        return not self.solver.startswith("Kvaerno")
-
-
-class Rk4(eqx.Module):
-    """The paper's method: classical Runge-Kutta steps of constant length, no event located.
-
-    Attributes:
-        steps: Steps per forcing period.
-        law: The membrane.
-    """
-
-    steps: Real
-    law: Law
+        """Whether a step calls no library, so that it may be put into kernels (`xla.kernel`); False is never wrong."""
+        return False
 
     @property
-    def arithmetic(self) -> bool:
-        """Whether a step calls no library."""
-        return True
+    def grain(self) -> Scalar | float:
+        """How far apart two motions from one point may end: 0 unless the method chooses its steps."""
+        return 0.0
 
-
-Method = Ode | Rk4
-
-
-def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype: str = "float64") -> Method | None:
-    """The method of a name, with what it is told; None for the exact one, which is told nothing.
-
-    Args:
-        method: "exact", "ode" or "rk4".
-        options: Of solver, rtol, atol, membrane and steps those given; None counts as not given.
-        wall: "soft" or "rigid".
-        dtype: "float64" or "float32": the defaults of the tolerances, and the least that they may be.
-
-    Raises:
-        ValueError: Which argument, what must hold, what came.
-    """
-    checks.choice("method", method, OPTIONS)
-    given = {name: value for name, value in options.items() if value is not None}
-    law = given.get("membrane", Linear())
-    if not isinstance(law, Linear | HuntCrossley):
-        raise ValueError(
-            f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {checks.shown(law)}"
-        )
-    if method == "exact" and not isinstance(law, Linear):
-        raise ValueError(f'membrane must be linear for method="exact"; got {describe(law)}; use method="ode"')
-    for name in given:
-        takers = [taker for taker, taken in OPTIONS.items() if name in taken]
-        if method not in takers and name != "membrane":
-            theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
-            raise ValueError(f"{name} must be left out unless method is {theirs}; got {got}")
-    if method == "exact":
+    def taken(self, carry: C) -> Array | None:
+        """Count the steps so far; None where the clock does, as all are of one length."""
         return None
-    if wall != "soft":
-        raise ValueError(f'wall must be "soft" for method={_quoted(method)}; got {wall!r}; use method="exact"')
-    if method == "rk4":
-        return Rk4(checks.whole("steps", given.get("steps", _STEPS), _FEWEST_STEPS, _MOST_STEPS), law)
-    solver = checks.choice("solver", given.get("solver", "Tsit5"), SOLVERS)
-    rtol, atol = _DEFAULTS[dtype]
-    least = _FINEST * float(np.finfo(dtype).eps)
-    must = f"a finite number of at least {least:.1e}"
-    rtol = checks.real("rtol", given.get("rtol", rtol), must, lambda x: least <= x < math.inf)
-    atol = checks.real("atol", given.get("atol", atol), "a finite number above 0", lambda x: 0 < x < math.inf)
-    return Ode(solver, rtol, atol, law)
 
-
-def describe(law: Law) -> str:
-    """A membrane law in words: its name, as `--membrane` takes it, and its numbers."""
-    if isinstance(law, Linear):
-        return "linear"
-    return f"hunt-crossley with chi {float(law.chi):g}, exponent {float(law.exponent):g}"
-
-
-def record(method: Method | None) -> dict[str, Any]:
-    """What a method was told, by name, for the attributes of a map."""
-    if method is None:
-        return {}
-    told = {"membrane": describe(method.law)}
-    if isinstance(method, Rk4):
-        return told | {"steps": int(method.steps)}
-    return told | {"solver": method.solver, "rtol": float(method.rtol), "atol": float(method.atol)}
-
-
-def _quoted(name: str) -> str:
-    return f'"{name}"'
+    def most_steps(self, periods: int, max_impacts: int) -> int:
+        """Say after how many steps a recorded run is stopped."""
+        return _PER_IMPACT * (periods + max_impacts)

@@ -1,4 +1,4 @@
-"""The stepping engine: diffrax's Runge-Kutta steps with located events, on the same seam as the exact engine.
+"""An adaptive method: diffrax's Runge-Kutta steps with located events.
 
 One `step` of a lane is one attempt of a solver step, accepted, rejected or cut short, so that no lane waits for
 another's solve. A cell's motion is a chain of smooth spells: flight in the displacement u, contact in the penetration
@@ -19,10 +19,10 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from vijax.engine.dense_output import Dense, Point, dense_output, root
-from vijax.engine.method import Ode, Passage, decided
+from vijax.engine.method import Method, Passage, decided
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
-from vijax.model.pair import ImpactPair, MembranePair
+from vijax.model.pair import ImpactPair, MembranePair, Real
 from vijax.model.records import Impact, State
 from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
@@ -102,6 +102,128 @@ class Motion(eqx.Module):
 _CREST = 2.0  # an aim that is no wall: the deepest point of a contact
 
 
+class Ode(Method[Motion]):
+    """An adaptive Runge-Kutta method of diffrax with located events.
+
+    Attributes:
+        solver: One of `method_choice.SOLVERS`.
+        rtol, atol: Tolerances of position and velocity, step by step.
+        dt: A constant step instead, for measuring orders of convergence.
+    """
+
+    solver: str = eqx.field(static=True)
+    rtol: Real
+    atol: Real
+    dt: Real | None = None
+
+    @property
+    def arithmetic(self) -> bool:
+        """Whether a step calls no library: the implicit solvers leave their linear systems to LAPACK."""
+        return not self.solver.startswith("Kvaerno")
+
+    @property
+    def grain(self) -> Scalar | float:
+        """How far apart two motions from one point may end: steps of other lengths, each as wrong as is allowed."""
+        return self.rtol
+
+    def taken(self, m: Motion) -> Int[Array, ""]:
+        """Count the steps so far, those that were refused among them."""
+        return m.steps
+
+    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
+        """Make the carry of a start."""
+        zero, whole = jnp.zeros_like(state.u), jnp.zeros_like(state.n)
+        side = state.mode.astype(zero.dtype)
+        held = state.mode != 0
+        x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
+        if self.dt is None:
+            first, inside = zero + _FIRST_STEP, jnp.minimum(_FIRST_STEP, 0.1 / pair._soft_kappa())
+        else:
+            first = inside = zero + self.dt
+        no = jnp.zeros_like(held)
+        return Motion(
+            y=Point(
+                x,
+                jnp.where(held, side * state.v, state.v),
+                zero if deep else None,
+                (zero + 1, zero, zero, zero + 1) if tangent else None,
+            ),
+            t=state.t,
+            n=state.n,
+            mode=state.mode,
+            h=jnp.where(held, inside, first),
+            full=first,
+            other=jnp.where(held, first, inside),
+            cut=no,
+            aim=zero,
+            attempts=whole,
+            onset_t=state.t,
+            onset_n=state.n,
+            entered=no,
+            v_in=state.v,
+            depth=jnp.where(held, x, 0.0),
+            left_t=state.t,
+            left_n=state.n,
+            steps=whole,
+        )
+
+    def step(self, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False) -> tuple[Motion, Passage, Flag]:
+        """Try one step of the solver; one that vanishes beside the time, or is not finite, makes an impact of NaN."""
+        half, held = 0.5 * pair.d, m.mode != 0
+        trial = _try(self, _solver(self, recorded), m, Spell(pair.gamma, m.mode, wall), recorded)
+        landing = _land(m, half, trial)
+        sight = _look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
+        landing, sight = share((landing, sight))
+        shut = landing.onset | landing.exits
+        seen = trial.passes & sight.seen & ~shut & ~landing.crest
+        seen, moved = decided((seen, trial.passes & ~seen))
+        side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
+        y = _meet(m, half, side, wall, trial, landing)
+
+        t = trial.t + landing.delay
+        over = decided(t >= 2)
+        t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
+        n = m.n + (moved & over).astype(m.n.dtype)
+        passage = _passage(m, half, side, y, t, n, landing.speed)
+        lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
+        passage = eqx.tree_at(lambda p: p.impact.v_out, passage, jnp.where(lost, jnp.nan, passage.impact.v_out))
+
+        if y.tangent is not None:
+            unit = (1.0, 0.0, 0.0, 1.0)
+            fresh = tuple(jnp.where(landing.exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
+            y = eqx.tree_at(lambda y: y.tangent, y, fresh)
+        h, full, other = decided(_lengths(self, m, trial, sight, seen, moved, shut))
+        depth = jnp.where(landing.crest, jnp.maximum(m.depth, y.x), m.depth)
+        new = Motion(
+            y=jax.tree.map(lambda new, old: jnp.where(moved, new, old), y, m.y),
+            t=t,
+            n=n,
+            mode=jnp.where(landing.onset, side.astype(m.mode.dtype), jnp.where(landing.exits, 0, m.mode)),
+            h=h,
+            full=full,
+            other=other,
+            cut=seen,
+            aim=decided(lax.stop_gradient(jnp.where(seen, sight.aim, 0.0))),
+            attempts=jnp.where(seen, m.attempts + 1, 0),
+            onset_t=jnp.where(landing.onset, t, m.onset_t),
+            onset_n=jnp.where(landing.onset, n, m.onset_n),
+            entered=(m.entered | landing.onset) & ~landing.exits,
+            v_in=jnp.where(landing.onset, side * landing.speed, m.v_in),
+            depth=jnp.where(landing.onset, 0.0, depth),
+            left_t=jnp.where(landing.exits, t, m.left_t),
+            left_n=jnp.where(landing.exits, n, m.left_n),
+            steps=m.steps + 1,
+        )
+        return new, passage, (landing.exits & m.entered) | lost
+
+    def ball(self, pair: ImpactPair, m: Motion) -> State:
+        """Say where the ball of a carry is."""
+        side = m.mode.astype(m.y.x.dtype)
+        held = m.mode != 0
+        u = jnp.where(held, side * (0.5 * pair.d + m.y.x), m.y.x)
+        return State(u, jnp.where(held, side * m.y.z, m.y.z), m.t, m.n, m.mode)
+
+
 def _solver(engine: Ode, recorded: bool) -> Solver:
     """diffrax's solver; its loop over stages is differentiable in reverse where a run is recorded."""
     solver, kind = getattr(diffrax, engine.solver), "bounded" if recorded else "lax"
@@ -109,52 +231,6 @@ def _solver(engine: Ode, recorded: bool) -> Solver:
         tolerances: Any = (engine.rtol, engine.atol)
         return solver(scan_kind=kind, root_finder=diffrax.VeryChord(*tolerances))
     return solver(scan_kind=kind)
-
-
-def start(engine: Ode, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
-    """The carry of a start, in flight or inside a wall (then a contact without onset, which ends in no impact).
-
-    Args:
-        engine: The method's numbers.
-        pair: One cell (scalars), soft.
-        state: Where the ball is; its mode is believed.
-        deep: Whether greatest depths and works are wanted.
-        tangent: Whether tangent maps are wanted.
-    """
-    zero, whole = jnp.zeros_like(state.u), jnp.zeros_like(state.n)
-    side = state.mode.astype(zero.dtype)
-    held = state.mode != 0
-    x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
-    if engine.dt is None:
-        first, inside = zero + _FIRST_STEP, jnp.minimum(_FIRST_STEP, 0.1 / pair._soft_kappa())
-    else:
-        first = inside = zero + engine.dt
-    no = jnp.zeros_like(held)
-    return Motion(
-        y=Point(
-            x,
-            jnp.where(held, side * state.v, state.v),
-            zero if deep else None,
-            (zero + 1, zero, zero, zero + 1) if tangent else None,
-        ),
-        t=state.t,
-        n=state.n,
-        mode=state.mode,
-        h=jnp.where(held, inside, first),
-        full=first,
-        other=jnp.where(held, first, inside),
-        cut=no,
-        aim=zero,
-        attempts=whole,
-        onset_t=state.t,
-        onset_n=state.n,
-        entered=no,
-        v_in=state.v,
-        depth=jnp.where(held, x, 0.0),
-        left_t=state.t,
-        left_n=state.n,
-        steps=whole,
-    )
 
 
 def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: Point, y1: Point, error: Point):
@@ -297,70 +373,6 @@ def _meet(m: Motion, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, land
     return Point(x, z, None if y.work is None else jnp.where(onset, 0.0, y.work), tangent)
 
 
-def step(
-    engine: Ode, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
-) -> tuple[Motion, Passage, Flag]:
-    """Try one step of the solver.
-
-    Args:
-        engine: The method's numbers.
-        pair: One cell (scalars).
-        wall: Its membrane, (w, w') -> acceleration.
-        m: The carry, from `start` or an earlier step.
-        recorded: For trajectories: a step ends at phase 0, and can be differentiated in reverse.
-
-    Returns:
-        The carry after it, and the impact that this step finished, meaningless unless the flag says that it did. A
-        step that vanishes beside the time, or is not finite, makes an impact of NaN.
-    """
-    half, held = 0.5 * pair.d, m.mode != 0
-    trial = _try(engine, _solver(engine, recorded), m, Spell(pair.gamma, m.mode, wall), recorded)
-    landing = _land(m, half, trial)
-    sight = _look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
-    landing, sight = share((landing, sight))
-    shut = landing.onset | landing.exits
-    seen = trial.passes & sight.seen & ~shut & ~landing.crest
-    seen, moved = decided((seen, trial.passes & ~seen))
-    side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
-    y = _meet(m, half, side, wall, trial, landing)
-
-    t = trial.t + landing.delay
-    over = decided(t >= 2)
-    t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
-    n = m.n + (moved & over).astype(m.n.dtype)
-    passage = _passage(m, half, side, y, t, n, landing.speed)
-    lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
-    passage = eqx.tree_at(lambda p: p.impact.v_out, passage, jnp.where(lost, jnp.nan, passage.impact.v_out))
-
-    if y.tangent is not None:
-        unit = (1.0, 0.0, 0.0, 1.0)
-        fresh = tuple(jnp.where(landing.exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
-        y = eqx.tree_at(lambda y: y.tangent, y, fresh)
-    h, full, other = decided(_lengths(engine, m, trial, sight, seen, moved, shut))
-    depth = jnp.where(landing.crest, jnp.maximum(m.depth, y.x), m.depth)
-    new = Motion(
-        y=jax.tree.map(lambda new, old: jnp.where(moved, new, old), y, m.y),
-        t=t,
-        n=n,
-        mode=jnp.where(landing.onset, side.astype(m.mode.dtype), jnp.where(landing.exits, 0, m.mode)),
-        h=h,
-        full=full,
-        other=other,
-        cut=seen,
-        aim=decided(lax.stop_gradient(jnp.where(seen, sight.aim, 0.0))),
-        attempts=jnp.where(seen, m.attempts + 1, 0),
-        onset_t=jnp.where(landing.onset, t, m.onset_t),
-        onset_n=jnp.where(landing.onset, n, m.onset_n),
-        entered=(m.entered | landing.onset) & ~landing.exits,
-        v_in=jnp.where(landing.onset, side * landing.speed, m.v_in),
-        depth=jnp.where(landing.onset, 0.0, depth),
-        left_t=jnp.where(landing.exits, t, m.left_t),
-        left_n=jnp.where(landing.exits, n, m.left_n),
-        steps=m.steps + 1,
-    )
-    return new, passage, (landing.exits & m.entered) | lost
-
-
 def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, moved: Flag, shut: Flag):
     """Length of the next step, the one to go on with after a cut one, and the one for after the next change of mode.
 
@@ -388,11 +400,3 @@ def _passage(m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[
     )
     flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
     return Passage(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), y.tangent)
-
-
-def ball(pair: ImpactPair, method: Ode, m: Motion) -> State:
-    """Where the ball of a carry is."""
-    side = m.mode.astype(m.y.x.dtype)
-    held = m.mode != 0
-    u = jnp.where(held, side * (0.5 * pair.d + m.y.x), m.y.x)
-    return State(u, jnp.where(held, side * m.y.z, m.y.z), m.t, m.n, m.mode)

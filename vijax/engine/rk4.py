@@ -12,15 +12,18 @@ For replaying published diagrams, and as the peer that other methods are measure
 Source: the scheme behind the paper's figures, Eq. (38).
 """
 
+from dataclasses import replace
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vijax.engine.method import Passage, Rk4, decided
+from vijax.engine.method import HELD, Method, Passage, decided
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
-from vijax.model.pair import ImpactPair
+from vijax.model.pair import ImpactPair, Real
 from vijax.model.records import Impact, State
 from vijax.runtime.arrays import Scalar
 from vijax.runtime.xla import share
@@ -48,39 +51,104 @@ class Motion(eqx.Module):
     tangent: tuple[Scalar, ...] | None  # row by row
 
 
-def start(method: Rk4, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
-    """The carry of a start; its phase is sample 0 if it lies on none of the grid of steps.
+class Rk4(Method[Motion]):
+    """The paper's method: classical Runge-Kutta steps of constant length, no event located.
 
-    Args:
-        method: The method's numbers.
-        pair: One cell (scalars), soft.
-        state: Where the ball is.
-        deep: Taken for the seam's sake: depth and work cost nothing here.
-        tangent: Whether tangent maps are wanted: those of the numerical scheme, which has no saltation.
+    Attributes:
+        steps: Steps per forcing period.
     """
-    zero = jnp.zeros_like(state.u)
-    h = 2 / method.steps
-    k = jnp.floor(state.t / h + _ON_GRID)
-    return Motion(
-        u=state.u,
-        v=state.v,
-        k=k,
-        offset=state.t - k * h,
-        n=state.n,
-        mode=state.mode,
-        onset_t=state.t,
-        onset_n=state.n,
-        entered=jnp.zeros_like(state.mode, bool),
-        v_in=state.v,
-        depth=jnp.maximum(jnp.abs(state.u) - 0.5 * pair.d, 0.0),
-        work=zero,
-        left_t=state.t,
-        left_n=state.n,
-        tangent=(zero + 1, zero, zero, zero + 1) if tangent else None,
-    )
+
+    steps: Real
+
+    @property
+    def arithmetic(self) -> bool:
+        """Whether a step calls no library: it does not."""
+        return True
+
+    def most_steps(self, periods: int, max_impacts: int) -> int:
+        """Say how many steps a recorded run takes."""
+        return int(self.steps) * (periods + HELD)
+
+    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
+        """Make the carry of a start; its phase is sample 0 if it lies on none of the grid of steps.
+
+        Depth and work cost nothing here. Tangent maps are those of the numerical scheme, which has no saltation.
+        """
+        zero = jnp.zeros_like(state.u)
+        h = 2 / self.steps
+        k = jnp.floor(state.t / h + _ON_GRID)
+        return Motion(
+            u=state.u,
+            v=state.v,
+            k=k,
+            offset=state.t - k * h,
+            n=state.n,
+            mode=state.mode,
+            onset_t=state.t,
+            onset_n=state.n,
+            entered=jnp.zeros_like(state.mode, bool),
+            v_in=state.v,
+            depth=jnp.maximum(jnp.abs(state.u) - 0.5 * pair.d, 0.0),
+            work=zero,
+            left_t=state.t,
+            left_n=state.n,
+            tangent=(zero + 1, zero, zero, zero + 1) if tangent else None,
+        )
+
+    def step(
+        self, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
+    ) -> tuple[Motion, Passage, Bool[Array, ""]]:
+        """Take one step, and see what its sample shows; one at phase 0 and derivatives in reverse cost nothing."""
+        h = 2 / self.steps
+        new = _moved(self.steps, pair, wall, m)
+        w = jnp.abs(new.u) - 0.5 * pair.d
+        mode = decided(jnp.where(w >= 0, jnp.where(new.u < 0, -1, 1), 0).astype(m.mode.dtype))
+        leaves, onset = (m.mode != 0) & (mode != m.mode), (mode != 0) & (mode != m.mode)
+        power = _power(pair, wall, m.u, m.v) + _power(pair, wall, new.u, new.v)
+        work = jnp.where(onset, 0.0, m.work + 0.5 * h * power)
+        t = m.offset + new.k * h
+        passage = _passage(replace(new, mode=mode, work=work), m.mode, t)
+        tangent = new.tangent
+        if tangent is not None:
+            unit = (1.0, 0.0, 0.0, 1.0)
+            tangent = tuple(jnp.where(leaves, one, value) for one, value in zip(unit, tangent, strict=True))
+        new = replace(
+            new,
+            mode=mode,
+            onset_t=jnp.where(onset, t, m.onset_t),
+            onset_n=jnp.where(onset, new.n, m.onset_n),
+            entered=onset | (m.entered & ~leaves),
+            v_in=jnp.where(onset, new.v, m.v_in),
+            depth=jnp.where(onset, w, jnp.where(leaves, 0.0, jnp.maximum(m.depth, w))),
+            work=work,
+            left_t=jnp.where(leaves, t, m.left_t),
+            left_n=jnp.where(leaves, new.n, m.left_n),
+            tangent=tangent,
+        )
+        return new, passage, leaves & m.entered
+
+    def ball(self, pair: ImpactPair, m: Motion) -> State:
+        """Say where the last sample is."""
+        return State(m.u, m.v, m.offset + m.k * (2 / self.steps), m.n, m.mode)
 
 
-def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Scalar, u: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
+def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Motion) -> Motion:
+    """The next sample and the tangent map up to it; what the contact has seen is still that of the last one."""
+    h = 2 / steps
+    move = partial(_runge_kutta, pair, wall, m.offset + m.k * h, h)
+    u, v = share(move(m.u, m.v))
+    tangent = None
+    if m.tangent is not None:
+        a, b, c, d = m.tangent
+        (_, (p, q)), (_, (r, s)) = (jax.jvp(move, (m.u, m.v), column) for column in ((a, c), (b, d)))
+        tangent = (p, r, q, s)
+    k = m.k + 1
+    over = k >= steps
+    k, n = jnp.where(over, 0.0, k), m.n + over.astype(m.n.dtype)
+    return replace(m, u=u, v=v, k=k, n=n, tangent=tangent)
+
+
+def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Real, u: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
     """One classical step; every stage is in contact if it lies beyond the wall."""
 
     def push(forcing, u, v):
@@ -97,84 +165,24 @@ def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Scalar, u: Scalar, 
     return u + h / 6 * (u1 + 2 * (u2 + u3) + u4), v + h / 6 * (v1 + 2 * (v2 + v3) + v4)
 
 
-def step(
-    method: Rk4, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
-) -> tuple[Motion, Passage, Bool[Array, ""]]:
-    """One step, and what its sample shows.
+def _power(pair: ImpactPair, wall: Wall, u: Scalar, v: Scalar) -> Scalar:
+    """Power into the membrane at a sample inside; 0 at one outside."""
+    along = jnp.where(u < 0, -v, v)
+    depth = jnp.abs(u) - 0.5 * pair.d
+    return jnp.where(depth >= 0, -wall(depth, along) * along, 0.0)
 
-    Args:
-        method: The method's numbers.
-        pair: One cell (scalars).
-        wall: Its membrane, (w, w') -> acceleration.
-        m: The carry.
-        recorded: Taken for the seam's sake: a sample at phase 0 and derivatives in reverse cost nothing here.
 
-    Returns:
-        The carry after it, and the impact that this sample ended, meaningless unless the flag says that it did.
-    """
-    h = 2 / method.steps
-    t = m.offset + m.k * h
-
-    def move(u, v):
-        return _runge_kutta(pair, wall, t, h, u, v)
-
-    u, v = share(move(m.u, m.v))
-    mapped = None
-    if m.tangent is not None:
-        a, b, c, d = m.tangent
-        (_, (p, q)), (_, (r, s)) = (jax.jvp(move, (m.u, m.v), column) for column in ((a, c), (b, d)))
-        mapped = (p, r, q, s)
-    k = m.k + 1
-    over = k >= method.steps
-    k, n = jnp.where(over, 0.0, k), m.n + over.astype(m.n.dtype)
-    t = m.offset + k * h
-    w = jnp.abs(u) - 0.5 * pair.d
-    mode = decided(jnp.where(w >= 0, jnp.where(u < 0, -1, 1), 0).astype(m.mode.dtype))
-    leaves, onset = (m.mode != 0) & (mode != m.mode), (mode != 0) & (mode != m.mode)
-    ends = leaves & m.entered
-
-    def given(u, v):  # power into the membrane at a sample inside
-        along = jnp.where(u < 0, -v, v)
-        depth = jnp.abs(u) - 0.5 * pair.d
-        return jnp.where(depth >= 0, -wall(depth, along) * along, 0.0)
-
-    work = jnp.where(onset, 0.0, m.work + 0.5 * h * (given(m.u, m.v) + given(u, v)))
+def _passage(m: Motion, side: Int[Array, ""], t: Scalar) -> Passage:
+    """The impact on a wall that ends with this sample, the first one outside, at a time t."""
     impact = Impact(
         n=m.onset_n,
         t=m.onset_t,
-        side=m.mode,
+        side=side,
         v_in=m.v_in,
-        v_out=v,
+        v_out=m.v,
         depth=m.depth,
-        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
-        work=work,
+        duration=(t - m.onset_t) + 2 * (m.n - m.onset_n).astype(t.dtype),
+        work=m.work,
     )
     flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
-    passage = Passage(impact, flight, State(u, v, t, n, mode), mapped)
-    tangent = None
-    if mapped is not None:
-        unit = (1.0, 0.0, 0.0, 1.0)
-        tangent = tuple(jnp.where(leaves, one, value) for one, value in zip(unit, mapped, strict=True))
-    new = Motion(
-        u=u,
-        v=v,
-        k=k,
-        offset=m.offset,
-        n=n,
-        mode=mode,
-        onset_t=jnp.where(onset, t, m.onset_t),
-        onset_n=jnp.where(onset, n, m.onset_n),
-        entered=onset | (m.entered & ~leaves),
-        v_in=jnp.where(onset, v, m.v_in),
-        depth=jnp.where(onset, w, jnp.where(leaves, 0.0, jnp.maximum(m.depth, w))),
-        work=work,
-        left_t=jnp.where(leaves, t, m.left_t),
-        left_n=jnp.where(leaves, n, m.left_n),
-        tangent=tangent,
-    )
-    return new, passage, ends
-
-
-def ball(pair: ImpactPair, method: Rk4, m: Motion) -> State:
-    """The last sample of a carry."""
-    return State(m.u, m.v, m.offset + m.k * (2 / method.steps), m.n, m.mode)
+    return Passage(impact, flight, State(m.u, m.v, t, m.n, m.mode), m.tangent)

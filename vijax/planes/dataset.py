@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vijax.batch import simulate
-from vijax.engine.method import Method, record
+from vijax.engine.method import Method
+from vijax.engine.method_choice import record
 from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.quantities import AXES
 from vijax.model.records import Status

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import numpy as np
 
-from vijax.engine import method as methods
-from vijax.engine.method import MethodName, SolverName
+from vijax.engine import method_choice as methods
+from vijax.engine.method_choice import MethodName, SolverName
 from vijax.model.device import Harvester, one_device
 from vijax.model.membrane import HuntCrossley, Law
 from vijax.model.pair import WALLS, Walls

@@ -5,7 +5,7 @@ and stand for their own shapes where a layout is asked for. `Float[AnyArray, ...
 jaxtyping that nothing but JAX comes there; both are checked when tests run.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import numpy as np
@@ -23,3 +23,14 @@ Lane = Float[AnyArray, "lane"]
 Mask = Bool[AnyArray, "lane"]
 Values = Float[AnyArray, "..."]
 Flags = Bool[AnyArray, "..."]
+
+T = TypeVar("T")
+
+
+def present(value: T | None) -> T:
+    """Return a field that is None in programs that do not need it, where a program is made that does.
+
+    Which one it is, is a static choice made elsewhere, which a type checker cannot follow.
+    """
+    assert value is not None
+    return value

@@ -1,0 +1,85 @@
+"""One step of every lane by a method that steps through time, and what is made of the impacts that it finishes."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from vijax.batch.advance import QUIET, neutral
+from vijax.batch.attractor_search import review
+from vijax.batch.cell import Cell, Course, Event, Lane, Plan, Settings, last_period
+from vijax.batch.lanes import choose
+from vijax.batch.tally import add_event
+from vijax.engine.impact import Ball, Hit
+from vijax.engine.method import Method
+from vijax.model.pair import ImpactPair
+from vijax.model.records import State, Status
+from vijax.runtime.arrays import present
+from vijax.runtime.xla import share
+
+_STEPS = 20_000  # steps per period before a cell is stopped, where the method chooses them
+
+
+def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane) -> Course:
+    """Lanes at the start of a run or of a round."""
+    whole = ball.n.astype(jnp.int32)
+    state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
+    carry = jax.vmap(partial(method.start, deep=plan.deep, tangent=plan.tangent))(pair, state)
+    wall = jax.vmap(method.law.wall)(pair)
+    _, passage, _ = jax.eval_shape(jax.vmap(method.step), pair, wall, carry)
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), passage)
+    return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
+
+
+def step(method: Method, cell: Cell) -> Cell:
+    """One step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
+    old = present(cell.course)
+    carry, passage, finished = share(jax.vmap(method.step)(cell.pair, old.wall, old.carry))
+    blocked = old.waits & finished
+    new = Course(
+        old.wall,
+        choose(blocked, old.carry, carry),
+        old.waits | finished,
+        choose(finished & ~blocked, passage, old.passage),
+    )
+    return replace(cell, course=new)
+
+
+def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> Cell:
+    """Add the impacts that wait, end flights and contacts that outlast the run, and review what has stopped."""
+    course = present(cell.course)
+    carry, passage = course.carry, course.passage
+    impact, after = passage.impact, passage.after
+    waits = course.waits & cell.running
+    # A round of a candidate orbit may begin close to the end and go on beyond it.
+    end = last_period(plan, settings, cell.since)
+    late = carry.n.astype(cell.count.dtype) - jnp.maximum(end, cell.ball.n)
+    idle = cell.running & ~course.waits
+    out = idle & (carry.mode == 0) & (late >= (QUIET if cell.candidate is not None else 0))
+    quiet = out & neutral(cell.pair, cell.ball)
+    permanent = idle & (carry.mode != 0) & (late >= QUIET)
+    hit = Hit(
+        onset_t=impact.t,
+        onset_n=jnp.where(out, jnp.inf, impact.n.astype(impact.t.dtype)),
+        side=impact.side.astype(impact.t.dtype),
+        v_in=impact.v_in,
+        v_out=impact.v_out,
+        flight=passage.flight,
+        duration=impact.duration,
+        after=Ball(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
+        depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
+        work=impact.work if plan.deep else None,
+        tangent=passage.tangent,
+    )
+    cell = add_event(plan, settings, cell, Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
+    taken = method.taken(carry)
+    if taken is not None:
+        spent = cell.running & (taken.astype(cell.count.dtype) > _STEPS * (end + 1))
+        status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
+        cell = replace(cell, running=cell.running & ~spent, status=status)
+    stopped = ~cell.running
+    cell = review(plan, settings, cell)
+    again = set_off(method, plan, cell.pair, cell.ball, jnp.zeros_like(cell.count))
+    course = replace(course, waits=jnp.zeros_like(waits))
+    return replace(cell, course=choose(stopped & cell.running, again, course))

@@ -1,0 +1,91 @@
+"""The door of the methods: which there are by name, what each is told, and how a map says so."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from vijax.engine.method import Method
+from vijax.model.membrane import HuntCrossley, Law, Linear
+from vijax.runtime import checks
+
+MethodName = Literal["exact", "ode", "rk4"]
+SolverName = Literal["Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5"]
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+OPTIONS: dict[MethodName, tuple[str, ...]] = {
+    "exact": (),
+    "ode": ("solver", "rtol", "atol", "membrane"),
+    "rk4": ("steps", "membrane"),
+}
+_DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
+_STEPS = 1000
+_FEWEST_STEPS, _MOST_STEPS = 8, 10**6
+_FINEST = 8  # roundings: no error estimate is worth anything below
+
+
+def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype: str = "float64") -> Method | None:
+    """The method of a name, with what it is told; None for the exact one, which is told nothing.
+
+    Args:
+        method: "exact", "ode" or "rk4".
+        options: Of solver, rtol, atol, membrane and steps those given; None counts as not given.
+        wall: "soft" or "rigid".
+        dtype: "float64" or "float32": the defaults of the tolerances, and the least that they may be.
+
+    Raises:
+        ValueError: Which argument, what must hold, what came.
+    """
+    checks.choice("method", method, OPTIONS)
+    given = {name: value for name, value in options.items() if value is not None}
+    law = given.get("membrane", Linear())
+    if not isinstance(law, Linear | HuntCrossley):
+        raise ValueError(
+            f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {checks.shown(law)}"
+        )
+    if method == "exact" and not isinstance(law, Linear):
+        raise ValueError(f'membrane must be linear for method="exact"; got {describe(law)}; use method="ode"')
+    for name in given:
+        takers = [taker for taker, taken in OPTIONS.items() if name in taken]
+        if method not in takers and name != "membrane":
+            theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
+            raise ValueError(f"{name} must be left out unless method is {theirs}; got {got}")
+    if method == "exact":
+        return None
+    if wall != "soft":
+        raise ValueError(f'wall must be "soft" for method={_quoted(method)}; got {wall!r}; use method="exact"')
+    # An engine is loaded when it is first asked for: diffrax takes a second.
+    if method == "rk4":
+        from vijax.engine.rk4 import Rk4
+
+        return Rk4(checks.whole("steps", given.get("steps", _STEPS), _FEWEST_STEPS, _MOST_STEPS), law=law)
+    solver = checks.choice("solver", given.get("solver", "Tsit5"), SOLVERS)
+    rtol, atol = _DEFAULTS[dtype]
+    least = _FINEST * float(np.finfo(dtype).eps)
+    must = f"a finite number of at least {least:.1e}"
+    rtol = checks.real("rtol", given.get("rtol", rtol), must, lambda x: least <= x < math.inf)
+    atol = checks.real("atol", given.get("atol", atol), "a finite number above 0", lambda x: 0 < x < math.inf)
+    from vijax.engine.ode import Ode
+
+    return Ode(solver, rtol, atol, law=law)
+
+
+def describe(law: Law) -> str:
+    """A membrane law in words: its name, as `--membrane` takes it, and its numbers."""
+    if isinstance(law, Linear):
+        return "linear"
+    return f"hunt-crossley with chi {float(law.chi):g}, exponent {float(law.exponent):g}"
+
+
+def record(method: Method | None) -> dict[str, Any]:
+    """What a method was told, by name, for the attributes of a map."""
+    if method is None:
+        return {}
+    told = {field.name: getattr(method, field.name) for field in dataclasses.fields(method) if field.name != "law"}
+    numbers = {name: np.asarray(value).item() for name, value in told.items() if value is not None}
+    return {"membrane": describe(method.law)} | numbers
+
+
+def _quoted(name: str) -> str:
+    return f'"{name}"'
