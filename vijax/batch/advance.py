@@ -24,7 +24,7 @@ def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """One impact of every lane: by the quick step on level cells, by certified sampling with gravity."""
     pair, ball = cell.pair, cell.ball
     arrival = None
-    if plan.level:
+    if cell.wall is not None:
         hit, arrival, sure, never = quick.quick_step(cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
     else:
         hit, sure = sampled.sampled_step(pair, ball, deep=plan.deep, tangent=plan.tangent)

@@ -13,6 +13,7 @@ from vijax.batch.lanes import choose
 from vijax.engine.impact import Ball, Hit
 from vijax.model import flow
 from vijax.model.records import Status
+from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
 
 MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
@@ -129,7 +130,7 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     cell = _begin_round(plan, cell, newton, start | again, start)
     cell = _back_to_search(plan, cell, bad, 10 * least)
     done = cell.done | (stopped & ~start & ~again & ~bad)
-    return replace(cell, done=done, multiplier=jnp.where(good, newton.largest, cell.multiplier))
+    return replace(cell, done=done, multiplier=jnp.where(good, newton.largest, present(cell.multiplier)))
 
 
 class _Newton(NamedTuple):
@@ -151,9 +152,9 @@ class _Newton(NamedTuple):
 
 def _newton(cell: Cell) -> _Newton:
     """Newton's correction of the round's start, by the tangent map of the round."""
-    c = cell.candidate
-    grown = jnp.exp(cell.exponent * jnp.log(TANGENT_SCALE))
-    m = jnp.stack([jnp.stack(cell.tangent[:2], -1), jnp.stack(cell.tangent[2:], -1)], -2) * grown[:, None, None]
+    c, tangent = present(cell.candidate), present(cell.tangent)
+    grown = jnp.exp(present(cell.exponent) * jnp.log(TANGENT_SCALE))
+    m = jnp.stack([jnp.stack(tangent[:2], -1), jnp.stack(tangent[2:], -1)], -2) * grown[:, None, None]
     # The round ended at an exit; fly on (or back) to the phase at which it began.
     rest = 2 * (c.base.n + c.period - cell.ball.n) + (c.base.t - cell.ball.t)
     rise, v = jax.vmap(flow.flight)(cell.pair.gamma, cell.ball.t, cell.ball.v, rest)
@@ -176,7 +177,7 @@ def _newton(cell: Cell) -> _Newton:
 
 def _begin_round(plan: Plan, cell: Cell, newton: _Newton, begin: Mask, first: Mask) -> Cell:
     """Set lanes off on a round: from where they are, or from the last round's start, corrected."""
-    c, size = cell.candidate, newton.size
+    c, size = present(cell.candidate), newton.size
     corrected = Ball(c.base.u + newton.u, c.base.v + newton.v, c.base.t, c.base.n)
     base = choose(begin, choose(first, cell.ball, corrected), c.base)
     one, zero = jnp.ones_like(size), jnp.zeros_like(size)
@@ -211,7 +212,7 @@ def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] |
     What recurs to rounding and is none will not become one: the search is over, or it would hold the cell for
     thousands of periods, each failed round beginning its window anew.
     """
-    c = cell.candidate
+    c = present(cell.candidate)
     zero = jnp.zeros_like(cell.since)
     ball = choose(bad, c.origin, cell.ball)
     rounding = jnp.finfo(zero.dtype).eps

@@ -18,7 +18,7 @@ from vijax.engine.method import Method, Passage
 from vijax.engine.quick_contact import Wall
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.runtime.arrays import Lane, Mask, Values
+from vijax.runtime.arrays import AnyArray, Lane, Mask, Values
 
 TRANSIENT_SHARE = 0.25  # a cell without an orbit leaves this share of its periods out of its averages
 BATCHES = 24  # batch means behind a standard error
@@ -82,6 +82,15 @@ class Entry(eqx.Module):
     t: Values | None
 
 
+class Harvest(eqx.Module):
+    """What the variants of a cell have harvested."""
+
+    batch: Float[AnyArray, "lane variant"]  # in the running batch so far
+    past: Float[AnyArray, "lane variant"]  # in all full batches
+    square: Float[AnyArray, "lane variant"]  # the squares of what each full batch has given, added up
+    ratio: Float[AnyArray, "lane variant"]  # largest of harvested energy over what an impact gave
+
+
 class Tally(eqx.Module):
     """Sums over the impacts of a window or of one round of a candidate orbit."""
 
@@ -93,10 +102,7 @@ class Tally(eqx.Module):
     fastest: Lane
     momentum: Lane | None  # sum of v_in, signed
     deepest: Lane | None
-    energy: Float[Array, "lane variant"] | None  # what the running batch has harvested so far
-    energy_past: Float[Array, "lane variant"] | None  # what all full batches have harvested
-    energy_square: Float[Array, "lane variant"] | None  # the squares of what each full batch has harvested, added up
-    ratio: Float[Array, "lane variant"] | None
+    harvest: Harvest | None
     stuck: Mask | None
 
 
@@ -181,11 +187,12 @@ class Event(eqx.Module):
 def blank_tally(plan: Plan, like: Lane) -> Tally:
     """Sums of nothing yet."""
     zero = jnp.zeros_like(like)
-    wide = jnp.zeros((*like.shape, plan.variants), like.dtype) if plan.energies else None
+    wide = jnp.zeros((*like.shape, plan.variants), like.dtype)
+    harvest = Harvest(wide, wide, wide, wide) if plan.energies else None
     stuck = jnp.zeros(like.shape, bool) if plan.rigid else None
     deepest = zero if plan.deep else None
     momentum = zero if plan.asymmetry else None
-    return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, wide, wide, wide, wide, stuck)
+    return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, harvest, stuck)
 
 
 def last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:

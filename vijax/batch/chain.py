@@ -15,6 +15,7 @@ from vijax.engine.impact import Ball, Hit
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
+from vijax.runtime.arrays import present
 
 _START_REACH = 0.49  # a start outside a rigid gap is put at this part of it
 
@@ -46,8 +47,9 @@ def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Rel
     old = cell.relay
     if old is None:
         return None
-    tracing, period = cell.candidate.tracing, jnp.maximum(cell.candidate.period, 1.0)
-    early = kept & ~tracing & (hit.after.n < end - settings.keep)
+    candidate, keep = present(cell.candidate), present(settings.keep)
+    tracing, period = candidate.tracing, jnp.maximum(candidate.period, 1.0)
+    early = kept & ~tracing & (hit.after.n < end - keep)
     ahead = _ahead(hit.onset_n, end, period)
     onset = hit.onset_n + ahead + 0.5 * hit.onset_t
     later = kept & tracing & (onset > old.latest)
@@ -79,7 +81,7 @@ def depart(cell: Cell, begins: Mask) -> Relay | None:
 
 def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end: Lane) -> Handover:
     """What is handed on of cells that are done; of one that failed, its start."""
-    old, pair = cell.relay, cell.pair
+    old, pair = present(cell.relay), cell.pair
     quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
     last = choose(periodic, old.last, cell.ball)
     aloft = last.n < end
@@ -87,8 +89,8 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     rise, v = jax.vmap(flow.flight)(pair.gamma, last.t, last.v, left)
     ball = Ball(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
     ball = choose(permanent, _resting(pair, end), ball)
-    first = end - settings.keep
-    mark = choose(periodic, _moved(last, _ahead(last.n, first, cell.candidate.period)), old.mark)
+    first = end - present(settings.keep)
+    mark = choose(periodic, _moved(last, _ahead(last.n, first, present(cell.candidate).period)), old.mark)
     mark = choose(quiet | permanent, Ball(ball.u, ball.v, ball.t, first), mark)
     held = jnp.where(permanent, jnp.sign(ball.u), jnp.where(periodic | quiet, 0.0, old.held))
     ball = choose(failed, old.start, ball)
@@ -98,7 +100,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
 def _resting(pair: ImpactPair, end: Lane) -> Ball:
     """A ball that never leaves the wall on which it lies, at phase 0, when all but its steady motion has decayed."""
     side, zero = -jnp.sign(pair.gamma), jnp.zeros_like(end)
-    if pair.kappa is None:
+    if pair.rigid:
         return Ball(0.5 * side * pair.d, zero, zero, end)
 
     def steady(pair, side):
@@ -109,6 +111,6 @@ def _resting(pair: ImpactPair, end: Lane) -> Ball:
     return Ball(side * (0.5 * pair.d + w), side * z, zero, end)
 
 
-def within(kappa: Lane | float | None, d: Lane, u: Lane) -> Lane:
+def within(pair: ImpactPair, u: Lane) -> Lane:
     """Displacement of a start; one that the gap of a rigid wall does not hold is put back into it."""
-    return jnp.clip(u, -_START_REACH * d, _START_REACH * d) if kappa is None else u
+    return jnp.clip(u, -_START_REACH * pair.d, _START_REACH * pair.d) if pair.rigid else u

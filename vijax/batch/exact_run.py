@@ -36,7 +36,7 @@ def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[AnyA
     held = start.mode != 0
     side = jnp.where(held, start.mode, out.impact.side).astype(rise.dtype)
     inside = jnp.where(aloft, 0.0, when - out.flight)
-    if pair.kappa is None:
+    if pair.rigid:
         # Only sticking lasts: at rest on the wall.
         w, z = jnp.zeros_like(rise), jnp.zeros_like(rise)
     else:

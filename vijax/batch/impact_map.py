@@ -89,7 +89,7 @@ def next_impacts(
         t: Phase, in [0, 2).
         level: Whether gamma is 0 everywhere.
     """
-    plan = Plan(until="window", rigid=pair.kappa is None, level=level, deep=True, tangent=False)
+    plan = Plan(until="window", rigid=pair.rigid, level=level, deep=True, tangent=False)
     pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
     zero: Any = np.zeros_like(t)
     ball = Ball(0.5 * side * pair.d, -side * speed, t, zero)

@@ -21,7 +21,7 @@ from vijax.model.device import Harvester, check_device
 from vijax.model.membrane import HuntCrossley
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.runtime import checks, export_cache
-from vijax.runtime.arrays import AnyArray
+from vijax.runtime.arrays import AnyArray, present
 from vijax.runtime.context import door
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(Summary))
@@ -148,7 +148,8 @@ def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, 
         raise ValueError(f"method must be a vijax.engine.method.Method, or None; got {checks.shown(method)}")
     # Whoever carries cells of a Hunt-Crossley membrane has NaN for r.
     lossy = method is None or not isinstance(method.law, HuntCrossley)
-    checks.known("pair", check_pair(pair if lossy else dataclasses.replace(pair, r=None)))
+    nothing: Any = None
+    checks.known("pair", check_pair(pair if lossy else dataclasses.replace(pair, r=nothing)))
     check_device(device)
     checks.instance("scale", scale, Scale, "vijax.batch.simulate.Scale(...)")
     cells = np.shape(pair.d)
@@ -206,7 +207,7 @@ def summarise(
     dtype = pair.d.dtype
     plan = Plan(
         until=until,
-        rigid=pair.kappa is None,
+        rigid=pair.rigid,
         level=bool((np.asarray(pair.gamma) == 0).all()),
         deep=bool(outputs & DEEP),
         energies=bool(outputs & ENERGY),
@@ -274,7 +275,7 @@ def attractors(
 def _chained(pair: ImpactPair) -> Plan:
     """The plan of cells whose ends are wanted."""
     level = bool((np.asarray(pair.gamma) == 0).all())
-    return Plan(rigid=pair.kappa is None, level=level, deep=True, energies=True, chained=True)
+    return Plan(rigid=pair.rigid, level=level, deep=True, energies=True, chained=True)
 
 
 def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, keep: int) -> Settings:
@@ -310,14 +311,14 @@ def _succeed(
     plan: Plan, settings: Settings, cell: Cell, table: Float[AnyArray, "lane in"]
 ) -> Float[AnyArray, "lane in"]:
     """Rows of the next cells, with the start that the last ones hand on in the place of their growth."""
-    end = unload(plan, settings, cell).handover
+    end = present(unload(plan, settings, cell).handover)
     return _start(plan, table, end.u, end.v, end.t)
 
 
 def _start(plan: Plan, table: Float[AnyArray, "lane in"], u: Lane, v: Lane, t: Lane) -> Float[AnyArray, "lane in"]:
     """Rows that hold a growth, with the start that it makes of a state."""
     entry = rows.unpack(table, entry_shapes(plan, table.dtype))
-    u = chain.within(entry.pair.kappa, entry.pair.d, u * entry.u)
+    u = chain.within(entry.pair, u * entry.u)
     return rows.pack(dataclasses.replace(entry, u=u, v=v * entry.v, t=t))
 
 

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from vijax.batch.cell import TANGENT_SCALE, Cell, Lane, Mask, Plan, Settings, batch_length, last_period
+from vijax.batch.cell import TANGENT_SCALE, Cell, Harvest, Lane, Mask, Plan, Settings, batch_length, last_period
 from vijax.batch.chain import Handover, hand_over
 from vijax.engine.impact import Ball
 from vijax.model.records import Status
-from vijax.runtime.arrays import AnyArray
+from vijax.runtime.arrays import AnyArray, Values, present
 
 _CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
 
@@ -50,41 +50,57 @@ def shapes(plan: Plan, dtype: Any) -> Any:
     kinds |= {"handover": Handover(number, number, number, Ball(*[number] * 4), number)}
     asked = dict.fromkeys(energies, plan.energies)
     asked |= {"deepest": plan.deep, "asymmetry": plan.asymmetry, "lyapunov": plan.tangent, "handover": plan.chained}
-    fields = Summary.__dataclass_fields__
-    return Summary(**{name: kinds.get(name, number) if asked.get(name, True) else None for name in fields})
+    names = Summary.__dataclass_fields__
+    fields: dict[str, Any] = {name: kinds.get(name, number) if asked.get(name, True) else None for name in names}
+    return Summary(**fields)
+
+
+class _End(eqx.Module):
+    """How cells ended; every cell is one of periodic, still, failed or none of these.
+
+    Attributes:
+        periodic: On an orbit: the sums are those of one round.
+        silent: Without an impact.
+        permanent: In contact for ever.
+        failed: Stopped: nothing can be said.
+        end, window: The last period, and how many the window has.
+        span: How many periods the sums are over.
+        prime: The period of the orbit; `span` where none is sought.
+    """
+
+    periodic: Mask
+    silent: Mask
+    permanent: Mask
+    failed: Mask
+    end: Lane
+    window: Lane
+    span: Lane
+    prime: Lane
+
+    @property
+    def still(self) -> Mask:
+        """At rest, in flight or in contact."""
+        return self.silent | self.permanent
+
+
+def _ended(plan: Plan, settings: Settings, cell: Cell) -> _End:
+    c, impacts = cell.candidate, cell.tally.left + cell.tally.right
+    failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
+    periodic = (jnp.zeros_like(cell.running) if c is None else c.tracing) & ~failed
+    permanent = cell.status == Status.PERMANENT_CONTACT
+    end = last_period(plan, settings, cell.since)
+    window = end - cell.since
+    span = jnp.where(periodic, 1.0 if c is None else c.period, window)
+    quiet = impacts == 0 if c is None else (impacts == 0) | (cell.status == Status.NO_IMPACT)
+    silent = ~periodic & ~failed & ~permanent & quiet
+    return _End(periodic, silent, permanent, failed, end, window, span, span if c is None else c.prime)
 
 
 def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
     """What is kept of cells that are done."""
-    t = cell.tally
-    attractor = cell.candidate is not None
-    periodic = cell.candidate.tracing if attractor else jnp.zeros_like(cell.running)
-    failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
-    periodic = periodic & ~failed
-    quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
-    end = last_period(plan, settings, cell.since)
-    window = end - cell.since
-    span = jnp.where(periodic, cell.candidate.period if attractor else 1.0, window)
-    hits = t.left + t.right
-    silent = ~periodic & ~failed & ~permanent & ((hits == 0) | (quiet if attractor else False))
-    still = silent | permanent
-    status = jnp.where(silent, Status.NO_IMPACT, jnp.where(permanent | failed, cell.status, Status.OK))
-    prime = cell.candidate.prime if attractor else span
-    period = jnp.where(periodic, prime, -1.0)
-    lyapunov = None
-    if plan.tangent:
-        size = sum(jnp.abs(x) for x in cell.tangent)
-        growth = jnp.log(size) + cell.exponent * jnp.log(TANGENT_SCALE)
-        chaotic = growth > _CHAOS
-        lyapunov = jnp.where(periodic, jnp.log(cell.multiplier) / span, growth / window)
-        lyapunov = jnp.where(still | failed, jnp.nan, lyapunov)
-        if attractor:
-            period = jnp.where(periodic, prime, jnp.where(chaotic, 0.0, -1.0))
-            status = jnp.where(~periodic & ~chaotic & ~still & ~failed, Status.SLOW, status)
-    if attractor:
-        period = jnp.where(still, 1.0, jnp.where(failed, -1.0, period))
-    if plan.rigid:
-        status = jnp.where(t.stuck & (status == Status.OK), Status.STICKING, status)
+    t, e = cell.tally, _ended(plan, settings, cell)
+    still, failed, hits = e.still, e.failed, t.left + t.right
+    period, status, lyapunov = _kind(cell, e)
 
     def per(total, number):
         return jnp.where((number > 0) & ~still, total / jnp.where(number > 0, number, 1.0), jnp.nan)
@@ -93,55 +109,78 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
         value = jnp.where(still, 0.0, value)
         return jnp.where(failed, jnp.nan, value)
 
-    labelled = periodic | (still & attractor)
+    labelled = e.periodic | (still & (cell.candidate is not None))
 
     def number(impacts):
         """Impacts in the period of the label, -1 where there is none."""
-        each = jnp.where(still, 0.0, jnp.round(impacts * prime / span))
+        each = jnp.where(still, 0.0, jnp.round(impacts * e.prime / e.span))
         return jnp.where(labelled, each, -1.0).astype(jnp.int32)
 
-    power = error = ratio = None
-    if plan.energies:
-        power, error = _power(plan, settings, cell, periodic, still, window, span)
+    power = error = ratio = deepest = None
+    if t.harvest is not None:
+        power, error = _power(plan, settings, cell, t.harvest, e)
         power, error = jnp.where(failed[:, None], jnp.nan, power), jnp.where(failed[:, None], jnp.nan, error)
-        ratio = jnp.where(failed[:, None], jnp.nan, jnp.where(still[:, None], 0.0, t.ratio))
+        ratio = jnp.where(failed[:, None], jnp.nan, jnp.where(still[:, None], 0.0, t.harvest.ratio))
+    if t.deepest is not None:
+        deepest = jnp.where(failed, jnp.nan, jnp.where(e.silent, 0.0, t.deepest))
     ran = cell.ball.n + 0.5 * cell.ball.t
     return Summary(
         P=power,
         P_stderr=error,
         energy_ratio=ratio,
-        deepest=jnp.where(failed, jnp.nan, jnp.where(silent, 0.0, t.deepest)) if plan.deep else None,
+        deepest=deepest,
         fastest=measured(t.fastest),
-        asymmetry=per(t.momentum, hits * t.fastest) if plan.asymmetry else None,
+        asymmetry=None if t.momentum is None else per(t.momentum, hits * t.fastest),
         period=period.astype(jnp.int32),
         impacts_left=number(t.left),
         impacts_right=number(t.right),
-        impacts_per_period=measured(hits / span),
+        impacts_per_period=measured(hits / e.span),
         restitution=per(t.rebound_left + t.rebound_right, hits),
         restitution_left=per(t.rebound_left, t.left),
         restitution_right=per(t.rebound_right, t.right),
         contact_time=per(t.contact, hits),
-        contact_fraction=jnp.where(permanent, 1.0, measured(t.contact / (2 * span))),
+        contact_fraction=jnp.where(e.permanent, 1.0, measured(t.contact / (2 * e.span))),
         lyapunov=lyapunov,
-        periods_run=jnp.where(periodic, ran, jnp.where(failed | still, jnp.minimum(ran, end), end)),
+        periods_run=jnp.where(e.periodic, ran, jnp.where(failed | still, jnp.minimum(ran, e.end), e.end)),
         status=status.astype(jnp.int32),
-        handover=hand_over(settings, cell, periodic, failed, end) if plan.chained else None,
+        handover=hand_over(settings, cell, e.periodic, failed, e.end) if plan.chained else None,
     )
 
 
-def _power(plan, settings, cell: Cell, periodic: Mask, still: Mask, window: Lane, span: Lane):
+def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, "lane"], Lane | None]:
+    """Period (0: chaos, -1: neither known), status and Lyapunov exponent."""
+    attractor, none = cell.candidate is not None, e.still | e.failed
+    period, lyapunov = jnp.where(e.periodic, e.prime, -1.0), None
+    status = jnp.where(e.silent, Status.NO_IMPACT, jnp.where(e.permanent | e.failed, cell.status, Status.OK))
+    if cell.tangent is not None:
+        a, b, c, d = cell.tangent
+        size = jnp.abs(a) + jnp.abs(b) + jnp.abs(c) + jnp.abs(d)
+        growth = jnp.log(size) + present(cell.exponent) * jnp.log(TANGENT_SCALE)
+        chaotic = growth > _CHAOS
+        lyapunov = jnp.where(e.periodic, jnp.log(present(cell.multiplier)) / e.span, growth / e.window)
+        lyapunov = jnp.where(none, jnp.nan, lyapunov)
+        if attractor:
+            period = jnp.where(e.periodic, e.prime, jnp.where(chaotic, 0.0, -1.0))
+            status = jnp.where(~e.periodic & ~chaotic & ~none, Status.SLOW, status)
+    if attractor:
+        period = jnp.where(e.still, 1.0, jnp.where(e.failed, -1.0, period))
+    if cell.tally.stuck is not None:
+        status = jnp.where(cell.tally.stuck & (status == Status.OK), Status.STICKING, status)
+    return period, status, lyapunov
+
+
+def _power(plan: Plan, settings: Settings, cell: Cell, harvest: Harvest, e: _End) -> tuple[Values, Values]:
     """Energy per half period, and its standard error by batch means (0 on an orbit)."""
-    t = cell.tally
     length = batch_length(plan, settings)
-    batches = jnp.floor(window / length)
+    batches = jnp.floor(e.window / length)
     last = (cell.batch < batches)[:, None]  # the running batch is a whole one: nothing came after it
-    past = t.energy_past + jnp.where(last, t.energy, 0.0)
-    square = t.energy_square + jnp.where(last, t.energy * t.energy, 0.0)
+    past = harvest.past + jnp.where(last, harvest.batch, 0.0)
+    square = harvest.square + jnp.where(last, harvest.batch * harvest.batch, 0.0)
     number = jnp.maximum(batches, 1.0)[:, None]
     mean = past / number
     spread = jnp.maximum(square / number - mean * mean, 0.0) * number / jnp.maximum(number - 1, 1.0)
     error = jnp.sqrt(spread / number) / (2 * length)
     error = jnp.where((batches >= 2)[:, None], error, jnp.nan)
-    power = (t.energy_past + t.energy) / (2 * span)[:, None]
-    none = still[:, None]
-    return jnp.where(none, 0.0, power), jnp.where(none | periodic[:, None], 0.0, error)
+    power = (harvest.past + harvest.batch) / (2 * e.span)[:, None]
+    none = e.still[:, None]
+    return jnp.where(none, 0.0, power), jnp.where(none | e.periodic[:, None], 0.0, error)

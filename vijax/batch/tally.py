@@ -5,12 +5,25 @@ from dataclasses import replace
 import jax.numpy as jnp
 
 from vijax.batch.attractor_search import recur
-from vijax.batch.cell import TANGENT_SCALE, Cell, Event, Lane, Mask, Plan, Settings, Tally, batch_length, last_period
+from vijax.batch.cell import (
+    TANGENT_SCALE,
+    Cell,
+    Event,
+    Harvest,
+    Lane,
+    Mask,
+    Plan,
+    Settings,
+    Tally,
+    batch_length,
+    last_period,
+)
 from vijax.batch.chain import note
 from vijax.batch.lanes import choose
 from vijax.engine.impact import Hit
 from vijax.model import energy
 from vijax.model.records import Status
+from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
 
 _BUDGET = 512  # impacts per period before a cell is stopped
@@ -35,11 +48,13 @@ def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     status = jnp.where(spent, Status.EVENT_BUDGET, jnp.where(broken, Status.NONFINITE, status))
     tangent, exponent = _extend_tangent(cell, hit, kept, counted)
     batch = jnp.where(counted & ~tracing, _batch_of(plan, settings, cell, hit), cell.batch)
-    tally = _add(plan, settings, cell, hit, counted, batch, tracing, event.stuck)
-    if plan.deep:
+    # A batch that has ended is squared away before the first impact of the next is added.
+    turned = counted & ~tracing & (batch != cell.batch) & (cell.batch >= 0)
+    tally = _add(settings, cell, hit, counted, turned, event.stuck)
+    if tally.deepest is not None:
         # A contact for ever has a depth although no impact ends it.
-        held = event.permanent & (hit.depth > tally.deepest)
-        tally = replace(tally, deepest=jnp.where(held, hit.depth, tally.deepest))
+        depth = present(hit.depth)
+        tally = replace(tally, deepest=jnp.where(event.permanent & (depth > tally.deepest), depth, tally.deepest))
     candidate, found = recur(settings, cell, hit, kept, count)
     stop = over | ended | spent | broken | found
     return replace(
@@ -69,34 +84,28 @@ def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
     if cell.candidate is not None:
         fresh = fresh & ~cell.candidate.tracing
     a, b, c, d = (jnp.where(fresh, unit, old) for unit, old in zip((1.0, 0.0, 0.0, 1.0), cell.tangent, strict=True))
-    p, q, r, s = hit.tangent
+    p, q, r, s = present(hit.tangent)
     a, b, c, d = p * a + q * c, p * b + q * d, r * a + s * c, r * b + s * d
     size = jnp.abs(a) + jnp.abs(b) + jnp.abs(c) + jnp.abs(d)
     shrink = jnp.where(size > TANGENT_SCALE, 1 / TANGENT_SCALE, jnp.where(size < 1 / TANGENT_SCALE, TANGENT_SCALE, 1.0))
     carried = jnp.where(size > TANGENT_SCALE, 1.0, jnp.where(size < 1 / TANGENT_SCALE, -1.0, 0.0))
-    exponent = jnp.where(fresh, 0.0, cell.exponent)
+    exponent = jnp.where(fresh, 0.0, present(cell.exponent))
     new = tuple(jnp.where(kept, x * shrink, old) for x, old in zip((a, b, c, d), cell.tangent, strict=True))
-    return new, jnp.where(kept, exponent + carried, cell.exponent)
+    return new, jnp.where(kept, exponent + carried, present(cell.exponent))
 
 
-def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, tracing: Mask, stuck: Mask) -> Tally:
-    """The tally with one impact more; a batch that has ended is squared away first."""
+def _add(settings: Settings, cell: Cell, hit: Hit, counted: Mask, turned: Mask, stuck: Mask) -> Tally:
+    """The tally with one impact more."""
     old = cell.tally
     left, right = counted & (hit.side < 0), counted & (hit.side > 0)
     rebound = -hit.v_out / jnp.where(hit.v_in == 0, 1.0, hit.v_in)
     speed = jnp.where(counted, jnp.abs(hit.v_in), 0.0)
-    ratio = gain = past = square = None
-    if plan.energies:
-        metres = (hit.depth * cell.length)[:, None] * settings.length_variant
-        speeds = cell.speed[:, None] * settings.speed_variant
-        got = energy.harvested_energy(settings.device, metres)
-        given = settings.device.m_b * speeds * speeds * hit.work[:, None]
-        wide = counted[:, None]
-        ratio = jnp.where(wide, jnp.maximum(old.ratio, energy.energy_ratio(got, given)), old.ratio)
-        turned = (counted & ~tracing & (batch != cell.batch) & (cell.batch >= 0))[:, None]
-        past = jnp.where(turned, old.energy_past + old.energy, old.energy_past)
-        square = jnp.where(turned, old.energy_square + old.energy * old.energy, old.energy_square)
-        gain = jnp.where(turned, 0.0, old.energy) + jnp.where(wide, got, 0.0)
+    harvest = None if old.harvest is None else _harvested(settings, cell, old.harvest, hit, counted, turned)
+    momentum = deepest = None
+    if old.momentum is not None:
+        momentum = old.momentum + jnp.where(counted, hit.v_in, 0.0)
+    if old.deepest is not None:
+        deepest = jnp.where(counted, jnp.maximum(old.deepest, present(hit.depth)), old.deepest)
     return Tally(
         left=old.left + left.astype(speed.dtype),
         right=old.right + right.astype(speed.dtype),
@@ -104,11 +113,23 @@ def _add(plan, settings, cell: Cell, hit: Hit, counted: Mask, batch: Lane, traci
         rebound_right=old.rebound_right + jnp.where(right, rebound, 0.0),
         contact=old.contact + jnp.where(counted, hit.duration, 0.0),
         fastest=jnp.maximum(old.fastest, speed),
-        momentum=old.momentum + jnp.where(counted, hit.v_in, 0.0) if plan.asymmetry else None,
-        deepest=jnp.where(counted, jnp.maximum(old.deepest, hit.depth), old.deepest) if plan.deep else None,
-        energy=gain,
-        energy_past=past,
-        energy_square=square,
-        ratio=ratio,
-        stuck=old.stuck | (counted & stuck) if plan.rigid else None,
+        momentum=momentum,
+        deepest=deepest,
+        harvest=harvest,
+        stuck=None if old.stuck is None else old.stuck | (counted & stuck),
+    )
+
+
+def _harvested(settings: Settings, cell: Cell, old: Harvest, hit: Hit, counted: Mask, turned: Mask) -> Harvest:
+    """What has been harvested with one impact more."""
+    metres = (present(hit.depth) * cell.length)[:, None] * settings.length_variant
+    speeds = cell.speed[:, None] * settings.speed_variant
+    got = energy.harvested_energy(settings.device, metres)
+    given = settings.device.m_b * speeds * speeds * present(hit.work)[:, None]
+    wide, ended = counted[:, None], turned[:, None]
+    return Harvest(
+        batch=jnp.where(ended, 0.0, old.batch) + jnp.where(wide, got, 0.0),
+        past=jnp.where(ended, old.past + old.batch, old.past),
+        square=jnp.where(ended, old.square + old.batch * old.batch, old.square),
+        ratio=jnp.where(wide, jnp.maximum(old.ratio, energy.energy_ratio(got, given)), old.ratio),
     )

@@ -26,7 +26,7 @@ _TILES = (1, 8, 64, 512, 4096)
 
 
 def _wall(pair: ImpactPair) -> str:
-    return "rigid" if pair.kappa is None else "soft"
+    return "rigid" if pair.rigid else "soft"
 
 
 def _precision(pair: ImpactPair) -> str:

@@ -137,7 +137,7 @@ def step(
     _, v_in = flow.flight(pair.gamma, state.t, state.v, flight)
     t, periods = flow.wrap_phase(state.t + flight)
     meets = hit | held
-    if pair.kappa is None:
+    if pair.rigid:
         out, stuck, stay = _rigid_contact(pair, side, t, side * v_in, held)
         depth = side * v_in * energy.rigid_penetration(pair.r)
         work = energy.membrane_work_rigid(v_in, pair.r)
@@ -177,7 +177,7 @@ def start_mode(pair: ImpactPair, u: Values, v: Values, t: Values) -> Values:
     gap = 0.5 * pair.d - side * u
     pressed = spell_after(flow.contact_force(pair.gamma, side, t), jnp.zeros_like(t)).positive
     resting = (gap == 0) & (v == 0) & pressed
-    held = resting if pair.kappa is None else (gap < 0) | resting | ((gap == 0) & (side * v > 0))
+    held = resting if pair.rigid else (gap < 0) | resting | ((gap == 0) & (side * v > 0))
     return jnp.where(held, side, 0.0)
 
 
@@ -186,7 +186,7 @@ def tangent(pair: ImpactPair, outcome: Outcome) -> Float[Array, "2 2"]:
 
     A stuck ball forgets how it came: the zero matrix.
     """
-    if pair.kappa is None:
+    if pair.rigid:
         push = flow.acceleration(pair.gamma, outcome.impact.t)
         contact = flow.rigid_matrix(pair.r, push, outcome.impact.v_in)
         contact = jnp.where(outcome.stuck, 0.0, contact)

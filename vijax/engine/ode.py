@@ -73,9 +73,6 @@ equation_39 = diffrax.ODETerm(_field_39)
 """Eq. (39), lengths in units of s and times in units of 1/omega0: for `Point` (x, x') and (`MembranePair`, mode)."""
 
 
-# --- one solver step ------------------------------------------------------------------------------
-
-
 class Motion(eqx.Module):
     """The carry of a lane: where the ball is, the step it will try, and what its contact has seen so far."""
 

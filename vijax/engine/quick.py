@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool
 
 from vijax.engine.exact import stick_speed
 from vijax.engine.impact import Arrival, Ball, Hit, Lane
-from vijax.engine.quick_contact import Wall, touch
-from vijax.engine.quick_flight import fly
+from vijax.engine.quick_contact import RigidWall, SoftWall, Wall, touch
+from vijax.engine.quick_flight import Flight, fly
 from vijax.model import energy
 
 
@@ -31,6 +31,55 @@ class Quick(NamedTuple):
     never: Bool[Array, "lane"]  # will meet no wall again
 
 
+class _Onset(NamedTuple):
+    """When and how the ball meets a wall."""
+
+    t: Lane
+    n: Lane
+    side: Lane
+    v_in: Lane
+
+
+class _Exit(NamedTuple):
+    """How it leaves: how much later, how fast, how deep it was, and how the contact maps what is near it."""
+
+    duration: Lane
+    speed: Lane
+    t: Lane
+    n: Lane
+    depth: Lane | None
+    work: Lane | None
+    contact: tuple[Lane, Lane, Lane, Lane]
+    sure: Bool[Array, "lane"]
+
+
+def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool) -> _Exit:
+    """From a rigid wall, at once."""
+    out = wall.r * flight.speed
+    # In the frame of the wall the acceleration there is -sine.
+    contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * flight.sine / flight.speed, -wall.r)
+    depth = wall.chi * flight.speed if deep else None
+    work = energy.membrane_work_rigid(onset.v_in, wall.r) if deep else None
+    sure = out > 10 * stick_speed(out.dtype)
+    return _Exit(jnp.zeros_like(out), out, onset.t, onset.n, depth, work, contact, sure)
+
+
+def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: Lane) -> _Exit:
+    """From a membrane, after a contact."""
+    left, depth, sure = touch(wall, flight, deep)
+    duration, out = left.duration, left.speed
+    leave = onset.t + duration
+    passed = jnp.floor(0.5 * leave)
+    work = None
+    if deep:
+        signed = onset.v_in, -onset.side * out
+        work = energy.membrane_work(wall.kappa, 2 * wall.zeta, gamma, onset.side, onset.t, duration, *signed)
+    h = left.decay * left.sine / wall.omega1
+    slope = left.decay * left.cosine - wall.zeta * h
+    contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)
+    return _Exit(duration, out, leave - 2 * passed, onset.n + passed, depth, work, contact, sure)
+
+
 def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tangent: bool = False) -> Quick:
     """One impact of every lane by the regular path; gamma must be 0.
 
@@ -41,33 +90,24 @@ def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tange
     flight = fly(wall.half, lane)
     side = flight.flip * flight.wall
     arrival = Arrival(flight.elapsed, flight.speed, side, flight.sure & ~flight.never)
-    onset = lane.t + flight.elapsed
-    passed = jnp.floor(0.5 * onset)
-    onset_t, onset_n = onset - 2 * passed, lane.n + passed
-    v_in = side * flight.speed
-    depth = work = contact = None
-    if wall.kappa is None:
-        out, duration = wall.r * flight.speed, jnp.zeros_like(onset)
-        leave_t, leave_n = onset_t, onset_n
-        sure = out > 10 * stick_speed(out.dtype)
-        if deep:
-            depth, work = wall.chi * flight.speed, energy.membrane_work_rigid(v_in, wall.r)
-        if tangent:
-            # In the frame of the wall the acceleration there is -sine.
-            contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * flight.sine / flight.speed, -wall.r)
+    meets = lane.t + flight.elapsed
+    passed = jnp.floor(0.5 * meets)
+    onset = _Onset(meets - 2 * passed, lane.n + passed, side, v_in=side * flight.speed)
+    if isinstance(wall, RigidWall):
+        leaves = _rebound(wall, flight, onset, deep)
     else:
-        left, depth, sure = touch(wall, flight, deep)
-        duration, out = left.duration, left.speed
-        leave = onset_t + duration
-        passed = jnp.floor(0.5 * leave)
-        leave_t, leave_n = leave - 2 * passed, onset_n + passed
-        if deep:
-            work = energy.membrane_work(wall.kappa, 2 * wall.zeta, gamma, side, onset_t, duration, v_in, -side * out)
-        if tangent:
-            h = left.decay * left.sine / wall.omega1
-            slope = left.decay * left.cosine - wall.zeta * h
-            contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)
-    matrix = None if contact is None else through(contact, flight.elapsed)
-    after = Ball(side * wall.half, -side * out, leave_t, leave_n)
-    hit = Hit(onset_t, onset_n, side, v_in, -side * out, flight.elapsed, duration, after, depth, work, matrix)
-    return Quick(hit, arrival, sure & arrival.sure, flight.never & flight.sure)
+        leaves = _release(wall, flight, onset, deep, gamma)
+    hit = Hit(
+        onset.t,
+        onset.n,
+        side,
+        v_in=onset.v_in,
+        v_out=-side * leaves.speed,
+        flight=flight.elapsed,
+        duration=leaves.duration,
+        after=Ball(side * wall.half, -side * leaves.speed, leaves.t, leaves.n),
+        depth=leaves.depth,
+        work=leaves.work,
+        tangent=through(leaves.contact, flight.elapsed) if tangent else None,
+    )
+    return Quick(hit, arrival, leaves.sure & arrival.sure, flight.never & flight.sure)

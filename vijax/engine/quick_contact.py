@@ -14,6 +14,7 @@ from vijax.engine.roots import converged_step, householder, single
 from vijax.model import energy
 from vijax.model.flow import PI, horner, membrane
 from vijax.model.pair import ImpactPair
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.xla import once, share
 
 _EXIT_ROUNDS = 2
@@ -22,31 +23,41 @@ _DOUBT = 1e-3  # a sign or a bound that is closer is not trusted to single preci
 _DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
 
 
-class Wall(eqx.Module):
+class RigidWall(eqx.Module):
+    """What an impact on a rigid wall needs and no impact changes."""
+
+    half: Lane
+    r: Lane
+    chi: Lane  # greatest depth per speed
+
+
+class SoftWall(eqx.Module):
     """What the contact of a cell needs and no impact changes."""
 
     half: Lane
     r: Lane
-    chi: Lane | None = None  # rigid: greatest depth per speed
-    kappa: Lane | None = None
-    zeta: Lane | None = None
-    omega1: Lane | None = None
-    gain_in: Lane | None = None  # steady response per forcing, in phase
-    gain_out: Lane | None = None  # and a quarter turn behind
-    span: Lane | None = None  # pi/omega1: the free contact
-    cos_span: Lane | None = None
-    sin_span: Lane | None = None
-    cos_middle: Lane | None = None
-    sin_middle: Lane | None = None
-    root_r: Lane | None = None
-    hop: Lane | None = None  # a contact whose cubic Taylor polynomial ends before this is expanded about half the span
-    crest: Lane | None = None  # free time of greatest depth
-    cos_crest: Lane | None = None
-    sin_crest: Lane | None = None
-    crest_decay: Lane | None = None
-    steep: Lane | None = None  # least speed at which w' is sure to have its first zero near the free crest
-    lift: Lane | None = None  # least -w'' at the crest, per bound of f', that keeps w' negative until the exit
-    usable: Bool[Array, "lane"] | None = None
+    kappa: Lane
+    zeta: Lane
+    omega1: Lane
+    gain_in: Lane  # steady response per forcing, in phase
+    gain_out: Lane  # and a quarter turn behind
+    span: Lane  # pi/omega1: the free contact
+    cos_span: Lane
+    sin_span: Lane
+    cos_middle: Lane
+    sin_middle: Lane
+    root_r: Lane
+    hop: Lane  # a contact whose cubic Taylor polynomial ends before this is expanded about half the span
+    crest: Lane  # free time of greatest depth
+    cos_crest: Lane
+    sin_crest: Lane
+    crest_decay: Lane
+    steep: Lane  # least speed at which w' is sure to have its first zero near the free crest
+    lift: Lane  # least -w'' at the crest, per bound of f', that keeps w' negative until the exit
+    usable: Bool[AnyArray, "lane"]
+
+
+Wall = RigidWall | SoftWall
 
 
 def prepare(pair: ImpactPair) -> Wall:
@@ -57,8 +68,8 @@ def prepare(pair: ImpactPair) -> Wall:
     there -w' starts with slope V = -w'' and is driven by at most max f': it stays positive while V h > max f' H, H the
     integral of h ("lift"); h/H falls with time since h is log-concave.
     """
-    if pair.kappa is None:
-        return Wall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r))
+    if pair.rigid:
+        return RigidWall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r))
     wall = membrane(pair)
     kappa, zeta, omega1 = wall.kappa, wall.zeta, wall.omega1
     square = kappa * kappa
@@ -75,7 +86,7 @@ def prepare(pair: ImpactPair) -> Wall:
 
     h_a, slope_a, static_a = response(0.5 * theta)
     h_d, _, static_d = response(jnp.full_like(theta, _DEEP_REACH))
-    return Wall(
+    return SoftWall(
         half=0.5 * pair.d,
         r=pair.r,
         kappa=kappa,
@@ -128,7 +139,7 @@ class _Course(eqx.Module):
 
 
 @once
-def _motion(wall: Wall, course: _Course, s: Lane) -> _Motion:
+def _motion(wall: SoftWall, course: _Course, s: Lane) -> _Motion:
     """The contact at time s from the course's reference."""
     sine, cosine = sine_cosine(wall.omega1 * s)
     drive_sine, drive_cosine = sine_cosine(PI * s)
@@ -144,13 +155,13 @@ def _motion(wall: Wall, course: _Course, s: Lane) -> _Motion:
     return _derivatives(wall, w, rate, force, drive, sine, cosine, decay)
 
 
-def _derivatives(wall, w, rate, force, drive, sine, cosine, decay) -> _Motion:
+def _derivatives(wall: SoftWall, w, rate, force, drive, sine, cosine, decay) -> _Motion:
     push = force - 2 * wall.zeta * rate - wall.kappa * wall.kappa * w
     jerk = drive - 2 * wall.zeta * push - wall.kappa * wall.kappa * rate
     return _Motion(w, rate, force, push, jerk, drive, sine, cosine, decay)
 
 
-def _at_reference(wall: Wall, course: _Course) -> _Motion:
+def _at_reference(wall: SoftWall, course: _Course) -> _Motion:
     """The contact at the course's reference: no sine and no exponential is needed there."""
     one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
     w = course.steady_cos + course.decay * course.free_cos
@@ -158,7 +169,7 @@ def _at_reference(wall: Wall, course: _Course) -> _Motion:
     return _derivatives(wall, w, rate, course.force_cos, -PI * course.force_sin, zero, one, course.decay)
 
 
-def _in_reach(wall: Wall, s: Lane) -> Bool[Array, "lane"]:
+def _in_reach(wall: SoftWall, s: Lane) -> Bool[Array, "lane"]:
     """Whether the polynomials of `_motion` hold at s."""
     return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
 
@@ -212,7 +223,7 @@ class _Entry(eqx.Module):
         return self.steady_cos, self.steady_sin, self.force_cos, self.force_sin
 
 
-def _entry(wall: Wall, flight: Flight) -> _Entry:
+def _entry(wall: SoftWall, flight: Flight) -> _Entry:
     """The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin."""
     force_cos, force_sin = -flight.sine, flight.cosine
     steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
@@ -229,7 +240,7 @@ class _Guess(eqx.Module):
     rise: Lane
 
 
-def _guess(wall: Wall, entry: _Entry) -> _Guess:
+def _guess(wall: SoftWall, entry: _Entry) -> _Guess:
     """From the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
     speed, square = entry.speed, wall.kappa * wall.kappa
     push = entry.force_cos - 2 * wall.zeta * speed
@@ -249,7 +260,7 @@ def _guess(wall: Wall, entry: _Entry) -> _Guess:
     return share(_Guess(short, hop, rise))
 
 
-def touch(wall: Wall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
+def touch(wall: SoftWall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
     """Exit of the contact, its greatest depth if asked for, and certainty that w rises once and falls once until then.
 
     The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
@@ -291,7 +302,7 @@ def touch(wall: Wall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bo
     return share((Exit(duration, out, sine, cosine, decay), depth, sure))
 
 
-def _rough_exit(wall: Wall, entry: _Entry, guess: _Guess, course: _Course) -> tuple[Lane, Bool[Array, "lane"]]:
+def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: _Course) -> tuple[Lane, Bool[Array, "lane"]]:
     """Time of the exit from the course's reference in single precision, and whether the polynomials held on the way."""
     free = _at_reference(wall, course)
     near = guess.hop - 0.5 * wall.span
@@ -304,20 +315,20 @@ def _rough_exit(wall: Wall, entry: _Entry, guess: _Guess, course: _Course) -> tu
     return share((jnp.where(reached, s, 0.0), reached))
 
 
-def _crest_course(wall: Wall, entry: _Entry) -> _Course:
+def _crest_course(wall: SoftWall, entry: _Entry) -> _Course:
     """The contact rotated to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
     cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
     return share(_course(entry.parts, wall.cos_crest, wall.sin_crest, free, wall.crest_decay))
 
 
-def _snap(wall: Wall, at: _Motion) -> Lane:
+def _snap(wall: SoftWall, at: _Motion) -> Lane:
     """Fourth derivative of w."""
     return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
 
 
 def _rough_crest(
-    wall: Wall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]
+    wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]
 ) -> tuple[Lane, Bool[Array, "lane"]]:
     """Time of greatest depth from the free contact's, and certainty that w has no other extremum before the exit.
 
@@ -326,7 +337,7 @@ def _rough_crest(
     w' is an oscillator too, driven by the derivative f' of the forcing. Write e^(zeta s) w' = phi q with phi the free
     solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero.
     Beyond it -w' > 0 has no zero while f' < 0, and where f' ends positive at most one, so none if -w' > 0 at the exit.
-    Moreover a minimum of w needs a positive forcing. Else by size: `Wall.steep` and `Wall.lift`.
+    Moreover a minimum of w needs a positive forcing. Else by size: `SoftWall.steep` and `SoftWall.lift`.
     """
     duration, exit_drive, exit_force = end
     course = _crest_course(wall, entry)
@@ -355,7 +366,7 @@ def _rough_crest(
     return share((jnp.where(reached, s, 0.0), converged & first & only & inside))
 
 
-def _deepest(wall: Wall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
+def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
     """Greatest depth, and whether `crest`, its rough time from the free contact's, was close enough to tell."""
     at = share(_motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
     fourth = _snap(wall, at)

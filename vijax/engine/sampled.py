@@ -327,7 +327,7 @@ def sampled_step(
     onset_t, passed = flow.wrap_phase(lane.t + flight)
     onset_n, v_in = lane.n + passed, side * speed
     depth = work = contact = None
-    if pair.kappa is None:
+    if pair.rigid:
         out, duration = pair.r * speed, jnp.zeros_like(speed)
         sure = sure & (out > 10 * stick_speed(out.dtype))
         if deep:
@@ -340,10 +340,10 @@ def sampled_step(
         duration, out, depth, certain = _touch(m, flow.contact_force(pair.gamma, side, onset_t), speed, deep)
         sure = sure & certain
         if deep:
-            work = energy.membrane_work(pair.kappa, m.mu, pair.gamma, side, onset_t, duration, v_in, -side * out)
+            work = energy.membrane_work(m.kappa, m.mu, pair.gamma, side, onset_t, duration, v_in, -side * out)
         if tangent:
             h, slope = flow.free_response(m, duration)
-            contact = (slope, h, -pair.kappa * pair.kappa * h, slope + m.mu * h)
+            contact = (slope, h, -m.kappa * m.kappa * h, slope + m.mu * h)
     leave_t, passed = flow.wrap_phase(onset_t + duration)
     after = Ball(0.5 * side * pair.d, -side * out, leave_t, onset_n + passed)
     matrix = None if contact is None else through(contact, flight)

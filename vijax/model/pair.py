@@ -38,6 +38,11 @@ class ImpactPair(eqx.Module):
     gamma: Float[AnyArray, "..."]
 
     @property
+    def rigid(self) -> bool:
+        """Whether the walls are rigid: a static choice, which no compiled program asks twice."""
+        return self.kappa is None
+
+    @property
     @door
     def mu(self) -> Float[AnyArray, "..."]:
         """Damping of w'' + mu w' + kappa^2 w = f, by the calibration of Eq. (19)."""
@@ -137,7 +142,7 @@ def check_pair(pair: Any) -> ImpactPair:
 
 def check_start(pair: ImpactPair, name: str, u: Any) -> None:
     """Raise ValueError unless a displacement lies between rigid walls; soft ones may be entered, traced ones pass."""
-    if pair.kappa is not None or not is_concrete(pair.d, u):
+    if not pair.rigid or not is_concrete(pair.d, u):
         return
     u, half = np.broadcast_arrays(np.asarray(u), 0.5 * np.asarray(pair.d))
     good = np.abs(u) <= half

@@ -56,7 +56,7 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
         attrs={
             "title": "Branches of periodic orbits of a vibro-impact pair",
             "along": along,
-            "wall": "rigid" if branches[0].orbit.pair.kappa is None else "soft",
+            "wall": "rigid" if branches[0].orbit.pair.rigid else "soft",
         },
     )
 

@@ -87,7 +87,7 @@ def between(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Between:
 
     flights = jax.vmap(_flight_room, in_axes=(None, 0, 0, 0, 0, 0))
     flight = flights(pair, passage.side, passage.speed, passage.t, passage.next_t - passage.t, real)
-    if pair.kappa is None:
+    if pair.rigid:
         deepest = jnp.full_like(passage.side, jnp.nan)
         contact = leaves = jnp.full_like(pair.d, _NOTHING)
     else:

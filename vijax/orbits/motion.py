@@ -109,7 +109,7 @@ def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int
 
 def _contact(pair: ImpactPair, t, side, v_in, s) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Displacement and velocity a time s after an onset; on a rigid wall, where only sticking lasts, at rest."""
-    if pair.kappa is None:
+    if pair.rigid:
         return 0.5 * side * pair.d, jnp.where(s > 0, 0.0, v_in)
     w, z = flow.oscillate(
         flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t), 0.0 * s, side * v_in, s

@@ -101,7 +101,7 @@ def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
 @door
 def depth_unit(orbit: Orbit, device: Harvester) -> Any:
     """Metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
-    if orbit.pair.kappa is None:
+    if orbit.pair.rigid:
         return device.length_unit * device.omega / (flow.PI * device.omega0)
     return device.length_unit
 

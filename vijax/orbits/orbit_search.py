@@ -46,7 +46,7 @@ def from_state(
     given = {"u": u, "v": v, "t": t}
     # By NumPy, as JAX would compile a program for each number of states.
     u, v, t = (np.atleast_1d(np.asarray(checks.finite(name, x), float)) for name, x in given.items())
-    shape = checks.shapes(u=u, v=v, t=t, d=pair.d, kappa=0 if pair.kappa is None else pair.kappa, r=pair.r)
+    shape = checks.shapes(u=u, v=v, t=t, d=pair.d, kappa=0 if pair.rigid else pair.kappa, r=pair.r)
     check_start(pair, "u", u)
     pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)
     u, v, t = (np.broadcast_to(x, shape) for x in (u, v, t))
@@ -145,7 +145,7 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     gaps = draw.dirichlet(np.ones(count), guesses) * 2 * period
     t = draw.uniform(0, 2, (guesses, 1)) + np.cumsum(gaps, axis=1) - gaps[:, :1]
     speed = draw.uniform(0, _FASTEST, (guesses, count))
-    free = np.zeros(()) if pair.kappa is None else np.pi / np.asarray(pair.omega1)
+    free = np.zeros(()) if pair.rigid else np.pi / np.asarray(pair.omega1)
     knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
     wide = jax.tree.map(lambda x: np.broadcast_to(x, guesses), pair)
     side = np.broadcast_to(np.asarray(walls, np.int32), (guesses, count))

@@ -81,7 +81,7 @@ def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], devi
 
 def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tuple[float, float]:
     """Bounds of a parameter, or ValueError unless branches of a pair with such walls can be followed between them."""
-    stiff = [name for name, several in MOVED.items() if several == ("kappa",) and pair.kappa is None]
+    stiff = [name for name, several in MOVED.items() if several == ("kappa",) and pair.rigid]
     hint = f"a rigid wall has no {' or '.join(stiff)}" if stiff else ""
     checks.choice("along", along, [name for name in MOVED if name not in stiff], hint)
     bounds = checks.bounds("within", units.plain(along, within))

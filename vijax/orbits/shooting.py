@@ -71,7 +71,7 @@ def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
     """
     t, speed, stay, _, _ = knot
     zero, one = jnp.zeros_like(t), jnp.ones_like(t)
-    if pair.kappa is None:
+    if pair.rigid:
         return _Contact(stay, -pair.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -pair.r, zero]))
     wall, force = flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t)
     w, rate = flow.oscillate(wall, force, zero, speed, stay)
@@ -195,7 +195,7 @@ def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, 
     """Whether every speed, contact and flight is longer than nothing."""
     _, _, joined = _joined(sequence, knots)
     t, speed, stay, next_t, _ = joined.T
-    touches = jnp.ones_like(speed, bool) if pair.kappa is None else stay > 0
+    touches = jnp.ones_like(speed, bool) if pair.rigid else stay > 0
     return ((speed > 0) & touches & (next_t - t - stay > 0)).all()
 
 
@@ -269,7 +269,7 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
 
     def one(before, here):
         side, t, speed, stay, flight, real = here
-        if pair.kappa is None:
+        if pair.rigid:
             contact = flow.rigid_matrix(pair.r, flow.acceleration(pair.gamma, t), side * speed)
         else:
             contact = flow.contact_matrix(flow.membrane(pair, rolled=True), stay)

@@ -106,7 +106,7 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
         raise ValueError(
             f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbits.periodic` found it"
         )
-    wall = "rigid" if orbit.pair.kappa is None else "soft"
+    wall = "rigid" if orbit.pair.rigid else "soft"
     # Numbers of one kind, however they are given: each kind would be a program of its own.
     device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
     return _near(device, pair, orbit.sequence, orbit.knots, wall)
@@ -133,7 +133,7 @@ def _check(device: Any, orbit: Any, pair: Any) -> None:
         )
     if jnp.ndim(orbit.knots) != 2:
         raise ValueError(f"orbit must be a single one; got knots of shape {jnp.shape(orbit.knots)}; take found[0]")
-    if pair is not None and (check_pair(pair).kappa is None) != (orbit.pair.kappa is None):
+    if pair is not None and check_pair(pair).rigid != orbit.pair.rigid:
         raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
 
 
@@ -201,7 +201,7 @@ def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Kno
     """Depth [m], harvested energy [J] and energy given to the membrane [J] of every impact."""
     real = sequence.real
     t, speed, stay = knots.T
-    if pair.kappa is None:
+    if pair.rigid:
         kappa = device.omega0 * flow.PI / device.omega
         depth = speed * energy.rigid_penetration(pair.r) / kappa
         work = energy.membrane_work_rigid(speed, pair.r)
