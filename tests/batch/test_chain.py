@@ -14,7 +14,7 @@ from vijax.planes.orbit_diagram import orbit_diagram
 @pytest.mark.parametrize("gamma", [-1.5, 2.0])
 def test_a_ball_at_rest_in_a_soft_wall_repeats_itself(gamma):
     pair = vijax.impact_pair(jnp.full(2, 0.2), jnp.array([4.0, 40.0]), jnp.full(2, 0.5), jnp.full(2, gamma))
-    ball = chain._resting(pair, jnp.full(2, 400.0))
+    ball = chain.resting(pair, jnp.full(2, 400.0))
     side = -np.sign(gamma)
     for i in range(2):
         wall = flow.membrane(vijax.impact_pair(0.2, pair.kappa[i], 0.5))

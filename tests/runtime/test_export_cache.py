@@ -122,7 +122,7 @@ def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
 def test_a_change_in_any_folder_changes_the_digest(tmp_path):
     package = tmp_path / "vijax"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    digest = export_cache._sources.__wrapped__
+    digest = export_cache.source_digest.__wrapped__
     digests = {digest(), digest(package)}
     assert len(digests) == 1  # of the same sources elsewhere
     folders = [package, *sorted(path.parent for path in package.glob("*/__init__.py"))]
@@ -137,7 +137,7 @@ def test_a_change_in_any_folder_changes_the_digest(tmp_path):
 def test_all_that_a_trace_goes_through_is_in_the_digest(monkeypatch):
     asked = []
     monkeypatch.setattr(export_cache, "version", lambda name: asked.append(name) or "1")
-    export_cache._sources.__wrapped__()
+    export_cache.source_digest.__wrapped__()
     nodes = [node for path in PACKAGE.glob("[be]*/*.py") for node in ast.walk(ast.parse(path.read_text()))]
     tops = {alias.name.split(".")[0] for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     tops |= {node.module.split(".")[0] for node in nodes if isinstance(node, ast.ImportFrom)}
@@ -156,7 +156,7 @@ def test_all_that_a_trace_goes_through_is_in_the_digest(monkeypatch):
 
 def test_other_sources_are_other_programs(folder, monkeypatch):
     called()
-    monkeypatch.setattr(export_cache, "_sources", lambda: "other")
+    monkeypatch.setattr(export_cache, "source_digest", lambda: "other")
     assert called()[1] == 1
 
 

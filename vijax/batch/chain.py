@@ -88,7 +88,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     left = jnp.where(aloft, 2 * (end - last.n) - last.t, 0.0)
     rise, v = jax.vmap(flow.flight)(pair.gamma, last.t, last.v, left)
     ball = Ball(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
-    ball = choose(permanent, _resting(pair, end), ball)
+    ball = choose(permanent, resting(pair, end), ball)
     first = end - present(settings.keep)
     mark = choose(periodic, _moved(last, _ahead(last.n, first, present(cell.candidate).period)), old.mark)
     mark = choose(quiet | permanent, Ball(ball.u, ball.v, ball.t, first), mark)
@@ -97,7 +97,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     return Handover(ball.u, ball.v, ball.t, _moved(mark, -first), held)
 
 
-def _resting(pair: ImpactPair, end: Lane) -> Ball:
+def resting(pair: ImpactPair, end: Lane) -> Ball:
     """A ball that never leaves the wall on which it lies, at phase 0, when all but its steady motion has decayed."""
     side, zero = -jnp.sign(pair.gamma), jnp.zeros_like(end)
     if pair.rigid:

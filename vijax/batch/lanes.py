@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.runtime.xla import in_blocks, kernel, put, share, whole_blocks
+from vijax.runtime.xla import in_blocks, kernel, put, shared, whole_blocks
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -92,6 +92,7 @@ def _cumulative(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
     return count
 
 
+@shared
 def _first(mask: Bool[Array, "lane"], width: int) -> _Batch:
     """The first `width` lanes of a mask.
 
@@ -100,7 +101,7 @@ def _first(mask: Bool[Array, "lane"], width: int) -> _Batch:
     rank = _cumulative(mask.astype(jnp.int32))
     members = jnp.searchsorted(rank, jnp.arange(1, width + 1, dtype=jnp.int32))
     chosen = mask & (rank <= width)
-    return share(_Batch(jnp.minimum(members, mask.size - 1), chosen.sum(dtype=jnp.int32), chosen))
+    return _Batch(jnp.minimum(members, mask.size - 1), chosen.sum(dtype=jnp.int32), chosen)
 
 
 def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:

@@ -11,7 +11,7 @@ import numpy as np
 
 from vijax.model.flow import PI, horner
 from vijax.runtime.arrays import Lane
-from vijax.runtime.xla import once, share
+from vijax.runtime.xla import once, shared
 
 REACH = 1.65  # sine and cosine hold up to so many radians
 EXP_REACH = 2.4
@@ -60,11 +60,12 @@ def _of(x: Lane) -> _Tables:
 
 
 @once
+@shared
 def sine_cosine(x: Lane) -> tuple[Lane, Lane]:
     """sin and cos on |x| <= REACH."""
     square = x * x
     sine = x - x * square * horner(_of(x).sine, square)
-    return share((sine, 1 - square * (0.5 - square * horner(_of(x).cosine, square))))
+    return sine, 1 - square * (0.5 - square * horner(_of(x).cosine, square))
 
 
 @once

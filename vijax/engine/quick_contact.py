@@ -15,7 +15,7 @@ from vijax.model import energy
 from vijax.model.flow import PI, horner, membrane
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import AnyArray
-from vijax.runtime.xla import once, share
+from vijax.runtime.xla import once, share, shared
 
 _EXIT_ROUNDS = 2
 _CREST_ROUNDS = 2
@@ -192,8 +192,9 @@ def _taylor(derivatives: tuple[Lane, ...], order: int, s: Lane) -> Lane:
     return horner(tuple(d * (1 / math.factorial(k + order)) for k, d in enumerate(derivatives)), s)
 
 
+@shared
 def _either(short: Bool[Array, "lane"], near: _Course, far: _Course) -> _Course:
-    return share(jax.tree.map(lambda a, b: jnp.where(short, a, b), near, far))
+    return jax.tree.map(lambda a, b: jnp.where(short, a, b), near, far)
 
 
 class Exit(eqx.Module):
@@ -223,13 +224,14 @@ class _Entry(eqx.Module):
         return self.steady_cos, self.steady_sin, self.force_cos, self.force_sin
 
 
+@shared
 def _entry(wall: SoftWall, flight: Flight) -> _Entry:
     """The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin."""
     force_cos, force_sin = -flight.sine, flight.cosine
     steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
     steady_sin = wall.gain_out * force_cos - wall.gain_in * force_sin
     free_sin = (flight.speed - PI * steady_sin - wall.zeta * steady_cos) / wall.omega1
-    return share(_Entry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady_cos, free_sin))
+    return _Entry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady_cos, free_sin)
 
 
 class _Guess(eqx.Module):
@@ -240,6 +242,7 @@ class _Guess(eqx.Module):
     rise: Lane
 
 
+@shared
 def _guess(wall: SoftWall, entry: _Entry) -> _Guess:
     """From the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
     speed, square = entry.speed, wall.kappa * wall.kappa
@@ -257,9 +260,10 @@ def _guess(wall: SoftWall, entry: _Entry) -> _Guess:
     hop = jnp.where(slope < 0, hop - value / slope, hop)
     rise = 2 * speed / (jnp.sqrt(jnp.maximum(push * push - 2 * jerk * speed, 0.0)) - push)
     rise = rise - _taylor(derivatives, 0, rise) / _taylor(derivatives[1:], 0, rise)
-    return share(_Guess(short, hop, rise))
+    return _Guess(short, hop, rise)
 
 
+@shared
 def touch(wall: SoftWall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
     """Exit of the contact, its greatest depth if asked for, and certainty that w rises once and falls once until then.
 
@@ -299,9 +303,10 @@ def touch(wall: SoftWall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None
     sine, cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)
     rot = wall.zeta * step
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
-    return share((Exit(duration, out, sine, cosine, decay), depth, sure))
+    return Exit(duration, out, sine, cosine, decay), depth, sure
 
 
+@shared
 def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: _Course) -> tuple[Lane, Bool[Array, "lane"]]:
     """Time of the exit from the course's reference in single precision, and whether the polynomials held on the way."""
     free = _at_reference(wall, course)
@@ -312,14 +317,15 @@ def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: _Course) -
         at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
         s = share(s + householder(at.w, at.rate, at.push, at.jerk))
         reached = reached & _in_reach(wall, s)
-    return share((jnp.where(reached, s, 0.0), reached))
+    return jnp.where(reached, s, 0.0), reached
 
 
+@shared
 def _crest_course(wall: SoftWall, entry: _Entry) -> _Course:
     """The contact rotated to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
     cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
-    return share(_course(entry.parts, wall.cos_crest, wall.sin_crest, free, wall.crest_decay))
+    return _course(entry.parts, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
 
 
 def _snap(wall: SoftWall, at: _Motion) -> Lane:
@@ -327,6 +333,7 @@ def _snap(wall: SoftWall, at: _Motion) -> Lane:
     return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
 
 
+@shared
 def _rough_crest(
     wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]
 ) -> tuple[Lane, Bool[Array, "lane"]]:
@@ -363,7 +370,7 @@ def _rough_crest(
     most = jnp.where(positive, jnp.maximum(at.drive, 0.0) + _DOUBT, PI)
     only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < _DEEP_REACH))
     inside = (wall.omega1 * when > _DOUBT) & (wall.omega1 * way > _DOUBT) & (way < (1 - _DOUBT) * wall.span)
-    return share((jnp.where(reached, s, 0.0), converged & first & only & inside))
+    return jnp.where(reached, s, 0.0), converged & first & only & inside
 
 
 def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:

@@ -10,7 +10,7 @@ from vijax.engine.impact import Ball, Lane
 from vijax.engine.polynomial import arcsine, phase, sine_cosine
 from vijax.engine.roots import converged_step, householder, single
 from vijax.model.flow import PI
-from vijax.runtime.xla import share
+from vijax.runtime.xla import share, shared
 
 _ROUNDS = 3  # so many run in single precision, before the one in double
 _NEAR = 64  # roundings within which an extremum may be on either side of a wall
@@ -29,12 +29,13 @@ def _kepler(slope: Lane, goal: Lane) -> tuple[Lane, Lane, Lane, Lane]:
     return y + step, step, sine, cosine
 
 
+@shared
 def _reflected(y: Lane) -> tuple[Lane, Lane]:
     """sin and cos on |y| <= pi + 0.08."""
     size = jnp.abs(y)
     beyond = size > 0.5 * PI
     sine, cosine = sine_cosine(jnp.where(beyond, PI - size, size))
-    return share((jnp.where(y < 0, -sine, sine), jnp.where(beyond, -cosine, cosine)))
+    return jnp.where(y < 0, -sine, sine), jnp.where(beyond, -cosine, cosine)
 
 
 class Flight(eqx.Module):
@@ -87,6 +88,7 @@ def _stretch(half: Lane, u: Lane, p: Lane, ahead: Lane, cosine: Lane) -> _Stretc
     return _Stretch(up, periods, ((near | before | passed) & ~falls) | flat)
 
 
+@shared
 def fly(half: Lane, lane: Ball) -> Flight:
     """First wall crossing without gravity: pick the one monotone stretch that holds it, then Kepler's equation.
 
@@ -124,4 +126,4 @@ def fly(half: Lane, lane: Ball) -> Flight:
     converged = stiffness * jnp.abs(step) < converged_step(eps)
     # A short hop loses its leading digits in the phases.
     sure = converged & ~doubt & (speed > 0) & (elapsed > 1 / 256) & (lane.v != 0) & (jnp.abs(y) < 3.4)
-    return Flight(*share((elapsed, speed, flip, wall, sine, cosine, sure, never & (lane.v != 0))))
+    return Flight(elapsed, speed, flip, wall, sine, cosine, sure, never & (lane.v != 0))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from vijax.runtime.arrays import Flag, Scalar, Values
-from vijax.runtime.xla import share
+from vijax.runtime.xla import share, shared
 
 _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
 
@@ -75,9 +75,10 @@ def householder(f: Values, f1: Values, f2: Values, f3: Values) -> Values:
     return -f * (6 * slope - 3 * bent) / (6 * f1 * (slope - bent) + f * f * f3)
 
 
+@shared
 def single(tree: Any) -> Any:
     """Floating leaves in single precision.
 
     An iteration of fourth order needs double precision in its last trip alone: the others cost a quarter as much.
     """
-    return share(jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != jnp.bool_ else x, tree))
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != jnp.bool_ else x, tree)

@@ -24,7 +24,7 @@ from vijax.model import energy, flow
 from vijax.model.flow import PI, Force, Membrane
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import Lane, Mask
-from vijax.runtime.xla import share
+from vijax.runtime.xla import share, shared
 
 Samples = Float[Array, "sample lane"]
 Zeros = Float[Array, "zero lane"]  # the exit, and the crest where it is asked for
@@ -69,9 +69,10 @@ def _powers(re: Rows, im: Rows) -> tuple[Powers, Powers]:
     return real, imaginary
 
 
+@shared
 def _least(samples: Samples) -> Lane:
     """Smallest of each lane: a chain over whole rows is one vector loop, XLA's reduction a scalar one."""
-    return share(reduce(jnp.minimum, samples))
+    return reduce(jnp.minimum, samples)
 
 
 def _safe(gap: Lane, rate: Lane, bend: Lane) -> Lane:
@@ -131,10 +132,12 @@ def _next(at: _Pass, s: Samples, h: Lane, crossing: _Crossing, side: Lane, gap: 
     return jax.tree.map(lambda fresh, kept: jnp.where(at.side == 0, fresh, kept), new, at)
 
 
+@shared
 def _chord(found: _Pass) -> Lane:
-    return share(found.s + found.h * found.start / (found.start - found.end))
+    return found.s + found.h * found.start / (found.start - found.end)
 
 
+@shared
 def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
     half, gamma = 0.5 * pair.d, pair.gamma
     eps = jnp.finfo(half.dtype).eps
@@ -174,7 +177,7 @@ def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
         at, step = share((at + step, step))
     speed = found.side * flow.flight(gamma, lane.t, lane.v, at)[1]
     sure = (found.side != 0) & (jnp.abs(step) < converged_step(eps)) & (speed > 0) & (at > 0)
-    return Arrival(*share((at, speed, found.side, sure)))
+    return Arrival(at, speed, found.side, sure)
 
 
 class _Contact(NamedTuple):
@@ -188,27 +191,31 @@ class _Contact(NamedTuple):
     free_sin: Lane
 
 
+@shared
 def _contact(m: Membrane, force: Force, speed: Lane) -> _Contact:
     steady = flow.steady_response(m, force)
     free_cos = steady.g - steady.c
     free_sin = (speed + PI * steady.q + m.zeta * free_cos) / m.omega1
-    return share(_Contact(m, force, speed, steady, free_cos, free_sin))
+    return _Contact(m, force, speed, steady, free_cos, free_sin)
 
 
+@shared
 def _turned(c: _Contact, s: Rows) -> tuple[Rows, Rows, Force]:
     """Free part and steady response of the contact with their clocks started at s."""
     decay, turn = jnp.exp(-c.m.zeta * s), c.m.omega1 * s
     cosine, sine = share((decay * jnp.cos(turn), decay * jnp.sin(turn)))
     along, across = c.free_cos * cosine + c.free_sin * sine, c.free_sin * cosine - c.free_cos * sine
-    return share((along, across, c.steady.later(s)))
+    return along, across, c.steady.later(s)
 
 
+@shared
 def _state(c: _Contact, turned: tuple[Rows, Rows, Force]) -> tuple[Rows, Rows]:
     along, across, steady = turned
     w = along + steady.c - steady.g
-    return share((w, c.m.omega1 * across - c.m.zeta * along - PI * steady.q))
+    return w, c.m.omega1 * across - c.m.zeta * along - PI * steady.q
 
 
+@shared
 def _step(c: _Contact, s: Zeros, w: Zeros, z: Zeros) -> tuple[Zeros, tuple[Zeros, ...]]:
     """Fourth-order step towards a zero of w (first row) or w' (second row), and the derivatives it is made of."""
     later, square = c.force.later(s), c.m.kappa * c.m.kappa
@@ -218,7 +225,7 @@ def _step(c: _Contact, s: Zeros, w: Zeros, z: Zeros) -> tuple[Zeros, tuple[Zeros
     derivatives = share((w, z, push, jerk, snap))
     crest = jnp.arange(s.shape[0])[:, None] == 1
     ours = (jnp.where(crest, after, f) for f, after in pairwise(derivatives))
-    return share((householder(*ours), derivatives))
+    return householder(*ours), derivatives
 
 
 def _polish(c: _Contact, s: Zeros) -> tuple[Zeros, Zeros, tuple[Zeros, ...]]:
@@ -290,6 +297,7 @@ def _higher_of(one: tuple[Lane, Lane], other: tuple[Lane, Lane]) -> tuple[Lane, 
     return jax.tree.map(partial(jnp.where, other[0] > one[0]), other, one)
 
 
+@shared
 def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: Lane, last: Lane) -> _Crest:
     """The highest sample so far.
 
@@ -306,7 +314,7 @@ def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: L
     apart = -_least(share(jnp.where(around, jnp.inf, -hidden)))
     beaten = jnp.where(better & (when - former.when > 2.5 * h), former.height + 0.125 * h * h * change, 0.0)
     rival = jnp.maximum(former.rival, jnp.maximum(apart, beaten))
-    return share(_Crest(when, jnp.where(better, h, former.step), height, rival))
+    return _Crest(when, jnp.where(better, h, former.step), height, rival)
 
 
 def sampled_step(

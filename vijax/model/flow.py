@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import Values
-from vijax.runtime.xla import once, share
+from vijax.runtime.xla import once, share, shared
 
 PI = math.pi
 
@@ -64,13 +64,14 @@ class Force(eqx.Module):
         return Force(-PI * self.q, PI * self.c, jnp.zeros_like(self.g))
 
 
+@shared
 def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
     """The soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
     decrement = 0.0 - jnp.log(pair.r)  # +0 at r = 1: a free half cycle that begins at -0 would be over at once
     kappa = pair._soft_kappa()
     scale = kappa / jnp.sqrt(PI**2 + decrement * decrement)
     # Else every loop that needs omega1 makes its own, and some lanes of a loop round PI - omega1 once and others twice.
-    return share(Membrane(kappa, decrement * scale, PI * scale, rolled))
+    return Membrane(kappa, decrement * scale, PI * scale, rolled)
 
 
 # On |x| <= pi/4 the first neglected term is below 1e-17 of the sum.
@@ -127,6 +128,7 @@ def wrap_phase(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
 
 
 @once
+@shared
 def flight(gamma: Values, t0: Values, v0: Values, s: Values) -> tuple[Values, Values]:
     """Displacement from the start and velocity after flying for a time s from phase t0 at velocity v0.
 
@@ -136,7 +138,7 @@ def flight(gamma: Values, t0: Values, v0: Values, s: Values) -> tuple[Values, Va
     sin0, cos0, _, _ = half_turn(t0)
     sin_s, _, versine, lag = half_turn(s)
     rise = (v0 - 0.5 * gamma * s) * s + (cos0 * versine - sin0 * lag) / PI**2
-    return share((rise, v0 - gamma * s + (cos0 * sin_s - sin0 * versine) / PI))
+    return rise, v0 - gamma * s + (cos0 * sin_s - sin0 * versine) / PI
 
 
 def acceleration(gamma: Values, t: Values) -> Values:
@@ -222,6 +224,7 @@ def _contact_closed(m: Membrane, force: Force, w0: Values, z0: Values, s: Values
 
 
 @once
+@shared
 def oscillate(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
     """(w, w') at time s of w'' + mu w' + kappa^2 w = force from (w0, z0) at s = 0.
 
@@ -230,7 +233,7 @@ def oscillate(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> t
     short = jnp.maximum(m.kappa, PI) * s < _SERIES_REACH
     near = _contact_series(m, force, w0, z0, jnp.where(short, s, 0.0))
     far = _contact_closed(m, force, w0, z0, jnp.where(short, 1.0, s))
-    return share((jnp.where(short, near[0], far[0]), jnp.where(short, near[1], far[1])))
+    return jnp.where(short, near[0], far[0]), jnp.where(short, near[1], far[1])
 
 
 def flight_force(gamma: Values, t: Values) -> Force:

@@ -70,7 +70,7 @@ class Program:
         options, folder = xla.compiler_options(), cache_folder()
         if folder is None or not _ours(tree):
             return jax.jit(flat, compiler_options=options)
-        path = folder / f"traced-{_DIGEST(f'{name} {xla.KERNELS} {_sources()}'.encode()).hexdigest()}"
+        path = folder / f"traced-{_DIGEST(f'{name} {xla.KERNELS} {source_digest()}'.encode()).hexdigest()}"
         known = _read(path)
         if known is None:
             known = export.export(jax.jit(flat), platforms=[platform])(*leaves)
@@ -93,7 +93,7 @@ def _ours(tree: Any) -> bool:
 
 
 @lru_cache(maxsize=1)
-def _sources(package: Path = _PACKAGE) -> str:
+def source_digest(package: Path = _PACKAGE) -> str:
     """Digest of what tracing depends on: this package with all its folders, and those that trace it."""
     digest = _DIGEST(" ".join(map(version, TRACED_BY)).encode())
     for path in sorted(package.rglob("*.py")):

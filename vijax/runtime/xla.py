@@ -13,6 +13,7 @@ long.
 
 import os
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -88,6 +89,16 @@ def share(value: Any) -> Any:
     without kernels, and on accelerators, it is what JAX offers.)
     """
     return _kept(value) if _in_kernels() else lax.optimization_barrier(value)
+
+
+def shared(work: Callable[P, T]) -> Callable[P, T]:
+    """Make a function store its whole result; see `share`."""
+
+    @wraps(work)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        return share(work(*args, **kwargs))
+
+    return call
 
 
 def kernel(work: Callable[P, T]) -> Callable[P, T]:
