@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from jaxtyping import Array, Bool, Float
 
 from vijax.batch import lanes
-from vijax.runtime import tiles, xla
+from vijax.runtime import tiles
 
 Lane = Float[Array, "lane"]
 
@@ -156,7 +158,7 @@ def test_results_do_not_depend_on_the_number_of_lanes(width):
 
 def test_an_accelerator_is_given_no_kernels_and_the_same_results(monkeypatch):
     cells = draw(600, [EASY, DECLINES, HARD])
-    monkeypatch.setattr(xla, "_on_cpu", lambda: False)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
 
     @jax.jit
     def as_there(cells):
@@ -255,3 +257,13 @@ def test_tiles_hold_every_row_once_and_little_padding(count, size, calls):
     rows = [tile.rows[: tile.real] for tile in found]
     np.testing.assert_array_equal(np.concatenate([np.zeros(0, int), *rows]), np.arange(count))
     assert all((tile.rows[tile.real :] == count - 1).all() for tile in found)
+
+
+@given(count=st.integers(0, 10**4), sizes=st.sets(st.integers(1, 5000), min_size=1))
+def test_tiles_of_any_sizes_hold_every_row_once(count, sizes):
+    found = tiles.tiles(count, tuple(sorted(sizes)))
+    rows = [tile.rows[: tile.real] for tile in found]
+    np.testing.assert_array_equal(np.concatenate([np.zeros(0, int), *rows]), np.arange(count))
+    assert len({tile.rows.size for tile in found}) <= 1
+    padding = sum(tile.rows.size - tile.real for tile in found)
+    assert padding <= max(count, min(sizes))

@@ -6,13 +6,38 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from vijax.batch import rows, simulate
 from vijax.batch.cell import Plan, Settings
+from vijax.batch.rows import pack, unpack, width
 from vijax.batch.summary import shapes, unload
 from vijax.model.device import Harvester
 
 LEAST = Plan(variants=3)
+
+
+WHOLE = st.integers(-(2**20), 2**20)
+
+
+@given(
+    rows=st.integers(1, 5),
+    widths=st.lists(st.tuples(st.sampled_from(["f8", "i4", "?"]), st.lists(st.integers(1, 3), max_size=2)), max_size=5),
+    data=st.data(),
+)
+def test_any_record_comes_out_as_it_went_in(rows, widths, data):
+    shapes_and_kinds = [("f8", []), *widths]  # a table is floating point: one field of a record must be
+    record = [
+        data.draw(arrays.arrays(kind, (rows, *shape), elements=None if kind == "?" else WHOLE))
+        for kind, shape in shapes_and_kinds
+    ]
+    table = np.asarray(pack(record))
+    assert table.shape == (rows, width(record))
+    for found, wanted in zip(unpack(table, record), record, strict=True):
+        assert found.dtype == wanted.dtype
+        np.testing.assert_array_equal(found, wanted)
 
 
 @pytest.mark.parametrize("leading", [1, 2])

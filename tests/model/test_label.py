@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
 
 from vijax.model.label import label, ordered
 from vijax.model.records import Status
@@ -48,3 +50,18 @@ def test_counts_of_labelled_arrays_are_ordered_along_their_own_dimensions():
     few, many = ordered(left, right, xr.DataArray([True, False], dims="gamma"))
     assert few.transpose("gamma", "d").values.tolist() == [[2, 1], [3, 1]]
     assert many.transpose("gamma", "d").values.tolist() == [[3, 2], [2, 2]]
+
+
+COUNTS = st.integers(0, 40)
+ORBITS = st.tuples(st.integers(1, 32), COUNTS, COUNTS).filter(lambda orbit: orbit[1] + orbit[2] > 0)
+
+
+@given(orbits=st.lists(ORBITS, min_size=1, max_size=8))
+def test_a_name_tells_its_orbit_and_no_other(orbits):
+    period, left, right = np.array(orbits).T
+    for name, orbit in zip(label(period, left, right), orbits, strict=True):
+        counts, _, turns = name.partition("/")
+        assert (int(turns.rstrip("T") or 1), *map(int, counts.split(":"))) == orbit
+    merged = label(period, left, right, merge_mirrors=True)
+    np.testing.assert_array_equal(merged, label(period, right, left, merge_mirrors=True))
+    np.testing.assert_array_equal(merged, label(period, np.minimum(left, right), np.maximum(left, right)))
