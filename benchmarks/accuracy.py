@@ -28,12 +28,13 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
+import derivatives
 import jax
 import jax.numpy as jnp
 import numpy as np
+import yardstick
 
 import vijax
 from vijax.batch import simulate
@@ -44,13 +45,6 @@ from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.shooting import Sequence
 from vijax.orbits.steady import Steady, find, response
 from vijax.runtime import tiles
-
-TESTS = Path(__file__).parent.parent / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "engine"), str(TESTS / "batch")]
-
-import helpers  # noqa: E402  the tests' arithmetic
-import test_exact  # noqa: E402
-import test_trajectory  # noqa: E402
 
 failures = 0
 
@@ -66,10 +60,10 @@ def say(what: str, value: float, limit: float, note: str = "") -> None:
 def reference() -> None:
     """Impact sequences of 50 digits."""
     first, all_of = 0.0, 0.0
-    for cases in (test_exact.SOFT, test_exact.RIGID):
-        for case, errors in test_exact.compare(cases):
+    for cases in (yardstick.SOFT, yardstick.RIGID):
+        for case, errors in yardstick.compare(cases):
             first = max(first, *(e[:4].max() for e in errors.values()))
-            if not test_exact.sensitive(case):
+            if not yardstick.sensitive(case):
                 all_of = max(all_of, *(e.max() for e in errors.values()))
     say("reference trajectories, first 4 impacts, relative error", first, 1e-13)
     say("the same, all 16 of the non-chaotic cases", all_of, 1e-11)
@@ -77,7 +71,7 @@ def reference() -> None:
 
 def plane(periods: int) -> None:
     """Reference cells of the (d, kappa) plane."""
-    cells = json.loads((TESTS / "data" / "plane_cells.json").read_text())["cells"]
+    cells = json.loads((yardstick.DATA / "plane_cells.json").read_text())["cells"]
     count = len(cells)
     pair = ImpactPair(*(jnp.asarray([c[k] for c in cells], float) for k in ("d", "kappa", "r", "gamma")))
     u0, v0 = (jnp.asarray([c[k] for c in cells], float) for k in ("u0", "v0"))
@@ -112,23 +106,23 @@ def audit(share: float) -> None:
     """Drawn flights and contacts against a dense scan in long double, and constructed extrema."""
     flights, contacts, bad_flight, bad_contact, determinant, undecided = 0, 0, 0, 0, 0.0, 0
     for soft, seed, count in ((True, 101, int(2600 * share)), (False, 102, int(1300 * share))):
-        pair, state = helpers.random_cells(np.random.default_rng(seed), count, soft)
-        ran = helpers.march(pair, state)
+        pair, state = yardstick.random_cells(np.random.default_rng(seed), count, soft)
+        ran = yardstick.march(pair, state)
         undecided += int(np.isnan(ran.out.stay).sum())
-        beyond = helpers.audit_flights(pair, ran)
+        beyond = yardstick.audit_flights(pair, ran)
         flights += len(beyond)
-        bad_flight += int(np.sum(~(beyond < 16 * helpers.EPS)))
+        bad_flight += int(np.sum(~(beyond < 16 * yardstick.EPS)))
         if soft:
-            below = helpers.audit_contacts(pair, ran)
+            below = yardstick.audit_contacts(pair, ran)
             contacts += len(below)
-            bad_contact += int(np.sum(~(below < 64 * helpers.EPS)))
+            bad_contact += int(np.sum(~(below < 64 * yardstick.EPS)))
         with np.errstate(invalid="ignore", over="ignore"):
-            determinant = max(determinant, float(np.nanmax(test_exact.determinants(pair, ran, 4))))
+            determinant = max(determinant, float(np.nanmax(yardstick.determinants(pair, ran, 4))))
     say("missed wall crossings", bad_flight, 0, f"{flights:,} flights over random parameters")
     say("missed exits", bad_contact, 0, f"{contacts:,} contacts over random parameters, {undecided} undecided")
     wrong = extrema = 0
     nearest = np.inf
-    for build, seed in ((helpers.grazing_flights, 103), (helpers.grazing_contacts, 104)):
+    for build, seed in ((yardstick.grazing_flights, 103), (yardstick.grazing_contacts, 104)):
         built = build(np.random.default_rng(seed), int(5000 * share))
         wrong += built.wrong()
         extrema += len(built.height)
@@ -141,11 +135,11 @@ def gradients() -> None:
     """Derivatives of impacts against differences in 50 digits."""
     worst = [0.0, 0.0]
     for rigid in (False, True):
-        cases, directions, first, second, _ = test_trajectory.derivatives(rigid)
+        cases, directions, first, second, _ = derivatives.derivatives(rigid)
         for i, case in enumerate(cases):
             for j, direction in enumerate(directions):
-                true = test_trajectory.differences(case, direction)
-                errors = test_trajectory.relative((first[i, j], second[i, j]), true)
+                true = derivatives.differences(case, direction)
+                errors = derivatives.relative((first[i, j], second[i, j]), true)
                 worst = [max(a, b) for a, b in zip(worst, errors, strict=True)]
     say("first derivatives of times, speeds, depths", worst[0], 1e-9)
     say("second derivatives", worst[1], 1e-6)

@@ -19,7 +19,6 @@ compilation stands beside it. Typical printout, two cores:
 import argparse
 import csv
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -30,16 +29,13 @@ import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
+import peers
+import yardstick
 from charts import work_precision
 
 import vijax
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]
-
-import helpers  # noqa: E402  the tests' 50-digit arithmetic
-import peers  # noqa: E402
-
 CHART = HERE.parent / "scripts" / "gallery" / "work_precision.png"
 
 R = 0.5
@@ -198,17 +194,17 @@ def truth(cells: Cells, by_kappa: bool = False) -> tuple[np.ndarray, np.ndarray]
         flights = np.diff(onset, prepend=0) - np.append(0, stay[:-1])
         guesses = [(flight, s, 0.5 * s) for flight, s in zip(flights, stay, strict=True)]
         parameters = [cells.d[cell], cells.scene.kappa, R, cells.scene.gamma, cells.u0[cell], cells.v0[cell]]
-        with mp.workdps(helpers.DIGITS):
+        with mp.workdps(yardstick.DIGITS):
             ends.append(_slope_50(parameters, guesses) if by_kappa else _state_50(parameters, guesses))
     u, v = np.array(ends, dtype=float).T
     return u, v
 
 
 def _state_50(parameters: list[Any], guesses: list) -> tuple[mp.mpf, mp.mpf]:
-    rows, _ = helpers.mp_march(parameters, len(guesses), guesses)
+    rows, _ = yardstick.mp_march(parameters, len(guesses), guesses)
     last, d, gamma = rows[-1], mp.mpf(parameters[0]), mp.mpf(parameters[3])
     left = last.t + last.duration
-    rise, v = helpers.mp_flight(gamma, left, last.v_out, 2 * PERIODS - left)
+    rise, v = yardstick.mp_flight(gamma, left, last.v_out, 2 * PERIODS - left)
     return last.side * d / 2 + rise, v
 
 

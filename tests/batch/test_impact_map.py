@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TILE, march, pairs, start
+from yardstick import TILE, march, pairs, start
 
 from vijax.batch.impact_map import next_impacts
 from vijax.model.pair import impact_pair

@@ -1,33 +1,21 @@
 """The work-precision tool: its quick setting gives rows, its errors behave, its chart draws them."""
 
-import importlib.util
 import itertools
 import math
 import sys
 from collections import defaultdict
-from pathlib import Path
 
 import numpy as np
 import pytest
+import work_precision as tool
 from charts import work_precision
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 EXACT = 1e-14  # worst measured: 2e-16
 PER_STEP = 5.0  # least gain of a hundredth of the tolerance
 
 
 @pytest.fixture(scope="module")
-def tool():
-    before = list(sys.path)
-    spec = importlib.util.spec_from_file_location("work_precision", BENCHMARKS / "work_precision.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    yield module
-    sys.path[:] = before
-
-
-@pytest.fixture(scope="module")
-def rows(tool, tmp_path_factory):
+def rows(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rows")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["work_precision.py", "--quick", "--rows", str(folder)])
@@ -62,14 +50,14 @@ def test_errors_fall_with_the_tolerance_and_with_the_step(rows):
             assert fine.worst < coarse.worst / PER_STEP, (method, fine.setting)
 
 
-def test_a_cell_without_a_number_is_a_failure(tool):
+def test_a_cell_without_a_number_is_a_failure():
     nothing, something = np.array([np.nan, 1.0, np.inf]), np.zeros(3)
     error = tool.deviation((nothing, something), (something, something))
     assert error.tolist() == [math.inf, 1.0, math.inf]
     assert tool.summary(error) == (math.inf, math.inf, 2)
 
 
-def test_derivative_in_fifty_digits_is_that_of_nearby_runs(tool):
+def test_derivative_in_fifty_digits_is_that_of_nearby_runs():
     cells, step = tool.settled(tool.MID), 1e-5
     up, down = (
         np.array(tool.follow(cells._replace(scene=tool.MID._replace(kappa=tool.MID.kappa + nudge))))
@@ -79,7 +67,7 @@ def test_derivative_in_fifty_digits_is_that_of_nearby_runs(tool):
     assert (tool.deviation((up - down) / (2 * step), true) < 1e-6 * np.hypot(*true)).all()
 
 
-def test_the_chart_has_a_panel_a_scene_and_names_every_line(tool, rows, tmp_path):
+def test_the_chart_has_a_panel_a_scene_and_names_every_line(rows, tmp_path):
     chaotic = [row._replace(scene="chaotic", measure="power", noise=1e-3) for row in rows]
     lost = [row._replace(scene="lost", error=math.inf) if row.method == "numba RK4" else row for row in rows]
     figure = work_precision([*rows, *chaotic, *lost], tmp_path / "chart.png")

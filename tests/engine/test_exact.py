@@ -4,12 +4,16 @@ import jax
 import mpmath as mp
 import numpy as np
 import pytest
-from helpers import (
+from yardstick import (
     DIGITS,
     EPS,
+    RIGID,
+    SOFT,
     TILE,
     audit_contacts,
     audit_flights,
+    compare,
+    determinants,
     grazing_contacts,
     grazing_flights,
     long_contact,
@@ -19,46 +23,13 @@ from helpers import (
     newton,
     pairs,
     random_cells,
-    reference_trajectories,
+    sensitive,
     start,
 )
 
 from vijax.engine import contact_search
 from vijax.model import flow
 from vijax.model.records import State
-
-CASES = reference_trajectories()
-SOFT = [case for case in CASES if not case["case"].get("hard")]
-RIGID = [case for case in CASES if case["case"].get("hard")]
-
-
-def sensitive(case) -> bool:
-    """Whether float64 loses more than a rounding a step on it: chaotic, or the rigid wall's slow impacts."""
-    return case["float64_max_err"]["t"] > 1e-14
-
-
-def compare(cases) -> list[tuple[dict, dict[str, np.ndarray]]]:
-    """Relative errors per impact of the reference sequences."""
-    given = [[float(case["case"][name]) for case in cases] for name in ("d", "kappa", "r", "gamma")]
-    rigid = bool(cases[0]["case"].get("hard"))
-    begin = [[float(case[name]) for case in cases] for name in ("u0", "v0", "t0")]
-    ran = march(pairs(given[0], None if rigid else given[1], *given[2:]), start(*begin))
-    result = []
-    for k, case in enumerate(cases):
-        truth = case["impacts"]
-        count = len(truth)
-        hit = jax.tree.map(lambda x, k=k, count=count: x[k, :count], ran.out.impact)
-        assert [int(side) for side in hit.side] == [row["side"] for row in truth]
-        got = {"t": (hit.n, hit.t), "vin": hit.v_in, "vout": hit.v_out}
-        got |= {} if rigid else {"tc": hit.duration, "dmax": hit.depth}
-        errors = {}
-        with mp.workdps(DIGITS):
-            for name, values in got.items():
-                rows = [mp.mpf(row[name]) for row in truth]
-                values = [2 * int(n) + mp.mpf(t) for n, t in zip(*values, strict=True)] if name == "t" else values
-                errors[name] = np.array([float(abs(mp.mpf(v) / row - 1)) for v, row in zip(values, rows, strict=True)])
-        result.append((case, errors))
-    return result
 
 
 @pytest.mark.parametrize("cases", [SOFT, RIGID], ids=["soft", "rigid"])
@@ -297,21 +268,6 @@ def test_mirror_symmetry(soft_runs, rigid_runs):
             assert np.allclose(a, b, rtol=1e-11, atol=1e-12, equal_nan=True)
         for a, b in ((plain.out.flight, turned.out.flight), (plain.out.stay, turned.out.stay)):
             assert np.allclose(a[sure, 0], b[sure, 0], rtol=1e-11, atol=1e-11, equal_nan=True)
-
-
-def determinants(pair, ran, steps: int) -> np.ndarray:
-    """|det - expected|/max(1, |M|^2) of the first steps' monodromy, NaN where a step was no plain impact."""
-    plain = ((ran.out.impact.side != 0) & ~ran.out.permanent & ~ran.out.stuck & np.isfinite(ran.out.stay))[:, :steps]
-    matrix = np.eye(2)
-    for k in range(steps):
-        matrix = ran.tangent[:, k] @ matrix
-    if pair.kappa is None:
-        expected = pair.r ** (2 * steps)
-    else:
-        expected = np.exp(-np.asarray(pair.mu) * ran.out.stay[:, :steps].sum(axis=1))
-    matrix = np.where(plain.all(axis=1)[:, None, None], matrix, np.eye(2))
-    error = np.abs(np.linalg.det(matrix) - expected) / np.maximum(1, np.linalg.norm(matrix, 2, axis=(1, 2)) ** 2)
-    return np.where(plain.all(axis=1), error, np.nan)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 4])

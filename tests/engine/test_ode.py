@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import reference_trajectories
+from yardstick import reference_trajectories
 
 import vijax
 from vijax.engine import dense_output, ode

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import TILE, both_ways, march, pairs, start
+from yardstick import TILE, both_ways, march, pairs, start
 
 from vijax.engine import sampled
 from vijax.engine.impact import Ball

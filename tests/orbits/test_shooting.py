@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import reference_orbits
+from yardstick import reference_orbits
 
 from vijax.model.pair import impact_pair
 from vijax.orbits import shooting

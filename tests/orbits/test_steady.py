@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import reference_orbits, reference_rows
+from yardstick import reference_orbits, reference_rows
 
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair, impact_pair
