@@ -180,10 +180,8 @@ def weights(side: int) -> tuple[int, float]:
     from vijax.planes import sweep as sweeps
     from vijax.planes import tiled_store as studies
 
-    settings: dict[str, Any] = {"periods": 400, "until": "attractor", "transient": 0}
-    settings |= {"wall": "soft", "method": "exact", "dtype": "float64"}
-    plain = sweeps.plan({"d": np.linspace(0.05, 0.3, side), "kappa": np.geomspace(3, 400, side)}, **settings)
-    physical = sweeps.plan({"omega": np.linspace(3, 9, side), "omega0": np.linspace(50, 400, side)}, **settings)
+    plain = sweeps.plan({"d": np.linspace(0.05, 0.3, side), "kappa": np.geomspace(3, 400, side)})
+    physical = sweeps.plan({"omega": np.linspace(3, 9, side), "omega0": np.linspace(50, 400, side)})
     with tempfile.TemporaryDirectory() as folder, studies.opened(plain, Path(folder) / "plane.zarr") as plane:
         return len(pickle.dumps(plane.tile(0))), len(pickle.dumps(physical)) / physical.count
 

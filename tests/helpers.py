@@ -1,4 +1,4 @@
-"""Where the scripts are, a plan as a sweep makes it, and a stand-in for the engine."""
+"""Where the scripts are, and a stand-in for the engine."""
 
 from pathlib import Path
 
@@ -7,14 +7,6 @@ import numpy as np
 from vijax.batch import simulate
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
-SETTINGS = {  # of a plan, as a sweep makes it when nothing else is asked
-    "periods": 400,
-    "until": "attractor",
-    "transient": 0,
-    "wall": "soft",
-    "method": "exact",
-    "dtype": "float64",
-}
 
 
 def stand_in(pair, u0, v0, scale, device, *, count, **settings) -> simulate.Summary:

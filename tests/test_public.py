@@ -16,9 +16,9 @@ import pytest
 import vijax
 from vijax.design import objective
 from vijax.engine import method_choice
-from vijax.model import pair
+from vijax.model import choices
 from vijax.orbits import continuation
-from vijax.planes import axes, orbit_diagram, sweep
+from vijax.planes import axes, orbit_diagram
 
 OFFERED = {name: getattr(vijax, name) for name in vijax.__all__}
 OFFERED |= {f"plots.{name}": getattr(vijax.plots, name) for name in vijax.plots.__all__}
@@ -26,13 +26,13 @@ FUNCTIONS = {name: found for name, found in OFFERED.items() if isinstance(found,
 ROOMS = [room.name for room in pkgutil.walk_packages(vijax.__path__, "vijax.")]
 # Arguments of a few closed choices, each a `Literal` wherever it stands.
 CHOICES = {
-    "direction": {continuation.Direction, orbit_diagram.Direction},
-    "dtype": {axes.Precision},
-    "method": {method_choice.MethodName},
+    "direction": {continuation.Direction, choices.Direction},
+    "dtype": {choices.Precision},
+    "method": {choices.MethodName},
     "objective": {objective.Objective},
-    "solver": {method_choice.SolverName},
-    "until": {sweep.Until},
-    "wall": {pair.Walls},
+    "solver": {choices.SolverName},
+    "until": {choices.Until},
+    "wall": {choices.Walls},
 }
 
 # Whatever room is asked for first, `vijax/__init__` runs before it: what matters is in which order the others follow.
@@ -115,8 +115,8 @@ def test_every_argument_shows_and_has_a_type(name):
 
 def test_choices_are_those_that_the_doors_allow():
     assert get_args(objective.Objective) == tuple(objective.OBJECTIVES)
-    assert get_args(method_choice.MethodName) == tuple(method_choice.OPTIONS)
+    assert get_args(choices.MethodName) == tuple(method_choice.OPTIONS)
     assert get_args(continuation.Direction) == tuple(continuation._WAYS)
-    assert get_args(orbit_diagram.Direction) == tuple(orbit_diagram._WAYS)
+    assert get_args(choices.Direction) == tuple(orbit_diagram._WAYS)
     assert set(axes.Axes.__annotations__) == set(axes.AXES)
-    assert {get_origin(one) for choices in CHOICES.values() for one in choices} == {Literal}
+    assert {get_origin(one) for several in CHOICES.values() for one in several} == {Literal}

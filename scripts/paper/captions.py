@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vijax.model.pair import Walls
+from vijax.model.choices import Walls
 from vijax.planes.orbit_diagram import Direction
 
 PERIODS, KEEP = 400, 25  # of every point of a diagram: run, and drawn

@@ -129,8 +129,7 @@ def kept(tmp_path):
 
 def planned(side, **axes):
     plane = {"d": np.linspace(0.1, 0.3, side), "kappa": np.linspace(3, 40, side)}
-    settings = {"periods": 400, "until": "attractor", "transient": 0, "wall": "soft", "method": "exact"}
-    return sweep.plan(plane | axes, **settings, dtype="float64")
+    return sweep.plan(plane | axes)
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from helpers import SCRIPTS
 from vijax.cli import closing, process, progress
 from vijax.model.records import Status
 from vijax.planes import dataset, sweep
+from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots import figure, kind_maps, number_maps
 
 TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
@@ -169,7 +170,7 @@ def test_default_plane(planned):
     np.testing.assert_allclose(kappa, np.geomspace(3, 400, 128))
     quantities = {name: float(plan.cells.quantities[name]) for name in ("r", "gamma", "omega")}
     assert quantities == {"r": 0.5, "gamma": 0.0, "omega": np.pi}
-    assert plan.settings["periods"] == 400
+    assert plan.settings.periods == 400
     assert "lyapunov" not in plan.outputs
 
 
@@ -194,7 +195,7 @@ def test_axes_in_the_order_given(planned, arguments, sizes):
 def test_settings_and_constants_arrive(planned):
     settings = ["--until", "window", "--transient", "5", "--periods", "7", "--wall", "rigid"]
     plan = planned(*settings, "--set", "V=1000", "--set", "m_b=0.01")
-    assert {"until": "window", "transient": 5, "periods": 7, "wall": "rigid"}.items() <= plan.settings.items()
+    assert plan.settings == SweepSettings(until="window", transient=5, periods=7, wall="rigid")
     assert (plan.device.V, plan.device.m_b) == (1000.0, 0.01)
 
 

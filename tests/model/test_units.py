@@ -87,12 +87,10 @@ def test_quantities_of_pint_at_the_doors():
     swept = sweep.plan(
         {"omega": U.Quantity([2, 3], "Hz"), "s": [30 * U.cm, 0.4 * U.m]},
         ["P"],
-        **{"periods": 400, "until": "attractor", "transient": 0, "wall": "soft", "method": "exact", "dtype": "float64"},
     )
     np.testing.assert_allclose(swept.cells.given["omega"], [2 * HZ, 3 * HZ], rtol=1e-14)
     np.testing.assert_allclose(swept.cells.given["s"], [0.3, 0.4], rtol=1e-14)
-    settings = {"direction": "up", "periods": 9, "keep": 3, "wall": "soft", "dtype": "float64"}
-    planned = orbit_diagram.plan("beta", U.Quantity([1, 2], "deg"), {}, **settings)
+    planned = orbit_diagram.plan("beta", U.Quantity([1, 2], "deg"), {})
     np.testing.assert_allclose(planned.planned.cells.given["beta"], np.radians([1, 2]), rtol=1e-14)
     bounds = variables.limits(("omega0",), {"omega0": (2 * U.Hz, 3 * U.Hz)}, Harvester())
     np.testing.assert_allclose(bounds[:, 0], [2 * HZ, 3 * HZ], rtol=1e-14)

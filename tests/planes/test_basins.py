@@ -10,6 +10,7 @@ from vijax.model.records import Status
 from vijax.planes import basins as tables
 from vijax.planes import sweep
 from vijax.planes.basins import basin_fractions, basins, matched, plan_basins, plan_fractions
+from vijax.planes.sweep_settings import SweepSettings
 
 NOISE = 1e-10  # of invariants from start to start; the engine's is below 3e-11
 
@@ -127,8 +128,8 @@ def test_energies_keep_dimensions_that_the_motion_does_not_depend_on():
 
 
 def drawn(**given):
-    settings = {"starts": 2000, "speed": 0.6, "seed": None, "periods": 400, "wall": "rigid"}
-    of = plan_fractions({"d": [0.1, 0.3], "kappa": 10.0}, **settings | given).cells
+    rigid = SweepSettings(wall="rigid")
+    of = plan_fractions({"d": [0.1, 0.3], "kappa": 10.0}, settings=rigid, starts=2000, **given).cells
     return (of.quantities[name].transpose(..., "start").values for name in ("u0", "v0"))
 
 
@@ -150,8 +151,7 @@ def test_a_seed_tells_the_starts():
 
 
 def test_a_plane_covers_the_widest_gap_unless_told():
-    settings = {"periods": 400, "wall": "soft"}
-    of = plan_basins({"d": [0.1, 0.2], "kappa": 3.0, "v0": np.linspace(-1, 1, 9)}, **settings).cells
+    of = plan_basins({"d": [0.1, 0.2], "kappa": 3.0, "v0": np.linspace(-1, 1, 9)}).cells
     assert of.sizes == {"u0": 9, "v0": 9, "d": 2}
     np.testing.assert_allclose(of.given["u0"].values[[0, -1]], [-0.1 + 0.1 / 9, 0.1 - 0.1 / 9])
 
@@ -194,8 +194,8 @@ def test_three_attractors_coexist_in_known_shares():
 
 
 def test_the_sign_of_the_mean_impact_velocity_tells_mirror_images_apart():
-    settings = {"starts": 500, "speed": 0.6, "seed": None, "periods": 200, "wall": "soft"}
-    swept = sweep.run(plan_fractions({"d": [0.2, 0.3], "kappa": 3.0, "r": 0.5}, **settings)).isel(d=0)
+    short = SweepSettings(periods=200)
+    swept = sweep.run(plan_fractions({"d": [0.2, 0.3], "kappa": 3.0, "r": 0.5}, settings=short, starts=500)).isel(d=0)
     few, many, both = (
         swept["asymmetry"].values[(swept["impacts_left"] == left) & (swept["impacts_right"] == right)]
         for left, right in ((1, 2), (2, 1), (2, 2))

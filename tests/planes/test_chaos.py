@@ -56,7 +56,7 @@ def test_chaos_that_ends_at_random_has_its_mean_lifetime(monkeypatch):
 
     def run(planned, progress):
         """After its end a motion is periodic, or creeps with rare impacts, or touches no wall."""
-        chaotic = ends > planned.settings["transient"]
+        chaotic = ends > planned.settings.transient
         exponents = np.where(chaotic, 0.9, np.array([-0.5, 0.05, np.nan])[kinds])
         impacts = np.where(chaotic, 1.3, np.array([2.0, 0.02, 0.0])[kinds])
         dims = ("d", "start")

@@ -17,7 +17,7 @@ import distributed
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import SETTINGS, stand_in
+from helpers import stand_in
 
 from vijax.batch import simulate
 from vijax.planes import cluster, tiled_store
@@ -121,7 +121,7 @@ def test_a_scheduler_that_is_lost_is_one_line(capfd, seconds):
 def test_a_tile_is_as_light_as_its_cells(folder, monkeypatch):
     monkeypatch.setattr(tiled_store, "LARGEST_TILE", 1024)
     side = 10_000
-    planned = sweeps.plan({"d": np.linspace(0.1, 0.3, side), "kappa": np.geomspace(3, 400, side)}, **SETTINGS)
+    planned = sweeps.plan({"d": np.linspace(0.1, 0.3, side), "kappa": np.geomspace(3, 400, side)})
     with tiled_store.opened(planned, "map.zarr") as plane:
         sent = pickle.dumps(plane.tile(7))
     assert len(sent) < 20_000
@@ -132,7 +132,7 @@ def test_a_tile_is_as_light_as_its_cells(folder, monkeypatch):
 
 
 def test_a_tile_that_is_written_late_does_not_spoil_another_plane(folder):
-    with tiled_store.opened(sweeps.plan(AXES, **SETTINGS), "map.zarr") as plane:
+    with tiled_store.opened(sweeps.plan(AXES), "map.zarr") as plane:
         late = plane.tile(0)
     whole = sweep(**AXES, r=0.4, out="map.zarr", overwrite=True).load()
     with pytest.raises(FileExistsError, match="no longer the store that tile 0"):

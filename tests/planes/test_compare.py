@@ -37,7 +37,7 @@ def _run_on(values, kappa) -> xr.Dataset:
     gamma = values.pop("gamma", np.zeros(kappa[1].size))
 
     def swept(planned, progress):
-        wall = planned.settings["wall"]
+        wall = planned.settings.wall
         names = [name for name in values if name.endswith(f"_{wall}")]
         variables = {name.removesuffix(f"_{wall}"): ("kappa", values[name], {"long_name": ""}) for name in names}
         coordinates = {"kappa": kappa, "gamma": ("kappa", gamma)}
@@ -45,7 +45,7 @@ def _run_on(values, kappa) -> xr.Dataset:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sweeps, "run", swept)
-        return run(plan({}, None, None, periods=1, until="attractor", transient=0, dtype="float64"))
+        return run(plan({}))
 
 
 def words(variable: xr.DataArray) -> list[str]:

@@ -9,6 +9,7 @@ from vijax.model.label import label
 from vijax.model.records import State, Status
 from vijax.planes import orbit_diagram as diagrams
 from vijax.planes.orbit_diagram import orbit_diagram
+from vijax.planes.sweep_settings import DiagramSettings
 
 
 def labels(ds) -> list[str]:
@@ -129,8 +130,8 @@ def test_an_orbit_is_taken_to_the_end_of_its_periods(periods):
 @pytest.mark.parametrize("wall", ["soft", "rigid"])
 def test_the_last_state_recorded_is_handed_on(wall):
     """Of orbits of periods 1 to 8 and of chaos; the record is flown from elsewhere on them."""
-    settings = {"direction": "down", "periods": 101, "keep": 3, "wall": wall, "dtype": "float64"}
-    asked = diagrams.plan("d", [0.3, 0.19, 0.18, 0.175, 0.16, 0.12], {"kappa": 400.0}, None, **settings)
+    settings = DiagramSettings(periods=101, keep=3, wall=wall)
+    asked = diagrams.plan("d", [0.3, 0.19, 0.18, 0.175, 0.16, 0.12], {"kappa": 400.0}, None, settings)
     ds = diagrams.run(asked)
     assert {1, 2} < set(ds.period.values.tolist())
     end = diagrams._follow(asked.planned, diagrams._table(asked), 8, 101, 3).handover
@@ -202,11 +203,8 @@ def test_progress_is_told():
     ],
 )
 def test_the_door(changed, say):
-    asked = {"along": "d", "values": [0.3, 0.2], "direction": "down", "periods": 400, "keep": 25} | changed
-    axes = {name: asked.pop(name) for name in ("d", "s", "r") if name in asked}
-    settings = {"wall": "soft", "dtype": "float64"} | asked
     with pytest.raises(ValueError, match=say):
-        diagrams.plan(settings.pop("along"), settings.pop("values"), axes, None, **settings)
+        orbit_diagram(**{"along": "d", "values": [0.3, 0.2]} | changed)
 
 
 def test_an_axis_that_is_none_is_named():

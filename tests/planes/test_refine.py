@@ -12,6 +12,7 @@ from vijax.model.records import Status
 from vijax.planes import refine
 from vijax.planes.refine import Mesh
 from vijax.planes.sweep import load, plan, save
+from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots import kind_maps, number_maps
 
 LEVELS = 3
@@ -399,8 +400,8 @@ BAD = [
 def test_bad_levels_are_refused_at_the_door(levels, changes, say):
     choices = {"until": "attractor", "wall": "soft"}
     asked = AXES | choices | changes
-    settings = {name: asked.pop(name) for name in choices}
+    chosen = SweepSettings(**{name: asked.pop(name) for name in choices})
     with pytest.raises(ValueError, match="refine") as error:
-        plan(asked, None, None, periods=40, transient=0, method="exact", dtype="float64", refine=levels, **settings)
+        plan(asked, None, None, chosen, levels)
     assert say in str(error.value)
     assert "\n" not in str(error.value)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import SETTINGS, stand_in
+from helpers import stand_in
 
 from vijax.batch import simulate
 from vijax.model.device import Harvester
@@ -284,7 +284,7 @@ def test_only_what_is_asked_for_is_computed(engine):
 
 
 def test_admissible_asks_for_energy_and_depth(monkeypatch):
-    plan = sweeps.plan({"d": [0.1, 0.2, 0.3, 0.4], "kappa": 20.0, "omega": math.pi}, ["admissible"], None, **SETTINGS)
+    plan = sweeps.plan({"d": [0.1, 0.2, 0.3, 0.4], "kappa": 20.0, "omega": math.pi}, ["admissible"])
     ratio = np.array([[0.5], [1.5], [0.5], [np.nan]])
     found = dataset.label(
         plan, {"energy_ratio": ratio, "deepest": np.array([0.0062, 0.001, 0.0064, 0.001]), "status": np.zeros(4, int)}

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from helpers import SETTINGS, stand_in
+from helpers import stand_in
 
 from vijax.batch import simulate
 from vijax.model.device import Harvester
@@ -277,7 +277,7 @@ def test_a_store_ends_in_zarr(calls, tmp_path, name):
 
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_second_writer_is_refused(calls, out, overwrite):
-    planned = sweeps.plan(AXES, **SETTINGS)
+    planned = sweeps.plan(AXES)
     with tiled_store.opened(planned, out):
         with pytest.raises(BlockingIOError, match=r"out must not be in use; got .*map\.zarr, which another"):
             sweep(**AXES, out=out, overwrite=overwrite)

@@ -187,7 +187,7 @@ def summarise(
         until: "attractor" or "window".
         transient: Periods before the window ("window" only).
         outputs: Names of `Summary` fields that must be there; what only others need is not computed.
-        method: The stepping method (`method.choose` makes it); None for the exact engine.
+        method: The stepping method (`method_choice.choose` makes it); None for the exact engine.
         count: How many cells are real, the rest being padding; all unless given.
         on: The device that runs them; JAX's default unless given.
 

@@ -14,7 +14,8 @@ from vijax.batch.exact_run import exact_run, exact_traced
 from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory
 from vijax.batch.stepped_run import stepped_run
 from vijax.engine.method import Method
-from vijax.engine.method_choice import MethodName, SolverName, choose
+from vijax.engine.method_choice import choose
+from vijax.model.choices import MethodName, SolverName
 from vijax.model.membrane import HuntCrossley, Law
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles

@@ -14,6 +14,7 @@ from vijax.cli.kinds import Real, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress
 from vijax.cli.targets import targets
+from vijax.planes.sweep_settings import SPEED, START_POINTS, SweepSettings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -43,7 +44,7 @@ def coexisting(
     with process.door():
         out, plot = targets(given.pop("out"), given.pop("plot"), _FILES, overwrite)
         axes, made = take_axes(given, _CELL), device(constants)
-        planned = _plan(axes, made, starts, speed, seed, merge_mirrors=merge_mirrors, **given)
+        planned = _plan(axes, made, starts, speed, seed, merge_mirrors, given)
         if plot is not None:
             _check_picture(plot, planned)
         process.keep_compiled()
@@ -61,17 +62,25 @@ def coexisting(
 
 
 def _plan(
-    axes: dict[str, Any], device: Any, starts: int | None, speed: float | None, seed: int | None, **settings: Any
+    axes: dict[str, Any],
+    device: Any,
+    starts: int | None,
+    speed: float | None,
+    seed: int | None,
+    merge_mirrors: bool,
+    given: dict[str, Any],
 ) -> "Plan":
-    from vijax.planes.basins import SPEED, plan_basins, plan_fractions
+    from vijax.planes.basins import plan_basins, plan_fractions
 
+    settings = SweepSettings(**given)
     if starts is not None:
         speed = SPEED if speed is None else speed
-        return plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, **settings)
+        drawn: dict[str, Any] = {"starts": starts, "speed": speed, "seed": seed}
+        return plan_fractions(axes, device, settings, merge_mirrors=merge_mirrors, **drawn)
     for name, value in (("speed", speed), ("seed", seed)):
         if value is not None:
             raise ValueError(f"{name} must come with starts; got {value} alone; add --starts 64")
-    return plan_basins(axes, device, **settings)
+    return plan_basins(axes, device, settings, merge_mirrors=merge_mirrors)
 
 
 def _agree(planned: "Plan", yes: bool) -> None:
@@ -121,7 +130,7 @@ _HELP = {
     "d": "gap, dimensionless [0.2 unless --s, --omega0 or --k is given]",
     "kappa": "stiffness, dimensionless [3 unless --s, --omega0 or --k is given]",
     "u0": "displacements at the start, dimensionless [the whole gap, as many as of v0]",
-    "v0": "velocities at the start, dimensionless [-0.6:0.6:256]",
+    "v0": f"velocities at the start, dimensionless [-{SPEED:g}:{SPEED:g}:{START_POINTS}]",
 }
 
 
@@ -132,12 +141,12 @@ def _sections() -> Sections:
         "Cell and starts": [*options.axis_options(**_HELP), *options.device_options()],
         "Starts in every cell": [
             click.Option(["--starts"], type=Whole(1), help="map parameters instead, with so many starts in every cell"),
-            click.Option(["--speed"], type=speed, help="with --starts: their largest velocity [0.6]"),
+            click.Option(["--speed"], type=speed, help=f"with --starts: their largest velocity [{SPEED:g}]"),
             click.Option(["--seed"], type=Whole(0), help="with --starts: draw them at random [an even lattice]"),
         ],
         "Run": [
             click.Option(["--merge-mirrors"], is_flag=True, help="count mirror images as one attractor (gamma = 0)"),
-            click.Option(["--periods"], type=Whole(1), default=400, show_default=True, help=long),
+            options.setting("periods", long, Whole(1)),
             options.wall_option(),
         ],
         "Files": options.file_options(),

@@ -38,10 +38,12 @@ def difference_map(constants: tuple[str, ...], tolerance: str | None, overwrite:
     finish(dataset, f"{pace}\n{_summary(dataset)}", out, plot, _draw, overwrite)
 
 
-def _plan(axes: dict[str, Any], device: Any, tolerance: str | None, settings: dict[str, Any]) -> "Comparison":
+def _plan(axes: dict[str, Any], device: Any, tolerance: str | None, given: dict[str, Any]) -> "Comparison":
     from vijax.planes.compare import plan
+    from vijax.planes.sweep_settings import SweepSettings
 
-    return plan(axes, None if tolerance is None else part("tolerance", tolerance), device, **settings)
+    largest = None if tolerance is None else part("tolerance", tolerance)
+    return plan(axes, largest, device, SweepSettings(**given))
 
 
 def _check(planned: "Comparison", plot: Path | None) -> None:

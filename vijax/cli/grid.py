@@ -9,6 +9,7 @@ from vijax.cli import sweep as page
 from vijax.cli.compare import difference_map, tolerance_option
 from vijax.cli.kinds import Choice
 from vijax.cli.page import Page, Sections
+from vijax.planes.sweep_settings import SweepSettings
 
 _METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", "chi", "exponent")
 
@@ -30,14 +31,14 @@ def _leave_out(given: dict[str, Any]) -> None:
     """Take out what a comparison does not know, or raise where it was chosen."""
     if (show := given.pop("show")) != "P":
         raise ValueError(f"show must be left out with compare, which shows the difference in P; got {show}")
-    if (wall := given.pop("wall")) != "soft":
+    if (wall := given.pop("wall")) != SweepSettings.wall:
         raise ValueError(f"wall must not be chosen with compare, which runs soft and rigid ones; got {wall!r}")
     if (outputs := given.pop("outputs")) is not None:
         raise ValueError(f"outputs must not be chosen with compare; got {outputs!r}; leave them out")
     if (levels := given.pop("refine")) is not None:
         raise ValueError(f"refine must not be chosen with compare, which computes every cell; got {levels}")
     for name in _METHOD_OPTIONS:
-        if (value := given.pop(name)) not in (None, "exact"):
+        if (value := given.pop(name)) != getattr(SweepSettings, name, None):
             raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
     crew = [given.pop(name) for name in ("workers", "scheduler")]
     if crew != [None, None]:

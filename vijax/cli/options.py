@@ -1,14 +1,16 @@
 """Options that several pages share, by the sections that they stand in, and the words that may be chosen.
 
-Nothing here imports JAX, so that help and completion answer at once. Tests hold the words against those of the rooms
-that know what they mean.
+Nothing here imports JAX, so that help and completion answer at once. Defaults and words of settings are those of the
+record; tests hold the other words against those of the rooms that know what they mean.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import click
 
 from vijax.cli.kinds import Choice, NewFile
+from vijax.planes.sweep_settings import SweepSettings, choices
 
 VALUES = (
     "VALUES are a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE (negative ranges as --gamma=-0.1:0.1:9); "
@@ -33,13 +35,7 @@ AXES = {
 PHYSICAL = {"s", "omega0", "k"}
 DEVICE = PHYSICAL | {"omega", "A", "beta"}
 
-WALLS = ("soft", "rigid")
-UNTIL = ("attractor", "window")
-DTYPES = ("float64", "float32")
-METHODS = ("exact", "ode", "rk4")
-SOLVERS = ("Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5")
 MEMBRANES = ("linear", "hunt-crossley")
-DIRECTIONS = ("down", "up", "both")
 OBJECTIVES = ("P", "power", "speed", "mean", "worst")
 POINT_QUANTITIES = ("v_in", "v_out", "restitution", "phase", "duration", "depth", "E", "P", "u_strobe", "v_strobe")
 BRANCH_QUANTITIES = ("v_in", "phase", "duration", "depth", "P", "multiplier")
@@ -61,15 +57,28 @@ def device_options() -> list[click.Parameter]:
     return [click.Option(["--set", "constants"], multiple=True, metavar="NAME=VALUE", help=text)]
 
 
+def setting(name: str, text: str, kind: Any = None, of: type[SweepSettings] = SweepSettings) -> click.Parameter:
+    """Make the option for a setting, with the record's default.
+
+    Args:
+        name: Of the setting.
+        text: For help.
+        kind: Of its values, unless it is one of the words that the record allows.
+        of: The record.
+    """
+    default, words = getattr(of, name), choices(of).get(name)
+    kind = kind if words is None else Choice(words)
+    return click.Option([f"--{name}"], type=kind, default=default, show_default=default is not None, help=text)
+
+
 def wall_option() -> click.Parameter:
     """Make the option for the kind of the walls."""
-    return click.Option(["--wall"], type=Choice(WALLS), default="soft", show_default=True, help="kind of the walls")
+    return setting("wall", "kind of the walls")
 
 
 def dtype_option() -> click.Parameter:
     """Make the option for the numbers that are computed with."""
-    text = "numbers that are computed with"
-    return click.Option(["--dtype"], type=Choice(DTYPES), default="float64", show_default=True, help=text)
+    return setting("dtype", "numbers that are computed with")
 
 
 def quantity_option(quantities: Sequence[str]) -> click.Parameter:

@@ -10,10 +10,11 @@ import click
 from vijax.cli import options, process
 from vijax.cli.arguments import about, device, take_axes
 from vijax.cli.closing import finish, pace, statuses
-from vijax.cli.kinds import Choice, Whole
+from vijax.cli.kinds import Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress
 from vijax.cli.targets import targets
+from vijax.planes.sweep_settings import DiagramSettings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -67,7 +68,7 @@ def _check_picture(path: Path, planned: "Diagram", quantity: str) -> None:
     check_format(path)
 
 
-def _plan(along: str, axes: dict[str, Any], device: Any, settings: dict[str, Any]) -> "Diagram":
+def _plan(along: str, axes: dict[str, Any], device: Any, given: dict[str, Any]) -> "Diagram":
     from vijax.model.quantities import AXES
     from vijax.planes.axes import parse_axis
     from vijax.planes.orbit_diagram import plan
@@ -79,7 +80,7 @@ def _plan(along: str, axes: dict[str, Any], device: Any, settings: dict[str, Any
         values = parse_axis(name, text)
     if not values.ndim:
         raise ValueError(f"along must have several values, as in {_ALONG}; got {along!r}")
-    return plan(name, values, axes, device, **settings)
+    return plan(name, values, axes, device, DiagramSettings(**given))
 
 
 def _run(diagram: "Diagram") -> "xr.Dataset":
@@ -111,19 +112,16 @@ def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
 
 
 def _sections() -> Sections:
-    shown: dict[str, Any] = {"show_default": True}
     kept = "of these, at the end, how many are recorded"
     return {
         "Sweep": [
-            click.Option(["--along"], default=_ALONG, metavar="AXIS=VALUES", help="axis to sweep", **shown),
-            click.Option(
-                ["--direction"], type=Choice(options.DIRECTIONS), default="down", help="ways along the axis", **shown
-            ),
+            click.Option(["--along"], default=_ALONG, show_default=True, metavar="AXIS=VALUES", help="axis to sweep"),
+            options.setting("direction", "ways along the axis", of=DiagramSettings),
         ],
         "Device": [*options.axis_options(), *options.device_options()],
         "Run": [
-            click.Option(["--periods"], type=Whole(1), default=400, help="forcing periods of every point", **shown),
-            click.Option(["--keep"], type=Whole(1), default=25, help=kept, **shown),
+            options.setting("periods", "forcing periods of every point", Whole(1), DiagramSettings),
+            options.setting("keep", kept, Whole(1), DiagramSettings),
             options.wall_option(),
             options.dtype_option(),
         ],

@@ -3,7 +3,7 @@
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -14,6 +14,7 @@ from vijax.cli.kinds import Choice, Real, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
 from vijax.cli.targets import targets
+from vijax.model.choices import SolverName
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -101,11 +102,13 @@ def _wanted(outputs: str | None, show: str) -> list[str] | None:
     return [name for name in OUTPUTS if name not in ON_REQUEST or name == shown]
 
 
-def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, settings: dict[str, Any]) -> "Plan":
+def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: dict[str, Any]) -> "Plan":
     from vijax.planes.sweep import plan
+    from vijax.planes.sweep_settings import SweepSettings
 
-    settings["membrane"] = _membrane(settings["membrane"], settings.pop("chi"), settings.pop("exponent"))
-    return plan(axes, outputs, device, **settings)
+    membrane = _membrane(*(given.pop(name) for name in ("membrane", "chi", "exponent")))
+    refine = given.pop("refine")
+    return plan(axes, outputs, device, SweepSettings(**given, membrane=membrane), refine)
 
 
 def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
@@ -191,13 +194,10 @@ def plane_options() -> list[click.Parameter]:
 
 def run_options() -> list[click.Parameter]:
     """Make options of how long cells are run."""
-    shown: dict[str, Any] = {"show_default": True}
     return [
-        click.Option(["--periods"], type=Whole(1), default=400, help="forcing periods to run, at most", **shown),
-        click.Option(
-            ["--until"], type=Choice(options.UNTIL), default="attractor", help="what cells are run to", **shown
-        ),
-        click.Option(["--transient"], type=Whole(0), default=0, help="periods to drop before a window", **shown),
+        options.setting("periods", "forcing periods to run, at most", Whole(1)),
+        options.setting("until", "what cells are run to"),
+        options.setting("transient", "periods to drop before a window", Whole(0)),
     ]
 
 
@@ -210,14 +210,15 @@ class _Membrane(Choice):
 
 
 def _method_options() -> list[click.Parameter]:
-    solvers = f"of ode: {', '.join(options.SOLVERS)} [Tsit5]"
+    solvers = get_args(SolverName)
+    listed = f"of ode: {', '.join(solvers)} [Tsit5]"
     above = Real("a finite number above 0", min=0, min_open=True)
     return [
-        click.Option(["--method"], type=Choice(options.METHODS), default="exact", show_default=True, help="engine"),
-        click.Option(["--solver"], type=Choice(options.SOLVERS), metavar="NAME", help=solvers),
-        click.Option(["--rtol"], type=float, help="of ode: relative tolerance of a step [1e-8]"),
-        click.Option(["--atol"], type=above, help="of ode: absolute tolerance of a step [1e-10]"),
-        click.Option(["--steps"], type=Whole(8), help="of rk4: steps per forcing period [1000]"),
+        options.setting("method", "engine"),
+        click.Option(["--solver"], type=Choice(solvers), metavar="NAME", help=listed),
+        options.setting("rtol", "of ode: relative tolerance of a step [1e-8]", float),
+        options.setting("atol", "of ode: absolute tolerance of a step [1e-10]", above),
+        options.setting("steps", "of rk4: steps per forcing period [1000]", Whole(8)),
         click.Option(["--membrane"], type=_Membrane(options.MEMBRANES), help="of ode and rk4 [linear]"),
         click.Option(["--chi"], type=_at_least(0), help="of hunt-crossley: damping over stiffness"),
         click.Option(["--exponent"], type=_at_least(1), help="of hunt-crossley: exponent of the penetration [1.5]"),

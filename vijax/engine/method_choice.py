@@ -3,16 +3,15 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from vijax.engine.method import Method
+from vijax.model.choices import MethodName, SolverName
 from vijax.model.membrane import HuntCrossley, Law, Linear
 from vijax.runtime import checks
 
-MethodName = Literal["exact", "ode", "rk4"]
-SolverName = Literal["Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5"]
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 OPTIONS: dict[MethodName, tuple[str, ...]] = {
     "exact": (),

@@ -1,7 +1,7 @@
 """The vibro-impact pair in its two nondimensional scalings, and the checks of what a user gives."""
 
 import math
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vijax.model import units
+from vijax.model.choices import Walls
 from vijax.model.quantities import check
 from vijax.model.units import Given
 from vijax.runtime import checks
@@ -78,7 +79,6 @@ def damping_ratio(r: Real) -> Float[AnyArray, "..."]:
     return decrement / jnp.sqrt(math.pi**2 + decrement * decrement)
 
 
-Walls = Literal["soft", "rigid"]
 WALLS: tuple[Walls, ...] = get_args(Walls)
 
 

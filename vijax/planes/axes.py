@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from vijax.runtime import checks
 
 if TYPE_CHECKING:
     import xarray as xr
-
-
-Precision = Literal["float64", "float32"]
 
 
 class Parameters(TypedDict, total=False):

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
+from vijax.model.choices import Walls
 from vijax.model.device import Harvester, one_device
 from vijax.model.label import FAILED, label, ordered
-from vijax.model.pair import Walls
 from vijax.model.records import Status
 from vijax.model.units import Given
 from vijax.planes import sweep
 from vijax.planes.axes import Parameters, cells, check_axis
-from vijax.planes.dataset import Plan
+from vijax.planes.dataset import DEFAULT, Plan
+from vijax.planes.sweep_settings import SPEED, START_POINTS, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = ["basin_fractions", "basins", "label"]
 
-SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
-_START_POINTS = 256
 MOST_STARTS = 10**7  # a cell may have so many
 # Invariants of polished orbits agree to 3e-11 from start to start on a dozen planes of 4096 starts, and differ between
 # attractors by 2e-2 and more. In single precision an orbit passes for one of twice its period: there is no `dtype`.
@@ -56,8 +55,8 @@ def basins(
     u0: Given | None = None,
     v0: Given | None = None,
     merge_mirrors: bool = False,
-    periods: int = 400,
-    wall: Walls = "soft",
+    periods: int = SweepSettings.periods,
+    wall: Walls = SweepSettings.wall,
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
@@ -91,42 +90,47 @@ def basins(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
     """
-    planned = plan_basins({**axes, "u0": u0, "v0": v0}, device, merge_mirrors=merge_mirrors, periods=periods, wall=wall)
+    settings = SweepSettings(periods=periods, wall=wall)
+    planned = plan_basins({**axes, "u0": u0, "v0": v0}, device, settings, merge_mirrors=merge_mirrors)
     return matched(sweep.run(planned, progress), merge_mirrors)
 
 
 @door
 def plan_basins(
-    axes: Mapping[str, Any], device: Harvester | None = None, *, merge_mirrors: bool = False, **settings: Any
+    axes: Mapping[str, Any],
+    device: Harvester | None = None,
+    settings: SweepSettings = DEFAULT,
+    *,
+    merge_mirrors: bool = False,
 ) -> Plan:
     """Check what `basins` is asked for and lay out its cells; runs nothing.
 
     Args:
         axes: Value or values of each axis; None counts as not given.
         device, merge_mirrors: As in `basins`.
-        settings: periods, wall: both of them, as in `basins`.
+        settings: Of these periods and wall are read.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
     others = {name: values for name, values in axes.items() if values is not None and name not in ("u0", "v0")}
     u0, v0 = axes.get("u0"), axes.get("v0")
-    v0 = np.linspace(-SPEED, SPEED, _START_POINTS) if v0 is None else check_axis("v0", v0)
+    v0 = np.linspace(-SPEED, SPEED, START_POINTS) if v0 is None else check_axis("v0", v0)
     if u0 is None:
         gap = cells(others, one_device(device), "soft").quantities["d"].values.max()
         u0 = gap * _middles(max(np.size(v0), 2))
-    return _plan({"u0": u0, "v0": v0} | others, device, merge_mirrors, settings)
+    return _plan({"u0": u0, "v0": v0} | others, device, settings, merge_mirrors)
 
 
 @door
 def basin_fractions(
     *,
-    starts: int = 64,
+    starts: int = STARTS,
     speed: float = SPEED,
     seed: int | None = None,
     merge_mirrors: bool = False,
-    periods: int = 400,
-    wall: Walls = "soft",
+    periods: int = SweepSettings.periods,
+    wall: Walls = SweepSettings.wall,
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
@@ -148,16 +152,8 @@ def basin_fractions(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
     """
-    planned = plan_fractions(
-        axes,
-        device,
-        starts=starts,
-        speed=speed,
-        seed=seed,
-        merge_mirrors=merge_mirrors,
-        periods=periods,
-        wall=wall,
-    )
+    settings = SweepSettings(periods=periods, wall=wall)
+    planned = plan_fractions(axes, device, settings, starts=starts, speed=speed, seed=seed, merge_mirrors=merge_mirrors)
     return matched(sweep.run(planned, progress), merge_mirrors)
 
 
@@ -165,18 +161,18 @@ def basin_fractions(
 def plan_fractions(
     axes: Mapping[str, Any],
     device: Harvester | None = None,
+    settings: SweepSettings = DEFAULT,
     *,
-    starts: int,
-    speed: float,
-    seed: int | None,
+    starts: int = STARTS,
+    speed: float = SPEED,
+    seed: int | None = None,
     merge_mirrors: bool = False,
-    **settings: Any,
 ) -> Plan:
     """Check what `basin_fractions` is asked for and lay out its cells; runs nothing.
 
     Args:
         axes, device, starts, speed, seed, merge_mirrors: As in `basin_fractions`.
-        settings: periods, wall: both of them, as in `basins`.
+        settings: As in `plan_basins`.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
@@ -186,17 +182,16 @@ def plan_fractions(
             raise TypeError(f"{name} must be left out where starts are drawn; got {checks.shown(axes[name])}")
     speed, seed = checks.positive("speed", speed), checks.seed(seed)
     starts = checks.whole("starts", starts, 1, MOST_STARTS)
-    planned = _plan(axes, device, merge_mirrors, settings)
+    planned = _plan(axes, device, settings, merge_mirrors)
     check_starts(planned, starts)
     place = spread(starts, seed)
     return started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
 
 
-def _plan(axes: Mapping[str, Any], device: Harvester | None, merge_mirrors: bool, settings: dict[str, Any]) -> Plan:
+def _plan(axes: Mapping[str, Any], device: Harvester | None, settings: SweepSettings, merge_mirrors: bool) -> Plan:
     checks.flag("merge_mirrors", merge_mirrors)
-    planned = sweep.plan(
-        axes, _OUTPUTS, device, until="attractor", transient=0, method="exact", dtype="float64", **settings
-    )
+    settings.only("basins", "periods", "wall")
+    planned = sweep.plan(axes, _OUTPUTS, device, settings)
     gamma = planned.cells.quantities["gamma"].values
     if merge_mirrors and gamma.any():
         got = gamma[gamma != 0].flat[0]

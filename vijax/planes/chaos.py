@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
+from vijax.model.choices import Walls
 from vijax.model.device import Harvester
-from vijax.model.pair import Walls
 from vijax.planes import sweep
 from vijax.planes.axes import Axes, Parameters
-from vijax.planes.basins import MOST_STARTS, SPEED, check_starts, described, plan_fractions, spread, started
+from vijax.planes.basins import MOST_STARTS, check_starts, described, plan_fractions, spread, started
+from vijax.planes.sweep_settings import SPEED, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -31,10 +32,10 @@ _NEAR = 0.01  # spread of an ensemble around its start, in parts of the gap and 
 @door
 def lyapunov(
     *,
-    starts: int = 64,
+    starts: int = STARTS,
     periods: int = 2000,
     transient: int = 500,
-    wall: Walls = "soft",
+    wall: Walls = SweepSettings.wall,
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
@@ -64,10 +65,10 @@ def lyapunov(
 
     periods = checks.whole("periods", periods, 1)
     place = spread(checks.whole("starts", starts, 2, MOST_STARTS), None)
-    settings = {"until": "window", "transient": transient, "wall": wall, "method": "exact", "dtype": "float64"}
     growths = []
     for done, window in enumerate((_WARM_UP, _WARM_UP + periods)):
-        planned = sweep.plan(axes, ("lyapunov",), device, periods=window, **settings)
+        settings = SweepSettings(periods=window, until="window", transient=transient, wall=wall)
+        planned = sweep.plan(axes, ("lyapunov",), device, settings)
         of = planned.cells.quantities
         check_starts(planned, starts)
         near = started(planned, of["u0"] * (1 - _NEAR * (0.5 + place[0])), of["v0"] + _NEAR * place[1])
@@ -102,7 +103,7 @@ def survival(
     speed: float = SPEED,
     seed: int | None = None,
     periods: int = 10_000,
-    wall: Walls = "soft",
+    wall: Walls = SweepSettings.wall,
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
@@ -132,11 +133,12 @@ def survival(
 
     step = checks.whole("periods", periods, _INSTANTS) // _INSTANTS
     after = step * np.arange(1, _INSTANTS + 1)
-    planned = plan_fractions(axes, device, starts=starts, speed=speed, seed=seed, periods=_WATCHED, wall=wall)
+    settings = SweepSettings(periods=_WATCHED, wall=wall)
+    planned = plan_fractions(axes, device, settings, starts=starts, speed=speed, seed=seed)
     alive = []
     for done, instant in enumerate(after):
-        settings = planned.settings | {"until": "window", "transient": int(instant)}
-        watched = replace(planned, settings=settings, outputs=("impacts_per_period", "lyapunov", "status"))
+        then = replace(settings, until="window", transient=int(instant))
+        watched = replace(planned, settings=then, outputs=("impacts_per_period", "lyapunov", "status"))
         found = sweep.run(watched, _share_of(progress, done, _INSTANTS))
         alive.append((found["lyapunov"] * _WATCHED > _GROWN) & (found["impacts_per_period"] > _RARE))
     chaotic = xr.concat(alive, xr.Variable("after", after, described("forcing periods")))

@@ -6,18 +6,19 @@ finished comparison.
 
 import enum
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Unpack
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Unpack, get_args
 
 import numpy as np
 
+from vijax.model.choices import Precision, Until, Walls
 from vijax.model.device import Harvester
 from vijax.model.label import ordered
 from vijax.model.records import Status
 from vijax.planes import sweep
-from vijax.planes.axes import Axes, Precision
-from vijax.planes.dataset import Plan
-from vijax.planes.sweep import Until
+from vijax.planes.axes import Axes
+from vijax.planes.dataset import DEFAULT, Plan
+from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -66,11 +67,11 @@ class Comparison:
 def compare(
     *,
     tolerance: float | None = None,
-    periods: int = 400,
-    until: Until = "attractor",
-    transient: int = 0,
+    periods: int = SweepSettings.periods,
+    until: Until = SweepSettings.until,
+    transient: int = SweepSettings.transient,
     device: Harvester | None = None,
-    dtype: Precision = "float64",
+    dtype: Precision = SweepSettings.dtype,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
@@ -99,28 +100,30 @@ def compare(
 
     Source: Eqs. (36)-(38), corrected; a rigid wall's penetration by Eq. (35).
     """
-    planned = plan(axes, tolerance, device, periods=periods, until=until, transient=transient, dtype=dtype)
-    return run(planned, progress)
+    settings = SweepSettings(periods=periods, until=until, transient=transient, dtype=dtype)
+    return run(plan(axes, tolerance, device, settings), progress)
 
 
 @door
 def plan(
-    axes: Mapping[str, Any], tolerance: float | None = None, device: Harvester | None = None, **settings: Any
+    axes: Mapping[str, Any],
+    tolerance: float | None = None,
+    device: Harvester | None = None,
+    settings: SweepSettings = DEFAULT,
 ) -> Comparison:
     """Check what a comparison is asked for and lay out its cells; runs nothing.
 
     Args:
         axes, tolerance, device: As in `compare`.
-        settings: periods, until, transient, dtype: all of them, as in `compare`.
+        settings: Of these periods, until, transient and dtype are read.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
     if tolerance is not None:
         tolerance = _checked(tolerance)
-    soft, rigid = (
-        sweep.plan(axes, COMPARED, device, method="exact", wall=wall, **settings) for wall in ("soft", "rigid")
-    )
+    settings.only("a comparison", "periods", "until", "transient", "dtype")
+    soft, rigid = (sweep.plan(axes, COMPARED, device, replace(settings, wall=wall)) for wall in get_args(Walls))
     return Comparison(soft, rigid, tolerance)
 
 

@@ -21,6 +21,7 @@ from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.quantities import AXES
 from vijax.model.records import Status
 from vijax.planes.axes import Cells
+from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import tiles
 
 if TYPE_CHECKING:
@@ -28,16 +29,24 @@ if TYPE_CHECKING:
 
 Found = dict[str, Any]  # field of Summary -> xr.Variable
 
+DEFAULT = SweepSettings()  # made here: it loads JAX, which the room of the settings must not
+
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep that has passed the door: its cells, its settings by name, its method unless it is the exact one.
+    """A sweep that has passed the door.
 
-    And the outputs wanted, the device, and the levels of refinement, 0 where every cell is computed.
+    Attributes:
+        cells: What is simulated.
+        settings: How.
+        method: The method of the settings, with what it is told; None for the exact one.
+        outputs: Variables of the map.
+        device: Constants that no axis gives.
+        refine: Levels of refinement, 0 where every cell is computed.
     """
 
     cells: Cells
-    settings: dict[str, Any]
+    settings: SweepSettings
     method: Method | None
     outputs: tuple[str, ...]
     device: Harvester
@@ -153,7 +162,7 @@ def specimen(planned: Plan) -> "xr.Dataset":
     """The map of the first cell alone, its numbers void: what kind of variables there will be."""
     first = planned.cut({dim: slice(1) for dim in planned.cells.dynamic})
     variants = math.prod(planned.cells.sizes[dim] for dim in planned.cells.variant)
-    blank = simulate.blank(1, variants, planned.settings["dtype"])
+    blank = simulate.blank(1, variants, planned.settings.dtype)
     return label(first, {name: np.asarray(getattr(blank, name)) for name in planned.needs})
 
 
@@ -191,7 +200,7 @@ def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":
     values = output.formula(found, planned) if output.formula else found[output.needs[0]]
     values = values.transpose(*(dim for dim in planned.cells.sizes if dim in values.dims))
     # Scales are float64 whatever the cells were computed in.
-    values = values.astype(planned.settings["dtype"] if values.dtype.kind == "f" else values.dtype)
+    values = values.astype(planned.settings.dtype if values.dtype.kind == "f" else values.dtype)
     values.attrs = {"units": output.units, "long_name": output.description}
     return values
 
@@ -206,12 +215,13 @@ def coordinates(of: Cells) -> "dict[str, xr.Variable]":
     return found
 
 
-def provenance(planned: Plan) -> dict[str, Any]:
-    """How a map was made: versions, commit, machine, and all that was asked."""
+def provenance(planned: Plan, **further: Any) -> dict[str, Any]:
+    """Tell how a map was made: versions, commit, machine, `further` facts, and all that was asked."""
     return {
         "title": "Energy harvested by a vibro-impact pair",
         "Conventions": "CF-1.11",
         **made_by(),
+        **further,
         **asked(planned),
     }
 
@@ -235,12 +245,12 @@ def asked(planned: Plan) -> dict[str, Any]:
     # The constants that axes stand for are coordinates.
     constants = [name for name in CONSTANTS if name not in AXES]
     return {
-        **planned.settings,
+        **planned.settings.told,
         **record(planned.method),
         "outputs": " ".join(planned.outputs),
         **{f"harvester_{name}": float(getattr(planned.device, name)) for name in constants},
         "harvester_penetration_limit": float(planned.device.depth_limit),
-        **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings["dtype"]).items()},
+        **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings.dtype).items()},
     }
 
 

@@ -150,15 +150,15 @@ def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> 
     needs = planned.needs
 
     def column(quantity: "xr.Variable") -> jax.Array:
-        return jnp.asarray(of.flat(quantity, rows).astype(settings["dtype"]))
+        return jnp.asarray(of.flat(quantity, rows).astype(settings.dtype))
 
     def factors(scale: "xr.Variable") -> jax.Array:
-        own = of.factors(scale).astype(settings["dtype"])
+        own = of.factors(scale).astype(settings.dtype)
         return jnp.asarray(np.resize(own, padded(own.size)))
 
     d, kappa, r, gamma, u0, v0 = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0"))
     summary = simulate.summarise(
-        ImpactPair(d=d, kappa=kappa if settings["wall"] == "soft" else None, r=r, gamma=gamma),
+        ImpactPair(d=d, kappa=kappa if settings.wall == "soft" else None, r=r, gamma=gamma),
         u0,
         v0,
         simulate.Scale(
@@ -167,10 +167,10 @@ def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> 
             length_variant=factors(of.length),
             speed_variant=factors(of.speed),
         ),
-        jax.tree.map(lambda constant: np.asarray(constant, settings["dtype"]), planned.device),
-        periods=settings["periods"],
-        until=settings["until"],
-        transient=settings["transient"],
+        jax.tree.map(lambda constant: np.asarray(constant, settings.dtype), planned.device),
+        periods=settings.periods,
+        until=settings.until,
+        transient=settings.transient,
         outputs=needs,
         method=planned.method,
         count=count,

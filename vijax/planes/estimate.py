@@ -95,7 +95,7 @@ class Watch:
 
 
 def _periods(planned: Plan) -> int:
-    return planned.settings["periods"] + planned.settings["transient"]
+    return planned.settings.periods + planned.settings.transient
 
 
 def _level(planned: Plan) -> str:
@@ -106,11 +106,11 @@ def _kind(planned: Plan) -> str:
     """Runs of one kind keep one pace."""
     settings = planned.settings
     devices = f"{len(places())} {places()[0].device_kind}"
-    return f"{settings['method']} {settings['until']} {settings['dtype']} {_level(planned)} {devices}"
+    return f"{settings.method} {settings.until} {settings.dtype} {_level(planned)} {devices}"
 
 
 def _slow(planned: Plan) -> float:
-    method = planned.settings["method"]
+    method = planned.settings.method
     return _SLOW[f"exact {_level(planned)}" if method == "exact" else method]
 
 

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import as_completed
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +17,16 @@ import numpy as np
 from vijax.batch import simulate
 from vijax.batch.impact_log import Record, record
 from vijax.model import energy
+from vijax.model.choices import Direction, Precision, Walls
 from vijax.model.device import Harvester, one_device
-from vijax.model.pair import WALLS, ImpactPair, Walls
+from vijax.model.pair import ImpactPair
 from vijax.model.quantities import AXES
 from vijax.model.records import State, Status
 from vijax.model.units import Given
 from vijax.planes import estimate
-from vijax.planes.axes import Axes, Precision, cells, check_axis
+from vijax.planes.axes import Axes, cells, check_axis
 from vijax.planes.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
-from vijax.planes.sweep import most_periods
+from vijax.planes.sweep_settings import DiagramSettings
 from vijax.runtime import checks, context
 from vijax.runtime.context import door
 from vijax.runtime.tiles import arrays, padded, workers
@@ -35,9 +36,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _WAITING = logging.getLogger("vijax.waiting")  # see `dispatch`
-Direction = Literal["down", "up", "both"]
 _WAYS: dict[Direction, tuple[str, ...]] = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
-_CHOICES: dict[str, tuple[str, ...]] = {"direction": tuple(_WAYS), "wall": WALLS, "dtype": get_args(Precision)}
+_DEFAULT = DiagramSettings()
 # A call takes chains so many points further: one compiled program for diagrams of every length.
 _LINKS = 64
 _FEWEST_LANES, _MOST_LANES = 8, 512
@@ -72,12 +72,12 @@ def orbit_diagram(
     *,
     along: str,
     values: Given,
-    direction: Direction = "down",
-    periods: int = 400,
-    keep: int = 25,
-    wall: Walls = "soft",
+    direction: Direction = DiagramSettings.direction,
+    periods: int = DiagramSettings.periods,
+    keep: int = DiagramSettings.keep,
+    wall: Walls = DiagramSettings.wall,
     device: Harvester | None = None,
-    dtype: Precision = "float64",
+    dtype: Precision = DiagramSettings.dtype,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
@@ -120,17 +120,28 @@ def orbit_diagram(
 
     Source: the procedure of the paper's bifurcation diagrams.
     """
-    settings = {"direction": direction, "periods": periods, "keep": keep, "wall": wall, "dtype": dtype}
-    return run(plan(along, values, axes, device, **settings), progress)
+    settings = DiagramSettings(periods=periods, wall=wall, dtype=dtype, direction=direction, keep=keep)
+    return run(plan(along, values, axes, device, settings), progress)
 
 
 @dataclass(frozen=True)
 class Diagram:
-    """An orbit diagram that has passed the door: what a sweep's plan holds, the axis swept, the ways it is gone."""
+    """An orbit diagram that has passed the door.
+
+    Attributes:
+        planned: What a sweep's plan holds.
+        along: The axis swept.
+        settings: Those of the plan, with the directions and how much is kept.
+    """
 
     planned: Plan
     along: str
-    ways: tuple[str, ...]
+    settings: DiagramSettings
+
+    @property
+    def ways(self) -> tuple[str, ...]:
+        """Directions in which the axis is gone along."""
+        return _WAYS[self.settings.direction]
 
     @property
     def dims(self) -> dict[str, int]:
@@ -152,46 +163,45 @@ class Diagram:
     @property
     def expected(self) -> estimate.Estimate:
         """What it asks of the machine."""
-        return estimate.of_recorded(self.count, self.planned.settings["periods"], self.size)
+        return estimate.of_recorded(self.count, self.settings.periods, self.size)
 
     @property
     def size(self) -> int:
         """Bytes of the dataset where there are two impacts a period."""
-        return 8 * self.count * (self.planned.settings["keep"] * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
+        return 8 * self.count * (self.settings.keep * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
 
 
 @door
-def plan(along: str, values: Any, axes: Mapping[str, Any], device: Harvester | None = None, **settings: Any) -> Diagram:
+def plan(
+    along: str,
+    values: Any,
+    axes: Mapping[str, Any],
+    device: Harvester | None = None,
+    settings: DiagramSettings = _DEFAULT,
+) -> Diagram:
     """Check what an orbit diagram is asked for; runs nothing.
 
     Args:
         along, values, device: As in `orbit_diagram`.
         axes: Value or values of each other axis; None counts as not given.
-        settings: direction, periods, keep, wall, dtype: all of them, as in `orbit_diagram`.
+        settings: How the points are run.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
     swept = [name for name in AXES if name not in ("u0", "v0")]
     checks.choice("along", along, swept)
-    for name, allowed in _CHOICES.items():
-        checks.choice(name, settings[name], allowed)
     given = {name: value for name, value in axes.items() if value is not None}
     if along in given:
         raise ValueError(f"{along} must not be given twice; got it as the axis swept and as another")
     points = check_axis("values", values, along)
     if not points.ndim:
         raise ValueError(f"values must be a 1-D array of {along}; got {points}")
-    for name in ("periods", "keep"):
-        settings[name] = checks.whole(name, settings[name], 1, most_periods(settings["dtype"]))
-    if settings["keep"] > settings["periods"]:
-        raise ValueError(f"keep must be at most periods; got {settings['keep']} of {settings['periods']}")
     device = one_device(device)
     # A start that a rigid gap does not hold is put back into it: to this door all walls are soft.
     laid_out = cells({**given, along: points}, device, "soft")
     outputs = (*_POINTS, *_IMPACTS, *_STROBES)
-    planned = Plan(laid_out, {"along": along, **settings}, None, outputs, device)
-    diagram = Diagram(planned, along, _WAYS[settings["direction"]])
+    diagram = Diagram(Plan(laid_out, settings, None, outputs, device), along, settings)
     names = ["keep", "values", *(name for name in diagram.dims if name in given)]
     checks.fits(names, diagram.size, f"the impacts of {diagram.count:,} points")
     return diagram
@@ -245,7 +255,7 @@ def _table(diagram: Diagram) -> dict[str, np.ndarray]:
     table = {name: column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0")}
     # In metres per unit of displacement; of a rigid wall the engine's depth is that of kappa = 1.
     table |= {"metres": column(of.length), "speed": column(of.speed)}
-    rigid = diagram.planned.settings["wall"] == "rigid"
+    rigid = diagram.settings.wall == "rigid"
     table["depth"] = table["metres"] / table["kappa"] if rigid else table["metres"]
     return table
 
@@ -271,8 +281,8 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
                 _WAITING.info("running %s", chains)
             else:
                 _WAITING.info("compiling, then running %s", chains)
-            periods, keep = (diagram.planned.settings[name] for name in ("periods", "keep"))
-            running = {pool.submit(_simulate, diagram, table, tile, lanes, periods, keep): tile for tile in tiles}
+            run_for, keep = diagram.settings.periods, diagram.settings.keep
+            running = {pool.submit(_simulate, diagram, table, tile, lanes, run_for, keep): tile for tile in tiles}
             for future in as_completed(running):
                 yield running.pop(future), future.result()
     finally:
@@ -285,7 +295,7 @@ def _simulate(
 ) -> dict[str, np.ndarray]:
     """The fields of the dataset for these chains, [chain, point] or [chain, point, impact or strobe]."""
     planned = diagram.planned
-    table = {name: x[index].astype(planned.settings["dtype"]) for name, x in table.items()}
+    table = {name: x[index].astype(planned.settings.dtype) for name, x in table.items()}
     summary = _follow(planned, table, lanes, periods, keep)
     flown = _fly(planned, table, summary, keep)
     impacts, shape = flown.impacts, table["d"].shape
@@ -323,7 +333,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
             widths = ((0, lanes - chains), (0, _LINKS - links))
             return jnp.asarray(np.pad(x[:, first : first + links], widths, mode="edge"))
 
-        soft = planned.settings["wall"] == "soft"
+        soft = planned.settings.wall == "soft"
         d, kappa, r, gamma = (extended(table[name]) for name in ("d", "kappa", "r", "gamma"))
         summary = simulate.follow(
             ImpactPair(d, kappa if soft else None, r, gamma),
@@ -346,7 +356,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
 
 def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -> Record:
     """The kept periods of every point, flown again from where they begin."""
-    soft = planned.settings["wall"] == "soft"
+    soft = planned.settings.wall == "soft"
     d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
     whole_numbers = (x.astype(np.int32) for x in (n, held))
@@ -365,7 +375,7 @@ def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
         for name, (units, text) in descriptions.items():
             values = fields[name][np.arange(len(given_order))[:, None], given_order]
             values = values.reshape(*sizes.values(), *values.shape[2:])
-            values = values.astype(planned.settings["dtype"]) if values.dtype.kind == "f" else values
+            values = values.astype(planned.settings.dtype) if values.dtype.kind == "f" else values
             variables[name] = xr.Variable((*sizes, *further), values, {"units": units, "long_name": text})
     variables["status"] = flagged(variables["status"])
     of = planned.cells
@@ -375,4 +385,4 @@ def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
     names = np.array(diagram.ways, dtype=np.dtypes.StringDType())
     ways = {"direction": ("direction", names)} if "direction" in sizes else {}
     title = {"title": "Orbit diagram of a vibro-impact pair"}
-    return xr.Dataset(variables, coords=ways | known, attrs=provenance(planned) | title)
+    return xr.Dataset(variables, coords=ways | known, attrs=provenance(planned, along=diagram.along) | title)

@@ -10,21 +10,20 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from vijax.engine import method_choice as methods
-from vijax.engine.method_choice import MethodName, SolverName
+from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
 from vijax.model.device import Harvester, one_device
 from vijax.model.membrane import HuntCrossley, Law
-from vijax.model.pair import WALLS, Walls
 from vijax.planes import cluster, dispatch, estimate, tiled_store
 from vijax.planes import refine as refinement
-from vijax.planes.axes import Axes, Cells, Precision, cells
-from vijax.planes.dataset import ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
+from vijax.planes.axes import Axes, Cells, cells
+from vijax.planes.dataset import DEFAULT, ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
 from vijax.planes.dispatch import Call, Fields
 from vijax.planes.store import check_store, load, save, view
+from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import checks, context
 from vijax.runtime.context import door
 from vijax.runtime.tiles import places
@@ -34,19 +33,17 @@ if TYPE_CHECKING:
 
 __all__ = ["load", "plan", "run", "save", "sweep"]
 
-Until = Literal["attractor", "window"]
-_CHOICES: dict[str, tuple[str, ...]] = {"until": get_args(Until), "wall": WALLS, "dtype": get_args(Precision)}
 _LOG = logging.getLogger(__name__)
 
 
 @door
 def sweep(
     *,
-    periods: int = 400,
-    until: Until = "attractor",
-    transient: int = 0,
-    wall: Walls = "soft",
-    method: MethodName = "exact",
+    periods: int = SweepSettings.periods,
+    until: Until = SweepSettings.until,
+    transient: int = SweepSettings.transient,
+    wall: Walls = SweepSettings.wall,
+    method: MethodName = SweepSettings.method,
     solver: SolverName | None = None,
     rtol: float | None = None,
     atol: float | None = None,
@@ -54,7 +51,7 @@ def sweep(
     steps: int | None = None,
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
-    dtype: Precision = "float64",
+    dtype: Precision = SweepSettings.dtype,
     refine: int | None = None,
     progress: Callable[[int, int], None] | None = None,
     out: str | Path | None = None,
@@ -130,61 +127,48 @@ def sweep(
 
     Source: Eqs. (36)-(38), corrected.
     """
-    planned = plan(
-        axes,
-        outputs,
-        device,
+    settings = SweepSettings(
         periods=periods,
         until=until,
         transient=transient,
         wall=wall,
         method=method,
-        dtype=dtype,
         solver=solver,
         rtol=rtol,
         atol=atol,
         membrane=membrane,
         steps=steps,
-        refine=refine,
+        dtype=dtype,
     )
-    return run(planned, progress, out, overwrite, workers)
+    return run(plan(axes, outputs, device, settings, refine), progress, out, overwrite, workers)
 
 
 @door
 def plan(
-    axes: Mapping[str, Any], outputs: Iterable[str] | None = None, device: Harvester | None = None, **settings: Any
+    axes: Mapping[str, Any],
+    outputs: Iterable[str] | None = None,
+    device: Harvester | None = None,
+    settings: SweepSettings = DEFAULT,
+    refine: int | None = None,
 ) -> Plan:
     """Check what a sweep is asked for and lay out its cells; runs nothing.
 
     Args:
         axes: Value or values of each axis; None counts as not given.
-        outputs: As in `sweep`.
-        device: As in `sweep`.
-        settings: periods, until, transient, wall, method, dtype: all of them, as in `sweep`; and of solver, rtol, atol,
-            membrane, steps, refine those that are given.
+        outputs, device, refine: As in `sweep`.
+        settings: How the cells are run.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
-    for name, allowed in _CHOICES.items():
-        checks.choice(name, settings[name], allowed)
-    for name, least in (("periods", 1), ("transient", 0)):
-        settings[name] = checks.whole(name, settings[name], least, most_periods(settings["dtype"]))
-    if settings["transient"] and settings["until"] == "attractor":
-        raise ValueError(
-            f"transient must be 0 with until='attractor', whose search begins at once; got {settings['transient']}; "
-            "until='window' drops a transient"
-        )
-    refine = settings.pop("refine", None)
-    options = {name: settings.pop(name, None) for name in ("solver", "rtol", "atol", "membrane", "steps")}
-    method = methods.choose(settings["method"], options, wall=settings["wall"], dtype=settings["dtype"])
+    method = settings.integrator()
     if outputs is None:
         outputs = (name for name in OUTPUTS if name not in ON_REQUEST)
     wanted = checks.words("outputs", outputs, OUTPUTS)
     device = one_device(device)
     given = {name: values for name, values in axes.items() if values is not None}
     lossy = method is None or not isinstance(method.law, HuntCrossley)
-    laid_out = cells(given, device, settings["wall"], restitution=lossy)
+    laid_out = cells(given, device, settings.wall, restitution=lossy)
     return Plan(
         cells=laid_out,
         settings=settings,
@@ -192,13 +176,8 @@ def plan(
         # No map can be read without knowing how its cells ended.
         outputs=tuple(name for name in OUTPUTS if name in wanted or name == "status"),
         device=device,
-        refine=0 if refine is None else _levels(refine, laid_out, settings["until"]),
+        refine=0 if refine is None else _levels(refine, laid_out, settings.until),
     )
-
-
-def most_periods(dtype: str) -> int:
-    """Periods that a cell may be told to run: two such numbers together are still counted one by one."""
-    return min(checks.MOST, 1 << int(np.finfo(dtype).nmant))
 
 
 def _levels(refine: Any, of: Cells, until: str) -> int:

@@ -1,0 +1,135 @@
+"""How the cells of a plane are run: what a user may set, its defaults, and what is wrong with a setting.
+
+Nothing here loads JAX until a record is made, so that help of the command can tell defaults and choices at once.
+"""
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+
+from vijax.model.choices import Direction, MethodName, Precision, SolverName, Until, Walls
+
+if TYPE_CHECKING:
+    from vijax.engine.method import Method
+    from vijax.model.membrane import Law
+
+STARTS = 64  # that fractions of basins are told by in every cell, to a standard error of 0.06 at most
+START_POINTS = 256  # along either side of a plane of starts: its picture is as fine as a page shows it
+SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
+
+_OPTIONS = ("solver", "rtol", "atol", "membrane", "steps")  # what methods are told, each its own
+_OF_DIAGRAMS = ("direction", "periods", "keep", "wall", "dtype")
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """How cells are run, whatever plane they are of; each is an argument of `vijax.sweep` too.
+
+    Attributes:
+        periods: Forcing periods to run, 400: at most (until="attractor"), or after the transient (until="window").
+            With fewer more cells stay undecided, their status SLOW.
+        until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
+            `transient` periods and measures over the next `periods`.
+        transient: Forcing periods to drop before a window, 0. The search for an attractor begins at once and takes
+            none; where it finds nothing, averages leave out the first quarter of `periods`.
+        wall: "soft" or "rigid".
+        method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
+            paper's fixed steps without event location.
+        solver: Of "ode", one of `SolverName`; Tsit5 if None.
+        rtol, atol: Of "ode": tolerances of position and velocity step by step; 1e-8 and 1e-10 if None, in single
+            precision 1e-4 and 1e-6.
+        membrane: Of "ode" and "rk4": a `HuntCrossley`; the linear one if None.
+        steps: Of "rk4": steps per forcing period; 1000 if None.
+        dtype: "float64", or "float32" with tolerances to match.
+
+    Raises:
+        ValueError: Which setting, what must hold, what came.
+    """
+
+    periods: int = 400
+    until: Until = "attractor"
+    transient: int = 0
+    wall: Walls = "soft"
+    method: MethodName = "exact"
+    solver: SolverName | None = None
+    rtol: float | None = None
+    atol: float | None = None
+    membrane: "Law | None" = None
+    steps: int | None = None
+    dtype: Precision = "float64"
+
+    def __post_init__(self) -> None:
+        from vijax.runtime import checks
+
+        for name, allowed in choices(type(self)).items():
+            checks.choice(name, getattr(self, name), allowed)
+        self._count("periods", 1)
+        self._count("transient", 0)
+        if self.transient and self.until == "attractor":
+            raise ValueError(
+                f"transient must be 0 with until='attractor', whose search begins at once; got {self.transient}; "
+                "until='window' drops a transient"
+            )
+        self.integrator()
+
+    def _count(self, name: str, least: int) -> None:
+        """Put a number of periods in place of what was given for it, as a frozen record lets only itself do."""
+        import numpy as np
+
+        from vijax.runtime import checks
+
+        # Two such numbers together are still counted one by one by the floats of the program.
+        most = min(checks.MOST, 1 << int(np.finfo(self.dtype).nmant))
+        object.__setattr__(self, name, checks.whole(name, getattr(self, name), least, most))
+
+    def integrator(self) -> "Method | None":
+        """Give the method with what it is told; None for the exact one."""
+        from vijax.engine.method_choice import choose
+
+        told = {name: getattr(self, name) for name in _OPTIONS}
+        return choose(self.method, told, wall=self.wall, dtype=self.dtype)
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The settings by name, as attributes of a dataset; `engine.method_choice.record` has what a method is told."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _OPTIONS}
+
+    def only(self, of: str, *names: str) -> None:
+        """Raise ValueError if a setting besides these differs from its default: `of` would not read it."""
+        from vijax.runtime import checks
+
+        for field in fields(self):
+            if field.name not in names and (given := getattr(self, field.name)) != field.default:
+                raise ValueError(f"{field.name} must be left out of {of}; got {checks.shown(given)}")
+
+
+@dataclass(frozen=True)
+class DiagramSettings(SweepSettings):
+    """How the points of an orbit diagram are run: of a sweep's settings periods, wall and dtype, and two more.
+
+    Attributes:
+        direction: Ways along the axis that is swept, "down", "up" or "both"; "down".
+        keep: How many of the periods, at the end, are recorded, 25.
+
+    Raises:
+        ValueError: Which setting, what must hold, what came.
+    """
+
+    direction: Direction = "down"
+    keep: int = 25
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.only("an orbit diagram", *_OF_DIAGRAMS)
+        self._count("keep", 1)
+        if self.keep > self.periods:
+            raise ValueError(f"keep must be at most periods; got {self.keep} of {self.periods}")
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The settings that a diagram reads by name, as attributes of a dataset."""
+        return {name: getattr(self, name) for name in _OF_DIAGRAMS}
+
+
+def choices(settings: type[SweepSettings]) -> dict[str, tuple[str, ...]]:
+    """Find the settings that are one of a few words, and the words."""
+    return {field.name: get_args(field.type) for field in fields(settings) if get_origin(field.type) is Literal}
