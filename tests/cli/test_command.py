@@ -15,8 +15,6 @@ from helpers import SCRIPTS
 import vijax
 from vijax.cli import main as command
 from vijax.cli import process
-from vijax.cli.options import AXES
-from vijax.model.quantities import AXES as QUANTITIES
 from vijax.orbits import orbit_search, switching
 from vijax.plots import branch_diagrams, orbit_diagrams
 
@@ -161,10 +159,6 @@ def test_the_least_that_may_be_given_is_that_of_python(folder, capsys, line):
     with pytest.raises(ValueError, match="must be") as refused:
         LEAST[line]()
     assert capsys.readouterr().err == f"error: {refused.value}\n"
-
-
-def test_every_axis_has_an_option():
-    assert set(AXES) == set(QUANTITIES)
 
 
 # --- help ------------------------------------------------------------------------------------------------------------

@@ -5,7 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from vijax.cli.options import AXES, PHYSICAL
+from vijax.cli.options import PHYSICAL
+from vijax.model.quantities import AXES
 
 if TYPE_CHECKING:
     from vijax.model.device import Harvester

@@ -126,11 +126,9 @@ def _row(entry: "xr.Dataset") -> str:
 
 # --- the page --------------------------------------------------------------------------------------------------------
 
-_HELP = {
-    "d": "gap, dimensionless [0.2 unless --s, --omega0 or --k is given]",
-    "kappa": "stiffness, dimensionless [3 unless --s, --omega0 or --k is given]",
-    "u0": "displacements at the start, dimensionless [the whole gap, as many as of v0]",
-    "v0": f"velocities at the start, dimensionless [-{SPEED:g}:{SPEED:g}:{START_POINTS}]",
+_DEFAULTS = {name: options.unless_physical(text) for name, text in _CELL.items()} | {
+    "u0": "the whole gap, as many as of v0",
+    "v0": f"-{SPEED:g}:{SPEED:g}:{START_POINTS}",
 }
 
 
@@ -138,7 +136,7 @@ def _sections() -> Sections:
     speed = Real("a positive finite number", min=0, min_open=True)
     long = "forcing periods to look for an attractor"
     return {
-        "Cell and starts": [*options.axis_options(**_HELP), *options.device_options()],
+        "Cell and starts": [*options.axis_options(defaults=_DEFAULTS), *options.device_options()],
         "Starts in every cell": [
             click.Option(["--starts"], type=Whole(1), help="map parameters instead, with so many starts in every cell"),
             click.Option(["--speed"], type=speed, help=f"with --starts: their largest velocity [{SPEED:g}]"),

@@ -16,6 +16,7 @@ from vijax.cli.kinds import Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
 from vijax.cli.targets import targets
+from vijax.model.quantities import AXES, BRANCH_QUANTITIES, PARAMETERS
 
 if TYPE_CHECKING:
     from vijax.model.device import Harvester
@@ -118,7 +119,6 @@ def _check_picture(path: Path | None, quantity: str) -> None:
 
 
 def _bounds(along: str) -> tuple[str, tuple[float, float]]:
-    from vijax.model.quantities import AXES
     from vijax.planes.axes import parse_axis
 
     name, sign, text = along.partition("=")
@@ -189,11 +189,11 @@ def _sections() -> Sections:
             click.Option(["--generations"], type=Whole(0), default=1, help=switches, **shown),
         ],
         "Device": [
-            *options.axis_options(u0=None, v0=None),
+            *options.axis_options(PARAMETERS),
             *options.device_options(),
             options.wall_option(),
         ],
-        "Files": [options.quantity_option(options.BRANCH_QUANTITIES), *options.file_options()],
+        "Files": [options.quantity_option(BRANCH_QUANTITIES), *options.file_options()],
     }
 
 

@@ -15,6 +15,7 @@ from vijax.cli.kinds import Choice, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
 from vijax.cli.targets import targets
+from vijax.model.quantities import PARAMETERS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -153,13 +154,12 @@ def _devices(
     import numpy as np
 
     from vijax.design.variables import constant
-    from vijax.model.quantities import AXES
     from vijax.planes.axes import parse_axis
 
     if over is None:
         return None, [at_one_point(axes, device)[1]]
     name, sign, text = over.partition("=")
-    if not sign or name not in AXES or name in ("u0", "v0"):
+    if not sign or name not in PARAMETERS:
         raise ValueError(f"over must be NAME=VALUES, as in d=0.05:0.3:64; got {over!r}")
     if name in axes:
         raise ValueError(f"over must name an axis that is not given besides; got {name}, also given by --{name}")
@@ -206,11 +206,10 @@ def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
     import numpy as np
 
     from vijax.design.variables import LINEAR, limits
-    from vijax.model.quantities import AXES
     from vijax.planes.orbit_diagram import orbit_diagram
     from vijax.plots.designs import close_view
 
-    along = next((name for name in found.tune if name in AXES), "omega0")
+    along = next((name for name in found.tune if name in PARAMETERS), "omega0")
     device = found.best.device if found.best else device
     low, high = limits((along,), {along: found.bounds[along]} if along in found.bounds else {}, device)[:, 0]
     values = (np.linspace if along in LINEAR else np.geomspace)(low, high, _POINTS)
@@ -257,7 +256,7 @@ def _sections() -> Sections:
             click.Option(["--balls"], type=Whole(1), default=8, help="starts of the survey at each of them", **shown),
             click.Option(["--impacts"], type=Whole(1), default=16, help="most impacts of an orbit", **shown),
         ],
-        "Device": [*options.axis_options(u0=None, v0=None), *options.device_options()],
+        "Device": [*options.axis_options(PARAMETERS), *options.device_options()],
         "Files": options.file_options(".json", "report"),
         "Large runs": [options.size_option()],
     }

@@ -1,15 +1,18 @@
 """Options that several pages share, by the sections that they stand in, and the words that may be chosen.
 
 Nothing here imports JAX, so that help and completion answer at once. Defaults and words of settings are those of the
-record; tests hold the other words against those of the rooms that know what they mean.
+record, texts of axes those of the table of quantities; tests hold the other words against those of the rooms that know
+what they mean.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import click
 
 from vijax.cli.kinds import Choice, NewFile
+from vijax.model.quantities import AXES, Quantity, synonyms
 from vijax.planes.sweep_settings import SweepSettings, choices
 
 VALUES = (
@@ -17,38 +20,36 @@ VALUES = (
     "a number may be a multiple of pi, as in 6pi, and all may have units, as in 2Hz:10Hz:9 or 20deg (Hz are turns a "
     "second)."
 )
-AXES = {
-    "d": "gap, dimensionless",
-    "kappa": "stiffness, dimensionless",
-    "r": "coefficient of restitution [0.5]",
-    "gamma": "gravity along the axis over forcing amplitude [0]",
-    "omega": "frequency of the forcing, rad/s [pi]",
-    "s": "gap, m [0.3]",
-    "omega0": "natural frequency of ball and membrane, rad/s [400]",
-    "k": "stiffness, N/m [560]",
-    "A": "amplitude of the forcing, m/s^2 [1]",
-    "beta": "inclination, rad [0]",
-    "u0": "displacement at the start, dimensionless [min(0.05853, 0.49 d)]",
-    "v0": "velocity at the start, dimensionless [-0.47898]",
-}
-# One physical name among these, and the plane is the device's: what is not given is taken from Tables I and II.
-PHYSICAL = {"s", "omega0", "k"}
-DEVICE = PHYSICAL | {"omega", "A", "beta"}
+DEVICE = {name for name, axis in AXES.items() if axis.unit}
+# One of these besides d and kappa, and the plane is the device's: what is not given is taken from Tables I and II.
+PHYSICAL = {name for of in ("d", "kappa") for name in synonyms(of) if name in DEVICE}
 
 MEMBRANES = ("linear", "hunt-crossley")
 OBJECTIVES = ("P", "power", "speed", "mean", "worst")
-POINT_QUANTITIES = ("v_in", "v_out", "restitution", "phase", "duration", "depth", "E", "P", "u_strobe", "v_strobe")
-BRANCH_QUANTITIES = ("v_in", "phase", "duration", "depth", "P", "multiplier")
 
 
-def axis_options(**changed: str | None) -> list[click.Parameter]:
+def axis_options(
+    axes: Mapping[str, Quantity] = AXES, defaults: Mapping[str, str] = MappingProxyType({})
+) -> list[click.Parameter]:
     """Make an option of every axis.
 
     Args:
-        changed: Another help text for an axis; None where there is no such option.
+        axes: Which axes.
+        defaults: What some of them are unless given, where that is not what the table says.
     """
-    helps = AXES | changed
-    return [click.Option([f"--{name}", name], metavar="VALUES", help=text) for name, text in helps.items() if text]
+    helps = {name: _help(axis, defaults.get(name, axis.default)) for name, axis in axes.items()}
+    return [click.Option([f"--{name}", name], metavar="VALUES", help=text) for name, text in helps.items()]
+
+
+def unless_physical(text: str) -> str:
+    """Say that an axis has a default where no physical name is given."""
+    return f"{text} unless --s, --omega0 or --k is given"
+
+
+def _help(axis: Quantity, default: str) -> str:
+    """Say what an axis is, in which unit, and what it is unless given."""
+    unit = f", {axis.unit}" if axis.unit else ""
+    return f"{axis.long_name}{unit}" + (f" [{default}]" if default else "")
 
 
 def device_options() -> list[click.Parameter]:

@@ -14,6 +14,7 @@ from vijax.cli.kinds import Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress
 from vijax.cli.targets import targets
+from vijax.model.quantities import AXES, POINT_QUANTITIES
 from vijax.planes.sweep_settings import DiagramSettings
 
 if TYPE_CHECKING:
@@ -69,7 +70,6 @@ def _check_picture(path: Path, planned: "Diagram", quantity: str) -> None:
 
 
 def _plan(along: str, axes: dict[str, Any], device: Any, given: dict[str, Any]) -> "Diagram":
-    from vijax.model.quantities import AXES
     from vijax.planes.axes import parse_axis
     from vijax.planes.orbit_diagram import plan
 
@@ -125,7 +125,7 @@ def _sections() -> Sections:
             options.wall_option(),
             options.dtype_option(),
         ],
-        "Files": [options.quantity_option(options.POINT_QUANTITIES), *options.file_options()],
+        "Files": [options.quantity_option(POINT_QUANTITIES), *options.file_options()],
         "Large runs": [options.size_option()],
     }
 

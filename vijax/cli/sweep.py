@@ -186,10 +186,8 @@ def _place(peak: "xr.DataArray", dataset: "xr.Dataset") -> str:
 
 def plane_options() -> list[click.Parameter]:
     """Make options of the axes, with the plane that is mapped by default, and of the device."""
-    planes = {
-        name: f"{options.AXES[name]} [{text} unless --s, --omega0 or --k is given]" for name, text in PLANE.items()
-    }
-    return [*options.axis_options(**planes), *options.device_options()]
+    planes = {name: options.unless_physical(text) for name, text in PLANE.items()}
+    return [*options.axis_options(defaults=planes), *options.device_options()]
 
 
 def run_options() -> list[click.Parameter]:

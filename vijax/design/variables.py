@@ -10,17 +10,16 @@ import numpy as np
 
 from vijax.model import units
 from vijax.model.device import CONSTANTS, Harvester
-from vijax.model.quantities import check
+from vijax.model.quantities import PARAMETERS, check
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
-# Other names of what a constant decides: each is applied after the constants, in this order.
-_ALIASES = {"k": "omega0", "kappa": "omega0", "d": "s", "gamma": "beta"}
+# Other names of what a constant decides: each is applied after the constants.
+_ALIASES = {name: axis.alias_of for name, axis in PARAMETERS.items() if axis.alias_of}
 LINEAR = ("beta", "gamma")  # may be zero or negative: their variable is the value, that of others its logarithm
 _LEAST_KAPPA, _MOST_KAPPA = 2.0, 400.0
 _LEAST_R, _MOST_R = 0.05, 0.95
 _TILT = 0.1  # rad
-_MOVING = ("omega0", "s", "r", "A", "omega", "beta")  # the motion depends on these
 NAMES = CONSTANTS + tuple(_ALIASES)
 
 
@@ -31,7 +30,7 @@ def constant(name: str) -> str:
 
 def moving(name: str) -> bool:
     """Whether the motion depends on it, and not the energies alone."""
-    return constant(name) in _MOVING
+    return constant(name) in PARAMETERS
 
 
 @door

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Union
 import numpy as np
 from jaxtyping import ArrayLike
 
+from vijax.model.quantities import AXES, MEASURED, QUANTITIES, synonyms
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -22,27 +23,10 @@ if TYPE_CHECKING:
 Given = Union[ArrayLike, Sequence[float], "Quantity[Any]"]
 """What may be given for a quantity: a number, an array or list of them, or such a quantity of pint."""
 
-UNITS = {
-    "omega": "rad/s",
-    "omega0": "rad/s",
-    "k": "N/m",
-    "s": "m",
-    "A": "m/s^2",
-    "beta": "rad",
-    "m_b": "kg",
-    "g": "m/s^2",
-    "w0": "m",
-    "R0": "m",
-    "eps_M": "F/m",
-    "C_T": "F",
-    "V": "V",
-    "r_b": "m",
-    "penetration_limit": "m",
-    "depth": "m",
-}
+UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
+UNITS["depth"] = MEASURED["depth"].units
 """What plain numbers are in; a quantity that is not here has no unit."""
 
-_WITH_UNIT = {"d": "s", "kappa": "omega0 or k", "gamma": "beta"}
 _PI = r"pi(?![^\W\d])"  # not the pico of picofarads
 _ONE = r"(?:[^\W\d]+|°)(?:(?:\^|\*\*)-?\d)?"
 # A multiple of pi keeps its pi, which pint would take for a unit.
@@ -52,14 +36,14 @@ _WRITTEN = re.compile(
 
 
 def split(text: str) -> tuple[str, str]:
-    """A number and its unit, as in 5Hz, 6pi rad/s or 20deg; the unit is empty where there is none."""
+    """Split a number and its unit, as in 5Hz, 6pi rad/s or 20deg; the unit is empty where there is none."""
     text = text.strip()
     written = _WRITTEN.fullmatch(text)
     return (written[1], written[2]) if written else (text, "")
 
 
 def with_unit(name: str, value: float, unit: str) -> float:
-    """A value in some unit as a plain number of the quantity `name`.
+    """Convert a value in some unit to a plain number of the quantity `name`.
 
     Raises:
         ValueError: If no such unit is known, or it is not one of the quantity.
@@ -68,7 +52,7 @@ def with_unit(name: str, value: float, unit: str) -> float:
 
 
 def plain(name: str, value: Any) -> Any:
-    """A quantity of pint, or a list of them, as plain numbers; whatever else comes is returned as it is.
+    """Turn a quantity of pint, or a list of them, into plain numbers; return whatever else comes as it is.
 
     Args:
         name: The quantity that is meant.
@@ -102,14 +86,15 @@ def _factor_of(name: str, text: str) -> float:
 
 
 def _factor(name: str, unit: Any) -> float:
-    """How many of the quantity's own units a unit of pint is."""
+    """Find how many of the quantity's own units a unit of pint is."""
     import pint
 
     one = 1.0 * unit
     if name not in UNITS:
         if one.unitless:
             return 1.0
-        hint = f"; with a unit there is {_WITH_UNIT[name]}" if name in _WITH_UNIT else ""
+        others = [one for one in synonyms(name) if one in UNITS] if name in AXES else []
+        hint = f"; with a unit there is {' or '.join(others)}" if others else ""
         raise ValueError(f"{name} must be a number without a unit; got one in {unit}{hint}")
     try:
         factor = one.m_as(UNITS[name])
@@ -118,10 +103,3 @@ def _factor(name: str, unit: Any) -> float:
     # Of what turns, hertz counts the turns; to pint it is 1/s, as rad/s is.
     turns = sum(power for part, power in one.unit_items() if part.endswith("hertz")) if UNITS[name] == "rad/s" else 0
     return factor * (2 * math.pi) ** turns
-
-
-def cf(name: str) -> str:
-    """The unit of a quantity as datasets write it: m s-2."""
-    above, _, below = UNITS.get(name, "1").partition("/")
-    unit, _, power = below.partition("^")
-    return f"{above} {unit}-{power or 1}" if below else above

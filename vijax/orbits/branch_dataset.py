@@ -6,7 +6,7 @@ import numpy as np
 
 from vijax.model.device import Harvester, one_device, with_constants
 from vijax.model.pair import ImpactPair
-from vijax.model.quantities import AXES
+from vijax.model.quantities import AXES, MEASURED
 from vijax.orbits import orbit_properties
 from vijax.orbits.continuation import Branch
 from vijax.orbits.parameter import MOVED
@@ -52,7 +52,7 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
         | {"event": (("branch", "event_number"), kinds), "event_value": (("branch", "event_number"), values)}
         | {"event_point": (("branch", "event_number"), places)}
         | {f"end_{name}": ("branch", np.array([b.ends[i] for b in branches], dtype=text)) for i, name in _ENDS},
-        coords={along: (("branch", "point"), found[along], _about(along))} | _constants(branches[0]),
+        coords={along: (("branch", "point"), found[along], AXES[along].attributes)} | _constants(branches[0]),
         attrs={
             "title": "Branches of periodic orbits of a vibro-impact pair",
             "along": along,
@@ -61,35 +61,21 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     )
 
 
-def _about(parameter: str) -> dict[str, str]:
-    axis = AXES[parameter]
-    return {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
-
-
 def _constants(branch: Branch) -> "dict[str, tuple]":
     """The parameters that do not move."""
     still = [name for name in ("d", "kappa", "r", "gamma") if name not in MOVED[branch.along]]
     pair = {name: getattr(branch.orbit.pair, name) for name in still}
-    return {name: ((), float(values[0]), _about(name)) for name, values in pair.items() if values is not None}
+    return {name: ((), float(values[0]), AXES[name].attributes) for name, values in pair.items() if values is not None}
 
 
 _ENDS = ((0, "first"), (1, "last"))
 _ABOUT = {
-    "multiplier": {"units": "1", "long_name": "largest modulus of a Floquet multiplier"},
+    **{name: MEASURED[name].attributes for name in ("multiplier", "P", "v_in", "side", "phase", "duration", "depth")},
     "stable": {"units": "1", "long_name": "whether the orbit attracts: 1 or 0"},
-    "P": {"units": "J", "long_name": "energy harvested per half forcing period"},
     "period": {"units": "1", "long_name": "forcing periods"},
     "impacts_left": {"units": "1", "long_name": "left impacts in that time"},
     "impacts_right": {"units": "1", "long_name": "right impacts in that time"},
     "status": {"units": "1", "long_name": "0: verified by the impact map"},
-    "v_in": {"units": "1", "long_name": "velocity at the onset, in units of A pi / omega"},
-    "side": {"units": "1", "long_name": "wall: -1 left, 1 right"},
-    "phase": {
-        "units": "1",
-        "long_name": "phase of the onset, in half forcing periods",
-    },
-    "duration": {"units": "1", "long_name": "duration of the contact, in half forcing periods"},
-    "depth": {"units": "m", "long_name": "penetration of the membrane"},
 }
 
 

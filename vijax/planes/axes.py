@@ -14,7 +14,7 @@ import numpy as np
 
 from vijax.model import units
 from vijax.model.device import Harvester
-from vijax.model.quantities import AXES, check
+from vijax.model.quantities import AXES, START, START_REACH, check, synonyms
 from vijax.model.units import Given
 from vijax.runtime import checks
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Parameters(TypedDict, total=False):
-    """The axes of a sweep but for those of the start; `vijax.model.quantities.AXES` describes them."""
+    """The axes of a sweep but for those of the start; `vijax.model.quantities.PARAMETERS` describes them."""
 
     d: Given
     kappa: Given
@@ -43,13 +43,6 @@ class Axes(Parameters, total=False):
     u0: Given
     v0: Given
 
-
-# Different names of one quantity: a sweep takes at most one of each row.
-_RIVALS = (("d", "s"), ("kappa", "omega0", "k"), ("gamma", "beta"))
-
-START = (0.05853, -0.47898)
-# A start off the centre of every gap: the default displacement is at most this part of the gap.
-_START_REACH = 0.49
 
 _FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
 _MOST_VALUES = 10**7  # an axis may have so many: the largest planes have some 10^6 a side
@@ -154,8 +147,6 @@ def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarra
     if array.size > _MOST_VALUES:
         raise ValueError(f"{name} must have at most {_MOST_VALUES:,} values; got {array.size:,}")
     array = array.astype(np.float64)
-    if name in ("u0", "v0"):
-        return checks.finite(name, array)
     check(quantity or name, array, name)
     return array
 
@@ -233,8 +224,8 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
     for name in given:
         if name not in AXES:
             raise TypeError(f"there is no axis {name!r}; the axes are {', '.join(AXES)}")
-    for row in _RIVALS:
-        rivals = [name for name in row if name in given]
+    for several in dict.fromkeys(map(synonyms, AXES)):
+        rivals = [name for name in several if name in given]
         if len(rivals) > 1:
             raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
     if "r" in given and not restitution:
@@ -292,7 +283,7 @@ def _quantities(values: "dict[str, xr.Variable]", device: Harvester, xr: Any) ->
         "kappa": values["kappa"] if "kappa" in values else omega0 * math.pi / omega,
         "r": r,
         "gamma": gamma,
-        "u0": values["u0"] if "u0" in values else np.minimum(START[0], _START_REACH * d),
+        "u0": values["u0"] if "u0" in values else np.minimum(START[0], START_REACH * d),
         "v0": values["v0"] if "v0" in values else xr.Variable((), START[1]),
         "omega": omega,
         "A": amplitude,

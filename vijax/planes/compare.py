@@ -14,6 +14,7 @@ import numpy as np
 from vijax.model.choices import Precision, Until, Walls
 from vijax.model.device import Harvester
 from vijax.model.label import ordered
+from vijax.model.quantities import synonyms
 from vijax.model.records import Status
 from vijax.planes import sweep
 from vijax.planes.axes import Axes
@@ -30,7 +31,6 @@ COMPARED = ("P", "P_stderr", "period", "impacts_left", "impacts_right", "status"
 SURE = 3.0
 # Cells that ended otherwise have no P to judge by, or one that still drifts.
 _SETTLED = (Status.OK, Status.NO_IMPACT, Status.PERMANENT_CONTACT, Status.STICKING)
-_STIFFNESS = ("kappa", "omega0", "k")
 
 
 class Label(enum.IntEnum):
@@ -220,7 +220,7 @@ def rigid_from(cheapest: "xr.DataArray") -> "xr.DataArray | None":
     Returns:
         Values of the axis kappa, omega0 or k over the other axes; None if there is no such axis.
     """
-    axis = next((dim for dim in cheapest.dims if dim in _STIFFNESS), None)
+    axis = next((dim for dim in cheapest.dims if dim in synonyms("kappa")), None)
     if axis is None:
         return None
     enough = (cheapest == Model.RIGID).sortby(axis, ascending=False)

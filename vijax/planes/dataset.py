@@ -18,7 +18,7 @@ from vijax.batch import simulate
 from vijax.engine.method import Method
 from vijax.engine.method_choice import record
 from vijax.model.device import CONSTANTS, Harvester
-from vijax.model.quantities import AXES
+from vijax.model.quantities import AXES, MEASURED
 from vijax.model.records import Status
 from vijax.planes.axes import Cells
 from vijax.planes.sweep_settings import SweepSettings
@@ -102,7 +102,7 @@ def _admissible(found: Found, planned: Plan) -> "xr.Variable":
 
 
 OUTPUTS = {
-    "P": Output("J", "energy harvested per half forcing period", ("P",)),
+    "P": Output(MEASURED["P"].units, MEASURED["P"].text, ("P",)),
     "power": Output("W", "harvested power, P omega / pi", ("P",), _power),
     "P_stderr": Output("J", "standard error of P by batch means, 0 when periodic", ("P_stderr",)),
     "period": Output("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided", ("period",)),
@@ -209,9 +209,8 @@ def coordinates(of: Cells) -> "dict[str, xr.Variable]":
     """The axes as given and the quantities of the cells, with symbols and units."""
     found = {}
     for name, values in {**of.given, **of.quantities}.items():
-        axis = AXES[name]
         found[name] = values.transpose(*(dim for dim in of.sizes if dim in values.dims))
-        found[name].attrs = {"units": axis.units, "long_name": axis.description, "symbol": axis.symbol}
+        found[name].attrs = AXES[name].attributes
     return found
 
 

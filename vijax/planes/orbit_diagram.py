@@ -20,7 +20,7 @@ from vijax.model import energy
 from vijax.model.choices import Direction, Precision, Walls
 from vijax.model.device import Harvester, one_device
 from vijax.model.pair import ImpactPair
-from vijax.model.quantities import AXES
+from vijax.model.quantities import MEASURED, PARAMETERS, STARTS
 from vijax.model.records import State, Status
 from vijax.model.units import Given
 from vijax.planes import estimate
@@ -42,29 +42,17 @@ _DEFAULT = DiagramSettings()
 _LINKS = 64
 _FEWEST_LANES, _MOST_LANES = 8, 512
 _POINTS = {
-    "P": ("J", "energy harvested per half forcing period"),
-    "period": ("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided"),
-    "impacts_left": ("1", "left impacts in `period` periods, -1 unless period > 0"),
-    "impacts_right": ("1", "right impacts in `period` periods, -1 unless period > 0"),
+    **{name: OUTPUTS[name][:2] for name in ("P", "period", "impacts_left", "impacts_right")},
     "status": ("1", "how the point ended"),
     "filled": ("1", "impacts in the kept periods"),
     **{name: OUTPUTS[name][:2] for name in ("max_penetration", "energy_ratio", "admissible")},
 }
 _IMPACTS = {
-    "phase": ("1", "phase of the onset, in half forcing periods from that of the greatest forcing"),
+    "phase": ("1", f"{MEASURED['phase'].text} from that of the greatest forcing"),
     "period_number": ("1", "forcing period of the onset, from the first one kept"),
-    "side": ("1", "wall: -1 left, 1 right"),
-    "v_in": ("1", "velocity at the onset, in units of A pi / omega"),
-    "v_out": ("1", "velocity at the exit, in units of A pi / omega"),
-    "restitution": ("1", "-v_out / v_in"),
-    "duration": ("1", "duration of the contact, in half forcing periods"),
-    "depth": ("m", "penetration of the membrane"),
-    "E": ("J", "energy harvested from the impact"),
+    **{name: MEASURED[name][:2] for name in ("side", "v_in", "v_out", "restitution", "duration", "depth", "E")},
 }
-_STROBES = {
-    "u_strobe": ("1", "displacement at phase 0, in units of A pi^2 / omega^2"),
-    "v_strobe": ("1", "velocity at phase 0, in units of A pi / omega"),
-}
+_STROBES = {name: MEASURED[name][:2] for name in ("u_strobe", "v_strobe")}
 
 
 @door
@@ -189,8 +177,7 @@ def plan(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
-    swept = [name for name in AXES if name not in ("u0", "v0")]
-    checks.choice("along", along, swept)
+    checks.choice("along", along, PARAMETERS)
     given = {name: value for name, value in axes.items() if value is not None}
     if along in given:
         raise ValueError(f"{along} must not be given twice; got it as the axis swept and as another")
@@ -380,7 +367,7 @@ def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
     variables["status"] = flagged(variables["status"])
     of = planned.cells
     # A start is that of the first points alone.
-    known = {name: x for name, x in coordinates(of).items() if name in of.given or name not in ("u0", "v0")}
+    known = {name: x for name, x in coordinates(of).items() if name in of.given or name not in STARTS}
     # Text of fixed width has no place in the third format of zarr.
     names = np.array(diagram.ways, dtype=np.dtypes.StringDType())
     ways = {"direction": ("direction", names)} if "direction" in sizes else {}

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from vijax.model.quantities import BRANCH_QUANTITIES
 from vijax.plots.figure import styled
 from vijax.plots.style import QUANTITIES, axis_label, title
 from vijax.runtime import checks
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 _MARKS = {"fold": "o", "flip": "s", "pitchfork": "^", "grazing": "x"}
 _STABLE, _UNSTABLE = "black", "red"
-_BRANCH_QUANTITIES = ("v_in", "phase", "duration", "depth", "P", "multiplier")
 
 
 @styled
@@ -44,7 +44,7 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
             axes.plot(one[along.name], one[quantity].where(shown), color=colour, linewidth=width)
         _mark_events(axes, one, quantity)
     axes.set_xlabel(axis_label(along))
-    axes.set_ylabel(QUANTITIES.get(quantity, "largest modulus of a multiplier"))
+    axes.set_ylabel(QUANTITIES[quantity])
     axes.set_title(title(dataset), fontsize="medium")
     kinds = {str(kind).split()[0] for kind in dataset["event"].values.flat if kind}
     lines = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
@@ -55,7 +55,7 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
 
 def check_branch_quantity(quantity: str) -> None:
     """Raise ValueError unless branches have the quantity."""
-    checks.choice("quantity", quantity, _BRANCH_QUANTITIES)
+    checks.choice("quantity", quantity, BRANCH_QUANTITIES)
 
 
 def _mark(kind: str, label: str | None = None) -> Line2D:

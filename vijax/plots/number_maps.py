@@ -19,7 +19,7 @@ from vijax.planes.dataset import best
 from vijax.plots.cells import BARE, VEIL, borders, edges, marked_places, panels, runs, veil
 from vijax.plots.figure import styled
 from vijax.plots.kind_maps import coded, of_flags
-from vijax.plots.style import NEEDS, axis_label, is_kind, layout, title, units
+from vijax.plots.style import NEEDS, QUANTITIES, axis_label, is_kind, layout, title, units
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ def _difference_marks(dataset: "xr.Dataset") -> list[_Mark]:
     return [*marks, _Mark(bare, "bare", BARE, "no difference, or failed")]
 
 
-_POWER = _Kind("P", "$P$ [J per half period]", "sweep", NEEDS, (), _power_colours, _power_marks)
+_POWER = _Kind("P", QUANTITIES["P"], "sweep", NEEDS, (), _power_colours, _power_marks)
 _DIFFERENCE = _Kind(
     "relative_difference",
     r"$|P_\mathrm{rigid} - P_\mathrm{soft}| / P_\mathrm{soft}$",

@@ -8,8 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from vijax.model.quantities import POINT_QUANTITIES
 from vijax.plots.figure import styled
-from vijax.plots.style import QUANTITIES, axis_label, symbol, title, units
+from vijax.plots.style import FURTHER, QUANTITIES, axis_label, symbol, title, units
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ _POINT: dict[str, Any] = {"linestyle": "none", "marker": ".", "mew": 0, "rasteri
 _OTHER_WAY = "0.8"
 # Energies of soft and stiff walls lie decades apart; grazing impacts so far below the greatest are left out.
 _LOGARITHMIC, _DECADES = ("depth", "E", "P"), 8
-_FURTHER = ("s", "omega0", "k", "beta")  # what a physical sweep holds constant besides
 
 
 @styled
@@ -62,14 +62,14 @@ def orbit_diagram(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
         most = float(dataset[quantity].max())
         panels[0].set(yscale="log", ylim=(most / 10**_DECADES, 2 * most) if most > 0 else None)
     panels[-1].set_xlabel(axis_label(dataset[along]))
-    figure.suptitle(title(dataset, _FURTHER), fontsize="medium")
+    figure.suptitle(title(dataset, FURTHER), fontsize="medium")
     _explain(figure, dataset, others, ways)
     return figure
 
 
 def check_quantity(quantity: str) -> None:
     """Raise ValueError unless an orbit diagram can be drawn of it."""
-    checks.choice("quantity", quantity, QUANTITIES)
+    checks.choice("quantity", quantity, POINT_QUANTITIES)
 
 
 def check_layout(along: str, sizes: Mapping[str, int]) -> list[str]:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vijax.model.quantities import MEASURED, PARAMETERS, synonyms
 from vijax.runtime import checks
 from vijax.runtime.files import replacing
 
@@ -28,8 +29,9 @@ STYLE: Any = {
 # Endings of pictures, each with the entry of its metadata that names what drew it.
 _DRAWN_WITH = {".png": "Software", ".pdf": "Creator", ".svg": "Creator", ".eps": "Creator"}
 _MARK = "drawn by vijax"
-# Worth a place in the title: neither the start, nor a quantity under a second name.
-CONSTANTS = ("d", "kappa", "r", "gamma", "omega", "A")
+# Worth a place in the title: neither the start, nor a quantity under a second name. Those a physical sweep may hold.
+CONSTANTS = tuple(name for name in PARAMETERS if name == synonyms(name)[0])
+FURTHER = tuple(name for name in PARAMETERS if name not in CONSTANTS)
 
 
 def check_format(path: str | Path) -> None:
@@ -121,15 +123,4 @@ def is_kind(variable: Any) -> bool:
     return variable.dtype == bool or "flag_values" in variable.attrs
 
 
-QUANTITIES = {
-    "v_in": r"$v_\mathrm{in}$, velocity at the impact",
-    "v_out": r"$v_\mathrm{out}$, velocity after the impact",
-    "restitution": r"$-v_\mathrm{out} / v_\mathrm{in}$, effective restitution",
-    "phase": "phase of the impact [half forcing periods]",
-    "duration": "duration of the contact [half forcing periods]",
-    "depth": "penetration [m]",
-    "E": r"$E_j$, energy of the impact [J]",
-    "P": "$P$ [J per half period]",
-    "u_strobe": "$u$ at phase 0",
-    "v_strobe": r"$\dot{u}$ at phase 0",
-}
+QUANTITIES = {name: measured.label for name, measured in MEASURED.items() if measured.label}
