@@ -15,6 +15,7 @@ from helpers import SCRIPTS
 import vijax
 from vijax.cli import main as command
 from vijax.cli import process
+from vijax.engine.method_choice import choose, record
 from vijax.orbits import orbit_search, switching
 from vijax.plots import branch_diagrams, orbit_diagrams
 
@@ -162,6 +163,14 @@ def test_the_least_that_may_be_given_is_that_of_python(folder, capsys, line):
 
 
 # --- help ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["solver", "rtol", "atol", "steps", "exponent"])
+def test_what_help_calls_a_default_is_what_a_method_is_told(name):
+    (option,) = [option for option in page("sweep").params if option.name == name]
+    told = [record(choose(engine, {})) for engine in ("ode", "rk4")]
+    default = {"exponent": vijax.HuntCrossley(0.5).exponent, **told[0], **told[1]}[name]
+    assert type(default)(re.search(r"\[(.+)\]$", option.help)[1]) == default
 
 
 @pytest.mark.parametrize("name", PAGES)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import re
 
 import pytest
 
@@ -120,3 +121,13 @@ def test_a_record_holds_only_what_can_be(wrong, say):
 def test_a_changed_record_is_checked_again():
     with pytest.raises(ValueError, match="keep must be at most periods; got 25 of 20"):
         dataclasses.replace(DiagramSettings(), periods=20)
+
+
+@pytest.mark.parametrize("settings", [SweepSettings, DiagramSettings])
+def test_every_setting_is_documented_with_its_default(settings):
+    said = dict(re.findall(r"^ {4}([a-z, ]+): (.+?)$", inspect.getdoc(settings), re.MULTILINE))
+    documented = {name: text for names, text in said.items() for name in names.split(", ")}
+    own = {name: getattr(settings, name) for name in settings.__annotations__}
+    assert set(documented) == set(own)
+    for name, default in own.items():
+        assert default is None or str(default) in documented[name]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _CELL = {"d": "0.2", "kappa": "3"}
 _FILES = ("basins.zarr", "basins.png")
-_MOST_ROWS = 24
+_MOST_ROWS = 24  # Attractors that are listed: those of fewer starts are in the store.
 
 
 def coexisting(

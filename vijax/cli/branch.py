@@ -97,7 +97,7 @@ def _asked(
 
     name, within = _bounds(along)
     chosen = given.get(name) is not None
-    # Along a quantity of the device it is a device that is given, of Tables I and II unless otherwise.
+    # Along a quantity of the device a branch begins at that of Tables I and II, all that is not given.
     start = {} if name in options.DEVICE else _START
     pair, made = at_one_point(take_axes(given, start), device(constants), wall)
     checks.whole("generations", generations, 0, switching.MOST_GENERATIONS)

@@ -45,5 +45,5 @@ def vijax(ctx: click.Context) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit code of the command; see `process.run`."""
+    """Run the command and return its exit code; see `process.run`."""
     return run(vijax, arguments)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _ALONG = "d=0.3:0.05:126"
 _FILES = ("orbit_diagram.zarr", "orbit_diagram.png")
-_COMMON = 8  # the most frequent labels; the others are counted together
+_COMMON = 8  # Labels that are counted each, the most frequent ones; the others are counted together.
 
 
 def diagram(

@@ -13,7 +13,7 @@ from vijax.cli.closing import pace
 T = TypeVar("T")
 
 _WAITING = logging.getLogger("vijax.waiting")
-_MANY = 10_000  # a bar of so many counts by thousands
+_MANY = 10_000  # From so many on a bar counts by thousands.
 
 
 @contextmanager
@@ -34,7 +34,8 @@ def progress(total: int, unit: str = "cells") -> Iterator[Callable[[int, int], N
 
 def counted(total: int, run: Callable[[Callable[[int, int], None]], T]) -> tuple[T, str]:
     """Run under a progress bar that counts cells; return what was found and how fast, in words."""
-    told: list[int] = []  # cells done, at first those that a store held already
+    # Numbers of cells done; at first those that a store held already.
+    told: list[int] = []
 
     with progress(total) as show:
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vijax.planes.dataset import Plan
 
 PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
-_LONG = 9  # periods from here on are counted together
+_LONG = 9  # From this period on cells are counted together.
 _FILES = {"P": ("power_map.zarr", "power_map.png"), "label": ("label_map.zarr", "label_map.png")}
 
 

@@ -98,7 +98,7 @@ class Harvester(eqx.Module):
 
     @door
     def pair(self, wall: str = "soft") -> ImpactPair:
-        """The device in nondimensional form, Eqs. (37)-(38).
+        """Bring the device into nondimensional form, Eqs. (37)-(38).
 
         d = s omega^2/(A pi^2), kappa = omega0 pi/omega, gamma = g sin(beta)/A.
 
@@ -117,7 +117,7 @@ CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field
 
 @door
 def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
-    """The device that has the given nondimensional form, by its s, omega0, r and beta; the inverse of `Harvester.pair`.
+    """Give a device the given nondimensional form, by its s, omega0, r and beta; the inverse of `Harvester.pair`.
 
     Args:
         device: Gives A, omega, g and everything electrical; and omega0 where the wall of `pair` is rigid.
@@ -139,7 +139,7 @@ def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
 
 @door
 def with_constants(device: Harvester, **constants: Real) -> Harvester:
-    """The device with some constants changed, checked by name; `k` [N/m] sets omega0 = sqrt(k/m_b).
+    """Change some constants of a device, checked by name; `k` [N/m] sets omega0 = sqrt(k/m_b).
 
     Raises:
         ValueError: An unknown constant, both k and omega0, or a value that cannot be.
@@ -160,12 +160,12 @@ def with_constants(device: Harvester, **constants: Real) -> Harvester:
 
 
 def check_device(device: Any) -> Harvester:
-    """The device, if it is one."""
+    """Return the device, if it is one."""
     return checks.instance("device", device, Harvester, "vijax.Harvester(...)")
 
 
 def one_device(device: Any) -> Harvester:
-    """The device, each constant of it one number that is not traced; that of Tables I and II where none is given."""
+    """Return the device, each constant one number that is not traced; that of Tables I and II where none is given."""
     if device is None:
         return Harvester()
     for name, value in vars(checks.known("device", check_device(device))).items():

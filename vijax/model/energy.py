@@ -23,7 +23,7 @@ PI = math.pi
 
 @door
 def stretch(device: Harvester, depth: Values) -> Values:
-    """Relative growth A_s/(pi R0^2) - 1 of a membrane of area A_s that a ball has entered by `depth` [m].
+    """Compute the relative growth A_s/(pi R0^2) - 1 of a membrane of area A_s that a ball has entered by `depth` [m].
 
     With lengths in units of R0, h = r_b - depth and S^2 = 1 + h^2 - r_b^2 (the tangent from the rim to the ball):
     cos(alpha) = (r_b h + S)/(1 + h^2), and A_s/(pi R0^2) - 1 = (1 - cos)/cos (1 - r_b^2 (1 - cos)).
@@ -41,13 +41,13 @@ def stretch(device: Harvester, depth: Values) -> Values:
 
 
 def _rest_capacitance(device: Harvester) -> Values:
-    """Capacitance of the undeformed membrane [F]."""
+    """Compute the capacitance of the undeformed membrane [F]."""
     return jnp.asarray(device.eps_M * PI * device.R0**2 / device.w0)
 
 
 @door
 def capacitance(device: Harvester, depth: Values) -> Values:
-    """Capacitance [F] of a membrane that a ball has entered by `depth` [m].
+    """Compute the capacitance [F] of a membrane that a ball has entered by `depth` [m].
 
     C_M = eps_M A_s^2/(w0 pi R0^2): the volume is kept, so the membrane thins as its area grows.
 
@@ -58,7 +58,7 @@ def capacitance(device: Harvester, depth: Values) -> Values:
 
 @door
 def harvested_energy(device: Harvester, depth: Given) -> Values:
-    """Energy E_j [J] harvested from an impact whose largest penetration is `depth`, in metres or a quantity of pint.
+    """Compute the energy E_j [J] of an impact whose largest penetration is `depth`, in metres or a quantity of pint.
 
     E = (C_max + C_T)/(C_min + C_T) (C_max - C_min) V^2/2, of full relative accuracy down to depth 0, where it and its
     gradient vanish.
@@ -88,7 +88,7 @@ def _harvested(device: Harvester, depth: Values) -> Values:
 
 @door
 def rigid_penetration(r: Values) -> Values:
-    """Largest penetration chi of a free contact in units of v_in/omega0; a rigid wall is lent it for its energy.
+    """Compute the largest penetration chi of a free contact, in v_in/omega0; a rigid wall is lent it for its energy.
 
     chi = exp(ln r/pi arctan(-pi/ln r)): depth [m] = |v_in| [m/s] chi/omega0, or |v| chi/kappa in units of u.
 
@@ -100,7 +100,7 @@ def rigid_penetration(r: Values) -> Values:
 
 @door
 def membrane_work_rigid(v_in: Values, r: Values) -> Values:
-    """Energy per unit mass that an impact on a rigid wall takes from the ball: v_in^2 (1 - r^2)/2."""
+    """Compute the energy per unit mass that a rigid wall takes from the ball: v_in^2 (1 - r^2)/2."""
     return 0.5 * v_in * v_in * (1 - r) * (1 + r)
 
 
@@ -110,7 +110,7 @@ _MATCHED = 4  # derivatives of the velocity that the polynomial matches at eithe
 
 
 def _legendre_from_ends(parity: int) -> np.ndarray:
-    """Matrix from the scaled derivatives at +1 of an even (0) or odd (1) polynomial to its Legendre coefficients.
+    """Make the matrix from scaled derivatives at +1 of an even (0) or odd (1) polynomial to Legendre coefficients.
 
     P_n^(j)(1) = (n + j)!/(2^j j! (n - j)!). Rows times sqrt(2/(2n + 1)), so that squares add up to the integral.
     """
@@ -128,7 +128,7 @@ _EVEN, _ODD = _legendre_from_ends(0), _legendre_from_ends(1)
 def _squared_speed_short(
     kappa: Values, mu: Values, ends: tuple[list[Values], list[Values]], z: tuple[Values, Values], half: Values
 ) -> Values:
-    """Integral of w'^2 over a short contact, without cancellation: a sum of squares of Legendre coefficients.
+    """Integrate w'^2 over a short contact, without cancellation: a sum of squares of Legendre coefficients.
 
     Args:
         ends: The forcing and its derivatives at onset and at exit.
@@ -164,7 +164,7 @@ def membrane_work(
     v_in: Values,
     v_out: Values,
 ) -> Values:
-    """Energy W per unit mass that a whole soft contact gives to the membrane, in squared units of u'.
+    """Compute the energy W per unit mass that a whole soft contact gives to the membrane, in squared units of u'.
 
     W = mu int w'^2 ds = (v_in^2 - v_out^2)/2 - int f' w ds, where w is the penetration and f = c cos(pi s) -
     q sin(pi s) - g its forcing at elapsed time s. With J_c, J_s = int (cos, sin)(pi s) w ds the last integral is
@@ -220,7 +220,7 @@ def membrane_work(
 
 @door
 def energy_ratio(energy: Values, work: Values) -> Values:
-    """Energy taken out over energy put in, E_j/W_j: 0 where nothing is taken out, inf where nothing was put in."""
+    """Divide energy taken out by energy put in, E_j/W_j: 0 where nothing is taken out, inf where nothing was put in."""
     some = work > 0
     ratio = jnp.where(some, energy / jnp.where(some, work, 1.0), jnp.inf)
     return jnp.where(energy == 0, 0.0, ratio)
@@ -228,7 +228,7 @@ def energy_ratio(energy: Values, work: Values) -> Values:
 
 @door
 def admissible(device: Harvester, energy: Values, work: Values, depth: Values) -> Bool[Array, "..."]:
-    """Whether an impact may be: it gives out no more than it got, and stays within the device's penetration limit.
+    """Tell whether an impact may be: it gives out no more than it got, within the device's penetration limit.
 
     Args:
         energy: E_j [J].

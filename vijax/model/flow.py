@@ -20,7 +20,7 @@ PI = math.pi
 
 
 def _alternating(start: int, terms: int) -> tuple[float, ...]:
-    """Taylor coefficients (-1)^k / (start + 2k)! in ascending powers of x^2."""
+    """Compute Taylor coefficients (-1)^k / (start + 2k)! in ascending powers of x^2."""
     return tuple((-1.0) ** k / math.factorial(start + 2 * k) for k in range(terms))
 
 
@@ -50,23 +50,23 @@ class Force(eqx.Module):
     g: Values
 
     def at(self, s: Values) -> Values:
-        """Value at elapsed time s."""
+        """Evaluate the forcing at elapsed time s."""
         sin_s, cos_s, _, _ = half_turn(s)
         return self.c * cos_s - self.q * sin_s - self.g
 
     def later(self, s: Values) -> "Force":
-        """The same forcing with its clock started a time s later."""
+        """Start the clock of the same forcing a time s later."""
         sin_s, cos_s, _, _ = half_turn(s)
         return Force(self.c * cos_s - self.q * sin_s, self.q * cos_s + self.c * sin_s, self.g)
 
     def slope(self) -> "Force":
-        """Time derivative."""
+        """Differentiate the forcing by time."""
         return Force(-PI * self.q, PI * self.c, jnp.zeros_like(self.g))
 
 
 @shared
 def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
-    """The soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
+    """Find the soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
     decrement = 0.0 - jnp.log(pair.r)  # +0 at r = 1: a free half cycle that begins at -0 would be over at once
     kappa = pair._soft_kappa()
     scale = kappa / jnp.sqrt(PI**2 + decrement * decrement)
@@ -85,7 +85,7 @@ _SERIES_REACH = 1.0
 
 
 def horner(coefficients: tuple[Any, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Polynomial with the given ascending coefficients at x."""
+    """Evaluate the polynomial with the given ascending coefficients at x."""
     total = x * coefficients[-1] + coefficients[-2]
     for coefficient in coefficients[-3::-1]:
         total = total * x + coefficient
@@ -94,7 +94,7 @@ def horner(coefficients: tuple[Any, ...], x: Float[Array, "..."]) -> Float[Array
 
 @once
 def half_turn(s: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
-    """sin, cos, versine and lag of pi s: (sin, cos, 1 - cos, pi s - sin), each to full relative accuracy near s = 0.
+    """Compute sin, cos, versine and lag of pi s: (sin, cos, 1 - cos, pi s - sin), each accurate near s = 0 too.
 
     Args:
         s: Half turns, any finite number; reduced by quadrants, so that sin(pi k/2) and cos(pi k/2) are exact.
@@ -122,7 +122,7 @@ def half_turn(s: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
 
 
 def wrap_phase(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Phase in [0, 2) and the whole periods taken off."""
+    """Wrap a phase into [0, 2); give it and the whole periods taken off."""
     periods = jnp.floor(0.5 * t)
     return t - 2 * periods, periods
 
@@ -130,7 +130,7 @@ def wrap_phase(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
 @once
 @shared
 def flight(gamma: Values, t0: Values, v0: Values, s: Values) -> tuple[Values, Values]:
-    """Displacement from the start and velocity after flying for a time s from phase t0 at velocity v0.
+    """Compute displacement from the start and velocity after a flight of length s from phase t0 at velocity v0.
 
     u - u0 = v0 s - gamma s^2/2 + (cos(pi t0)(1 - cos pi s) - sin(pi t0)(pi s - sin pi s))/pi^2
     Source: Eqs. (6)-(7) scaled, derived again (physics.md).
@@ -142,12 +142,12 @@ def flight(gamma: Values, t0: Values, v0: Values, s: Values) -> tuple[Values, Va
 
 
 def acceleration(gamma: Values, t: Values) -> Values:
-    """Acceleration in flight, cos(pi t) - gamma."""
+    """Compute the acceleration in flight, cos(pi t) - gamma."""
     return half_turn(t)[1] - gamma
 
 
 def _contact_series(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
-    """Taylor series in s of (w, w'); accurate for max(kappa, pi) s < 1, where the closed form cancels."""
+    """Compute (w, w') by Taylor series in s; accurate for max(kappa, pi) s < 1, where the closed form cancels."""
     s = share(s)
 
     def add(n, carry):
@@ -170,7 +170,7 @@ def _contact_series(m: Membrane, force: Force, w0: Values, z0: Values, s: Values
 
 @once
 def free_response(m: Membrane, s: Values) -> tuple[Values, Values]:
-    """Impulse response h of the membrane and its derivative: h'' + mu h' + kappa^2 h = 0, h(0) = 0, h'(0) = 1.
+    """Compute the membrane's impulse response h and h': h'' + mu h' + kappa^2 h = 0, h(0) = 0, h'(0) = 1.
 
     sin(omega1 s)/omega1 is the sinc form: it tends to s as omega1 -> 0 (r -> 0).
     """
@@ -180,7 +180,7 @@ def free_response(m: Membrane, s: Values) -> tuple[Values, Values]:
 
 
 def _driven_response(m: Membrane, h: Values, s: Values) -> tuple[Values, Values]:
-    """Responses from rest to cos(pi s), sin(pi s): the divided difference of exp at -zeta +- i omega1 and i pi.
+    """Compute responses from rest to cos(pi s), sin(pi s): divided difference of exp at -zeta +- i omega1 and i pi.
 
     Near kappa = pi, mu = 0 two of the three points meet: the secular form s e^m sinh(z)/z stays accurate there.
     """
@@ -213,7 +213,7 @@ def _driven_response(m: Membrane, h: Values, s: Values) -> tuple[Values, Values]
 
 
 def _contact_closed(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
-    """(w, w') by the closed form: free response plus Duhamel's integral of the forcing."""
+    """Compute (w, w') by the closed form: free response plus Duhamel's integral of the forcing."""
     h, slope = share(free_response(m, s))
     from_cos, from_sin = share(_driven_response(m, h, s))
     stay = slope + m.mu * h  # response to a unit displacement
@@ -226,7 +226,7 @@ def _contact_closed(m: Membrane, force: Force, w0: Values, z0: Values, s: Values
 @once
 @shared
 def oscillate(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
-    """(w, w') at time s of w'' + mu w' + kappa^2 w = force from (w0, z0) at s = 0.
+    """Compute (w, w') at time s of w'' + mu w' + kappa^2 w = force from (w0, z0) at s = 0.
 
     Source: Eqs. (20)-(21) with the constants derived again (physics.md); each regime against mpmath in test_flow.py.
     """
@@ -237,19 +237,19 @@ def oscillate(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> t
 
 
 def flight_force(gamma: Values, t: Values) -> Force:
-    """The forcing cos(pi t) - gamma with its clock started at phase t."""
+    """Make the forcing cos(pi t) - gamma with its clock started at phase t."""
     sin_t, cos_t, _, _ = half_turn(t)
     return Force(cos_t, sin_t, gamma)
 
 
 def contact_force(gamma: Values, side: Values, t: Values) -> Force:
-    """The forcing of the penetration w = side u - d/2 in a contact that begins at phase t."""
+    """Make the forcing of the penetration w = side u - d/2 in a contact that begins at phase t."""
     sin_t, cos_t, _, _ = half_turn(t)
     return Force(side * cos_t, side * sin_t, side * gamma)
 
 
 def steady_response(m: Membrane, force: Force) -> Force:
-    """Steady response of the membrane to `force`, in the same form; infinite at the undamped resonance.
+    """Find the membrane's steady response to `force`, in the same form; infinite at the undamped resonance.
 
     The forcing is the real part of (c + i q) e^(i pi s): divide by kappa^2 - pi^2 + i mu pi.
     """
@@ -263,13 +263,13 @@ def steady_response(m: Membrane, force: Force) -> Force:
 
 
 def flight_matrix(s: Values) -> Float[Array, "2 2"]:
-    """Tangent map of a flight of length s in (du, du')."""
+    """Compute the tangent map of a flight of length s in (du, du')."""
     one, zero = jnp.ones_like(s), jnp.zeros_like(s)
     return jnp.array([[one, s], [zero, one]])
 
 
 def contact_matrix(m: Membrane, s: Values) -> Float[Array, "2 2"]:
-    """Tangent map of a whole contact of duration s in (du, du'), from flight to flight; its determinant is exp(-mu s).
+    """Compute the tangent map of a whole contact in (du, du'), from flight to flight; its determinant is exp(-mu s).
 
     The saltations at onset [[1, 0], [-mu, 1]] and exit [[1, 0], [mu, 1]] (physics.md) around the fundamental matrix
     [[h' + mu h, h], [-kappa^2 h, h']] collapse to the form below: regular at grazing.
@@ -279,5 +279,5 @@ def contact_matrix(m: Membrane, s: Values) -> Float[Array, "2 2"]:
 
 
 def rigid_matrix(r: Values, a: Values, v_in: Values) -> Float[Array, "2 2"]:
-    """Saltation matrix of a rigid impact in (du, du'): det = r^2, and it grows as 1/v_in at grazing."""
+    """Compute the saltation matrix of a rigid impact in (du, du'): det = r^2, and it grows as 1/v_in at grazing."""
     return jnp.array([[-r, jnp.zeros_like(r)], [(1 + r) * a / v_in, -r]])

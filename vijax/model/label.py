@@ -11,7 +11,7 @@ FAILED = (Status.EVENT_BUDGET, Status.NONFINITE)
 
 
 def ordered(left: Any, right: Any, merge_mirrors: Any) -> tuple[Any, Any]:
-    """Impact counts; where mirror images are to count as one attractor, the smaller first.
+    """Order impact counts: where mirror images are to count as one attractor, the smaller first.
 
     Args:
         left, right, merge_mirrors: Arrays of NumPy or of xarray that broadcast.
@@ -28,7 +28,7 @@ def label(
     *,
     merge_mirrors: ArrayLike = False,
 ) -> np.ndarray:
-    """Names of attractors: "1:1", "1:2/2T", "aperiodic", "no impact", "permanent contact", "undecided", "failed".
+    """Name attractors: "1:1", "1:2/2T", "aperiodic", "no impact", "permanent contact", "undecided", "failed".
 
     Args:
         period, left, right, status: The variables `period`, `impacts_left`, `impacts_right` and `status` of a sweep, of

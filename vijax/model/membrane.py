@@ -18,7 +18,7 @@ class Spring(eqx.Module):
     mu: Values
 
     def __call__(self, w: Values, z: Values) -> Values:
-        """Acceleration at penetration w and rate z."""
+        """Compute the acceleration at penetration w and rate z."""
         return -(self.square * w + self.mu * z)
 
 
@@ -26,7 +26,7 @@ class Linear(eqx.Module):
     """The paper's membrane, Eq. (38): its damping is calibrated so that a free contact has restitution r, Eq. (19)."""
 
     def wall(self, pair: ImpactPair) -> Spring:
-        """The law with the numbers of a pair."""
+        """Give the law the numbers of a pair."""
         kappa = pair._soft_kappa()
         return Spring(kappa * kappa, pair.mu)
 
@@ -39,7 +39,7 @@ class Hertz(eqx.Module):
     exponent: Values
 
     def __call__(self, w: Values, z: Values) -> Values:
-        """Acceleration at penetration w and rate z."""
+        """Compute the acceleration at penetration w and rate z."""
         inside = w > 0  # a stage of a step may look beyond the exit
         spring = jnp.where(inside, jnp.where(inside, w, 1.0) ** self.exponent, 0.0)
         return -self.square * spring * (1 + self.chi * z)
@@ -70,7 +70,7 @@ class HuntCrossley(eqx.Module):
                 checks.real(name, value, must, lambda x, least=least: least <= x < math.inf)
 
     def wall(self, pair: ImpactPair) -> Hertz:
-        """The law with the numbers of a pair."""
+        """Give the law the numbers of a pair."""
         kappa = pair._soft_kappa()
         return Hertz(kappa * kappa, jnp.asarray(self.chi, kappa.dtype), jnp.asarray(self.exponent, kappa.dtype))
 

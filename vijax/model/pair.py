@@ -69,7 +69,7 @@ class ImpactPair(eqx.Module):
 
 @door
 def damping_ratio(r: Real) -> Float[AnyArray, "..."]:
-    """Ratio c/(2 sqrt(k m_b)) = mu/(2 kappa) whose free contact has restitution r.
+    """Compute the ratio c/(2 sqrt(k m_b)) = mu/(2 kappa) whose free contact has restitution r.
 
     -ln r/sqrt(pi^2 + ln^2 r), in [0, 1): every contact is underdamped.
 
@@ -109,7 +109,7 @@ class MembranePair(eqx.Module):
 
 @door
 def membrane_pair(pair: ImpactPair) -> MembranePair:
-    """A soft pair in the scaling of Eq. (39).
+    """Bring a soft pair into the scaling of Eq. (39).
 
     A* = 1/(d kappa^2), g* = gamma A*, omega* = pi/kappa, c* = mu/kappa.
     """
@@ -120,14 +120,14 @@ def membrane_pair(pair: ImpactPair) -> MembranePair:
 
 @door
 def from_membrane_pair(pair: MembranePair) -> ImpactPair:
-    """A soft pair in the scaling of Eqs. (37)-(38); the inverse of `membrane_pair` for 0 <= c* < 2."""
+    """Bring a soft pair into the scaling of Eqs. (37)-(38); the inverse of `membrane_pair` for 0 <= c* < 2."""
     ratio = 0.5 * pair.c_star
     r = jnp.exp(-math.pi * ratio / jnp.sqrt((1 - ratio) * (1 + ratio)))
     return ImpactPair(pair.length_unit, 1 / pair.time_unit, r, pair.g_star / pair.A_star)
 
 
 def check_pair(pair: Any) -> ImpactPair:
-    """The pair, if its fields may be; those of traced values pass unseen.
+    """Return the pair, if its fields may be; those of traced values pass unseen.
 
     Raises:
         ValueError: No pair, a field that cannot be, or fields that do not broadcast.
@@ -155,7 +155,7 @@ def check_start(pair: ImpactPair, name: str, u: Any) -> None:
 
 @door
 def impact_pair(d: Given, kappa: Given | None, r: Given | None, gamma: Given = 0.0) -> ImpactPair:
-    """A checked `ImpactPair`, its fields broadcast to one shape.
+    """Make a checked `ImpactPair`, its fields broadcast to one shape.
 
     Args:
         d: Gap between the walls, > 0, any shape.

@@ -84,7 +84,7 @@ def _named(*quantities: Quantity) -> dict[str, Quantity]:
 
 
 START, START_REACH = (0.05853, -0.47898), 0.49
-"""A start off the centre of every gap, u0 and v0; the displacement is at most this part of the gap."""
+"""The start unless given, u0 and v0, off the centre of every gap; the displacement is at most this part of the gap."""
 
 _RIGID = 'a rigid wall is wall="rigid" (kappa=None in an ImpactPair)'
 _GAP = "it is the gap between the walls in units of A pi^2/omega^2"

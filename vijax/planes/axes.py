@@ -45,14 +45,17 @@ class Axes(Parameters, total=False):
 
 
 _FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
-_MOST_VALUES = 10**7  # an axis may have so many: the largest planes have some 10^6 a side
-_MOST_CELLS = 10**12  # a plane may have so many, its store being some 80 TB then
-_BYTES = 8  # a number takes so many
-_MOST_TEXT = 32 * _MOST_VALUES  # bytes of a file that holds them
+# The most values of an axis: the largest planes have some 10^6 a side, and more are taken for a slip of the finger.
+_MOST_VALUES = 10**7
+# The most cells of a plane, whose store would be some 80 TB then.
+_MOST_CELLS = 10**12
+_BYTES = 8  # Of a number, as quantities of cells are held.
+# Bytes of the largest file of an axis that is read: 32 characters a value are more than any number needs.
+_MOST_TEXT = 32 * _MOST_VALUES
 
 
 def parse_axis(name: str, text: str) -> np.ndarray:
-    """Values of an axis written as a number (0-d), a comma list, `LO:HI:N`, `LO:HI:N:log` or `@FILE` (1-d).
+    """Read an axis written as a number (0-d), a comma list, `LO:HI:N`, `LO:HI:N:log` or `@FILE` (1-d).
 
     A number may be written with pi, as in `pi` or `12pi`, and with a unit, as in `5Hz` or `20deg`; then all are. Of an
     angular frequency Hz are turns a second. A file holds numbers apart by white space or commas.
@@ -73,7 +76,7 @@ def parse_axis(name: str, text: str) -> np.ndarray:
 
 
 def _numbers(name: str, items: list[str], text: str) -> list[float]:
-    """Numbers of which all have a unit or none has, or a reader would not know what the others are in."""
+    """Read numbers of which all have a unit or none has, or a reader would not know what the others are in."""
     parts = [units.split(item) for item in items]
     if len({bool(unit) for _, unit in parts}) > 1:
         raise ValueError(f"{name} must have a unit at every number or at none; got {text!r}")
@@ -122,7 +125,7 @@ def _from_file(name: str, path: str) -> list[float]:
 
 
 def _text(path: Path) -> str:
-    """What a file holds, unless it is none or too large to be an axis: a device may have no end."""
+    """Read a file, unless it is none or too large to be an axis: a device may have no end."""
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "not a plain file")
     if path.stat().st_size > _MOST_TEXT:
@@ -131,7 +134,7 @@ def _text(path: Path) -> str:
 
 
 def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarray:
-    """The values of an axis as a float64 array of at most one dimension.
+    """Turn the values of an axis into a float64 array of at most one dimension.
 
     Args:
         name: Of the argument that an error speaks of.
@@ -179,17 +182,17 @@ class Cells:
         return math.prod(self.sizes[dim] for dim in self.dynamic)
 
     def flat(self, quantity: "xr.Variable", index: np.ndarray) -> np.ndarray:
-        """Values of a quantity in the cells with the given flat indices; variants at their first point."""
+        """Take a quantity's values in the cells with the given flat indices; variants at their first point."""
         first = quantity.isel({dim: 0 for dim in self.variant if dim in quantity.dims})
         if not first.dims:
             return np.broadcast_to(first.values, index.shape)
-        # Never over all dimensions at once: a plane may be larger than memory.
+        # A quantity is never laid out over all dimensions at once, as a plane may be larger than memory.
         places = np.unravel_index(index, [self.sizes[dim] for dim in self.dynamic])
         place = dict(zip(self.dynamic, places, strict=True))
         return np.broadcast_to(first.values[tuple(place[str(dim)] for dim in first.dims)], index.shape)
 
     def cut(self, block: Mapping[str, slice]) -> "Cells":
-        """The cells of a block, the other dimensions whole."""
+        """Cut a block out of the cells, the other dimensions whole."""
 
         def within(variable: "xr.Variable") -> "xr.Variable":
             return variable.isel({dim: part for dim, part in block.items() if dim in variable.dims})
@@ -204,14 +207,14 @@ class Cells:
         )
 
     def factors(self, scale: "xr.Variable") -> np.ndarray:
-        """Factors by which the variants change a scale; the same for every cell, as scales are products over axes."""
+        """Find by which factors variants change a scale: the same in every cell, as scales are products over axes."""
         first = scale.isel({dim: 0 for dim in self.dynamic if dim in scale.dims})
         full = first.set_dims({dim: self.sizes[dim] for dim in self.variant}).transpose(*self.variant)
         return np.ravel(full.values / full.values.flat[0])
 
 
 def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: bool = True) -> Cells:
-    """Cells of a sweep over the given axes; a quantity that no axis gives is the device's.
+    """Lay out the cells of a sweep over the given axes; a quantity that no axis gives is the device's.
 
     Without `restitution`, of a membrane whose loss is not told by r, there is no axis r, and r is NaN.
 

@@ -28,9 +28,11 @@ if TYPE_CHECKING:
 
 __all__ = ["basin_fractions", "basins", "label"]
 
-MOST_STARTS = 10**7  # a cell may have so many
-# Invariants of polished orbits agree to 3e-11 from start to start on a dozen planes of 4096 starts, and differ between
-# attractors by 2e-2 and more. In single precision an orbit passes for one of twice its period: there is no `dtype`.
+# The most starts of a cell: more are taken for a slip of the finger.
+MOST_STARTS = 10**7
+# Invariants that differ by more are of two attractors. Those of polished orbits agree to 3e-11 from start to start on a
+# dozen planes of 4096 starts, and differ between attractors by 2e-2 and more. In single precision an orbit passes for
+# one of twice its period, and so there is no `dtype`.
 _SAME = 1e-6
 _COUNTS = ("impacts_left", "impacts_right")
 _ENDED = ("period", *_COUNTS, "status")
@@ -44,7 +46,8 @@ _TEXTS = {
     "fraction": "part of all starts",
     "fraction_stderr": "standard error of the fraction if the starts are drawn at random",
 }
-# What stands past the last attractor of a cell, by kind of value and for those that are counts.
+# A table is as long as that of the cell with the most attractors. Past the last one of another cell stands this, by
+# kind of value, and below what stands there of starts.
 _BLANK: dict[str, Any] = {"i": -1, "f": np.nan, "b": False, "O": ""}
 _NONE = {"starts": 0, "fraction": 0.0, "fraction_stderr": 0.0}
 
@@ -61,7 +64,7 @@ def basins(
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
 ) -> "xr.Dataset":
-    """Which attractor each start of a (u0, v0) plane ends on, and a table of the attractors.
+    """Find which attractor each start of a (u0, v0) plane ends on, and make a table of the attractors.
 
         found = basins(d=0.2, kappa=3.0, r=0.5, v0=np.linspace(-0.6, 0.6, 400))
         found.label.values, found.fraction.values  # the commonest first
@@ -135,7 +138,7 @@ def basin_fractions(
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
 ) -> "xr.Dataset":
-    """The share of starts that each coexisting attractor takes, for every parameter cell: multistability maps.
+    """Find the share of starts that each coexisting attractor takes, in every cell: multistability maps.
 
     Starts are spread uniformly over the gap and over velocities between -`speed` and `speed`, alike in every cell.
 
@@ -200,12 +203,12 @@ def _plan(axes: Mapping[str, Any], device: Harvester | None, settings: SweepSett
 
 
 def _middles(count: int) -> np.ndarray:
-    """Middles of `count` equal parts of [-1/2, 1/2]."""
+    """Give the middles of `count` equal parts of [-1/2, 1/2]."""
     return (np.arange(count) + 0.5) / count - 0.5
 
 
 def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
-    """Points spread uniformly over the unit square around 0, along the dimension `start`; drawn at random by a seed."""
+    """Spread points evenly over the unit square around 0, along the dimension `start`; a seed draws them at random."""
     import xarray as xr  # here, as importing vijax must not load it
 
     if seed is None:
@@ -225,7 +228,7 @@ def check_starts(planned: Plan, starts: int) -> None:
 
 
 def started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:
-    """A plan whose cells have one more dimension, `start`, on which their starts depend."""
+    """Give the cells of a plan one more dimension, `start`, on which their starts depend."""
     of = planned.cells
     laid = replace(
         of,
@@ -269,7 +272,7 @@ def _groups(cell: np.ndarray, group: np.ndarray) -> _Groups:
 
 
 def _group(cell: np.ndarray, measured: dict[str, np.ndarray], merge_mirrors: bool, apart: float) -> np.ndarray:
-    """A number for every start, alike where it is the same attractor of the same cell; in the order of the cells."""
+    """Give every start a number, alike where it is the same attractor of the same cell; in the order of the cells."""
     period = np.where(np.isin(measured["status"], FAILED), -2, measured["period"]).astype(np.int64)
     left, right = ordered(measured["impacts_left"], measured["impacts_right"], merge_mirrors)
     resting = measured["status"] == Status.PERMANENT_CONTACT
@@ -282,7 +285,7 @@ def _group(cell: np.ndarray, measured: dict[str, np.ndarray], merge_mirrors: boo
 
 
 def _invariants(measured: dict[str, np.ndarray], merge_mirrors: bool) -> list[np.ndarray]:
-    """What is the same for all starts of a periodic attractor and, of mirror images to be merged, for both of them."""
+    """Find what is the same for all starts of a periodic attractor and, to merge mirror images, for both of them."""
     speed, asymmetry, contact, *restitution = (np.nan_to_num(measured[name], nan=-1.0) for name in _INVARIANTS)
     while speed.ndim > 1:  # the unit of speed may vary where the motion does not
         speed = speed[0]
@@ -293,7 +296,7 @@ def _invariants(measured: dict[str, np.ndarray], merge_mirrors: bool) -> list[np
 
 
 def _parted(group: np.ndarray, values: np.ndarray, apart: float) -> np.ndarray:
-    """Groups parted further wherever, in ascending order, values of one group are further apart than a tolerance."""
+    """Part groups further wherever, in ascending order, values of one are further apart than a tolerance."""
     order = np.lexsort((values, group))
     parts = (np.diff(group[order]) != 0) | (np.diff(values[order]) > apart)
     parted = np.empty_like(group)
@@ -302,7 +305,7 @@ def _parted(group: np.ndarray, values: np.ndarray, apart: float) -> np.ndarray:
 
 
 def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
-    """The attractor of every start, and a table of attractors for every cell of the other dimensions.
+    """Find the attractor of every start, and make a table of them for every cell of the other dimensions.
 
     Args:
         found: A sweep over starts (u0, v0, or `start`) with the outputs that `basins` asks for.
@@ -336,7 +339,7 @@ def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
 
 
 def _flat(variable: "xr.Variable", dims: tuple[str, ...], over: tuple[str, ...]) -> np.ndarray:
-    """Values of every start, cell by cell, on the last axis; dimensions that leave the motion alone before it."""
+    """Take values start by start, cell by cell, on the last axis; before it dimensions that leave the motion alone."""
     further = [dim for dim in variable.dims if dim not in (*dims, *over)]
     values = variable.transpose(*further, *dims, *over).values
     return values.reshape(*values.shape[: len(further)], -1)
@@ -345,7 +348,7 @@ def _flat(variable: "xr.Variable", dims: tuple[str, ...], over: tuple[str, ...])
 def _entries(
     measured: dict[str, np.ndarray], groups: _Groups, merge_mirrors: bool, starts: int
 ) -> dict[str, np.ndarray]:
-    """The table's columns, each [..., group]."""
+    """Compute the table's columns, each [..., group]."""
     first = {name: measured[name][..., groups.order[groups.first]] for name in (*_ENDED, "admissible")}
     share = groups.counts / starts
     left, right = ordered(first["impacts_left"], first["impacts_right"], merge_mirrors)
@@ -354,7 +357,7 @@ def _entries(
         for name in _MEASURES
     }
     return {
-        # Objects, as zarr has no lasting format for strings of fixed length.
+        # These are objects, as zarr has no lasting format for strings of fixed length.
         "label": label(first["period"], left, right, first["status"]).astype(object),
         **first,
         "impacts_left": left,
@@ -369,12 +372,12 @@ def _entries(
 
 
 def _laid_out(values: np.ndarray, groups: _Groups, shape: tuple[int, ...], blank: Any) -> np.ndarray:
-    """Values of every group [..., group] over the cells and, by rank, their groups; blank past a cell's last."""
+    """Lay values of every group [..., group] out over the cells and, by rank, their groups; blank past the last."""
     table = np.full((*values.shape[:-1], math.prod(shape), groups.rank.max() + 1), blank, values.dtype)
     table[..., groups.cell, groups.rank] = values
     return table.reshape(*values.shape[:-1], *shape, -1)
 
 
 def described(text: str) -> dict[str, Any]:
-    """Attributes of a variable without units."""
+    """Make the attributes of a variable without units."""
     return {"units": "1", "long_name": text}

@@ -20,13 +20,21 @@ if TYPE_CHECKING:
 
 __all__ = ["lyapunov", "survival"]
 
-# Its growth from the identity is no stretching along the motion: the difference to a longer window is.
+# Forcing periods in which the tangent map turns from the identity to the most unstable direction. What it grows by
+# meanwhile is no stretching along the motion: only what it grows by in a longer window beyond that is.
 _WARM_UP = 100
-# How survival looks: so often, so long; growth of the tangent map in powers of e; impacts per period.
-_INSTANTS, _WATCHED, _GROWN, _RARE = 8, 200, 7.0, 0.1
+# Survival looks at eight instants: fewer tell less of the exponential law, more cost a run each.
+_INSTANTS = 8
+# There every motion is watched for so many forcing periods, and is chaotic if its tangent map grows by so many powers
+# of e meanwhile: chaos of an exponent below 7/200 = 0.035 is not counted.
+_WATCHED, _GROWN = 200, 7.0
+# With fewer impacts a forcing period than this the ball creeps towards motions that touch no wall, which is no chaos.
+_RARE = 0.1
 _SURVIVAL = ("part of all starts still chaotic", "mean lifetime of chaos, forcing periods", "its standard error")
 _SPREADS = ("its standard error", "the lowest of the ensemble", "the highest of the ensemble")
-_NEAR = 0.01  # spread of an ensemble around its start, in parts of the gap and of the unit of velocity
+# Spread of an ensemble around its start, in parts of the start's displacement and of the unit of velocity. A wider one
+# reaches more easily into another basin.
+_NEAR = 0.01
 
 
 @door
@@ -40,7 +48,7 @@ def lyapunov(
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
-    """Largest Lyapunov exponent per forcing period of the motion from a start, with its standard error.
+    """Measure the largest Lyapunov exponent per forcing period of the motion from a start, and its standard error.
 
     The exact tangent map is multiplied up along an ensemble of motions from starts around the given one, u0 up to 1 %
     nearer to the middle and v0 up to 0.005 off. The map starts from the identity, which biases the exponent of a window
@@ -91,7 +99,7 @@ def lyapunov(
 
 
 def _share_of(progress: Callable[[int, int], None] | None, done: int, runs: int) -> Callable[[int, int], None] | None:
-    """The progress of one of several equal runs, `done` of them over, as that of all."""
+    """Pass on the progress of one of several equal runs, `done` of them over, as that of all."""
     tell = checks.function("progress", progress)
     return tell and (lambda now, total: tell(done * total + now, runs * total))
 
@@ -108,7 +116,7 @@ def survival(
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
 ) -> "xr.Dataset":
-    """How long chaos lasts: chaos that ends is a transient, however much it looked like an attractor.
+    """Measure how long chaos lasts: chaos that ends is a transient, however much it looked like an attractor.
 
     At eight instants up to `periods` every motion is watched for 200 periods: it is chaotic still if its tangent map
     grows by e^7 and it meets a wall in one period of ten. What creeps towards motions that touch no wall meets ever
@@ -153,7 +161,7 @@ def survival(
 
 
 def _lifetime(before: np.ndarray, still: np.ndarray, step: int) -> dict[str, np.ndarray]:
-    """Mean lifetime and its standard error, of so many chaotic motions so many of which are so a step later."""
+    """Estimate the mean lifetime and its standard error from how many of the chaotic motions are so a step later."""
     with np.errstate(divide="ignore", invalid="ignore"):
         part = still / before
         rate = abs(np.log(part)) / step

@@ -27,10 +27,15 @@ Task = TypeVar("Task")
 Workers = int | str
 """So many processes of this machine, among which its cores are divided; or the address of a scheduler."""
 
-_MOST_WORKERS = 4096  # processes of one machine
-_ANSWER = 10  # seconds that a scheduler has to answer
-_WAITING = 2  # tasks a thread of a worker: one runs and one waits, so that nobody does
+# Processes of one machine, at most: more are taken for a slip of the finger.
+_MOST_WORKERS = 4096
+# Seconds that a scheduler has to answer: with fewer, a busy one counts as absent.
+_ANSWER = 10
+# Tasks for a thread of a worker: while one runs the next waits beside it, so that the thread never does.
+_WAITING = 2
+# Loggers that print tracebacks of connections that are lost.
 _LOGS = ("distributed.batched", "distributed.client", "distributed.core", "distributed.utils", "tornado.application")
+# Settings of JAX by which new processes keep compiled programs where their driver does.
 _CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
@@ -77,7 +82,7 @@ def _in_turn(client: "Client", work: Callable[[Task], None], tasks: Iterator[Tas
     def fill() -> None:
         most = _WAITING * max(sum(client.nthreads().values()), 1)
         some = list(itertools.islice(tasks, max(most - len(running), 0)))
-        # Not pure: what it is for is what it does, and that may have been undone since the same was asked.
+        # A task is not pure: it is there for what it writes, which may be gone since the same was asked before.
         futures = client.map(work, some, pure=False)
         running.update(zip(futures, some, strict=True))
         finished.update(futures)
@@ -113,7 +118,7 @@ def _dask() -> ModuleType:
 
 @contextmanager
 def _joined(address: str) -> "Iterator[Client]":
-    """The scheduler at an address."""
+    """Join the scheduler at an address."""
     dask = _dask()
     try:
         dask.comm.get_address_host_port(address)
@@ -155,7 +160,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _local(number: int) -> "Iterator[Client]":
-    """So many new processes, which share the cores and end with this one, however that ends."""
+    """Start so many processes, which share the cores and end with this one, however that ends."""
     made = _dask().LocalCluster(
         n_workers=number,
         threads_per_worker=max((os.cpu_count() or 1) // number, 1),

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 COMPARED = ("P", "P_stderr", "period", "impacts_left", "impacts_right", "status")
-# A verdict has to hold at so many standard errors: on a plane of thousands of cells two would often fail by chance.
+# Standard errors at which a verdict has to hold still: of a plane of thousands of cells two would often fail by chance.
 SURE = 3.0
-# Cells that ended otherwise have no P to judge by, or one that still drifts.
+# Ends of cells that have a P to judge by: otherwise there is none, or it still drifts.
 _SETTLED = (Status.OK, Status.NO_IMPACT, Status.PERMANENT_CONTACT, Status.STICKING)
 
 
@@ -75,7 +75,7 @@ def compare(
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
-    """How much a rigid wall changes the power and the label of every cell, |P_rigid - P_soft|/P_soft.
+    """Map how much a rigid wall changes the power and the label of every cell, |P_rigid - P_soft|/P_soft.
 
         found = compare(d=np.linspace(0.05, 0.3, 96), kappa=np.geomspace(3, 4000, 96), tolerance=0.05)
         found.rigid_from  # kappa from which on the rigid wall keeps P within 5 %, over d
@@ -134,7 +134,7 @@ def _checked(tolerance: Any) -> float:
 
 @door
 def run(planned: Comparison, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
-    """The comparison of a plan, soft cells first; see `compare`."""
+    """Run the comparison of a plan, soft cells first; see `compare`."""
     before = planned.soft.cells.count
 
     checks.function("progress", progress)
@@ -154,7 +154,7 @@ def run(planned: Comparison, progress: Callable[[int, int], None] | None = None)
 
 
 def _difference(found: "xr.Dataset") -> "dict[str, xr.DataArray]":
-    """The relative difference in P and its standard error, to first order that of the ratio of both P."""
+    """Compute the relative difference in P and its standard error, to first order that of the ratio of both P."""
     soft, rigid = found["P_soft"], found["P_rigid"]
     with np.errstate(divide="ignore", invalid="ignore"):
         difference = (abs(rigid - soft) / soft).where((soft != 0) | (rigid != 0), 0.0)
@@ -168,7 +168,7 @@ def _difference(found: "xr.Dataset") -> "dict[str, xr.DataArray]":
 
 
 def _label(found: "xr.Dataset") -> "xr.DataArray":
-    """Agreement of periods and impact counts; without gravity mirror images, their sides exchanged, count as one."""
+    """Compare periods and impact counts; without gravity mirror images, their sides exchanged, count as one."""
     soft, rigid = (
         [found[f"{name}_{wall}"] for name in ("period", "impacts_left", "impacts_right")] for wall in ("soft", "rigid")
     )
@@ -183,7 +183,7 @@ def _label(found: "xr.Dataset") -> "xr.DataArray":
 
 
 def cheapest_model(found: "xr.Dataset", tolerance: float) -> "xr.DataArray":
-    """The cheapest of the rigid and the exact soft model whose P is within a relative tolerance, for every cell.
+    """Find the cheaper of the rigid and the soft model whose P is within a relative tolerance, in every cell.
 
     Rigid or soft only if three standard errors do not change the verdict and both cells came to an end; undecided
     otherwise.
@@ -210,7 +210,7 @@ def cheapest_model(found: "xr.Dataset", tolerance: float) -> "xr.DataArray":
 
 
 def rigid_from(cheapest: "xr.DataArray") -> "xr.DataArray | None":
-    """The least stiffness from which on, up to the stiffest cell, the rigid model is enough; NaN where there is none.
+    """Find the least stiffness from which on, up to the stiffest cell, the rigid model is enough; NaN if none.
 
     Softer cells may pass too, where the difference in P changes its sign, but by chance.
 

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 Found = dict[str, Any]  # field of Summary -> xr.Variable
 
-DEFAULT = SweepSettings()  # made here: it loads JAX, which the room of the settings must not
+# Made here because making it loads JAX, which the room of the settings must not.
+DEFAULT = SweepSettings()
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Plan:
         return frozenset(need for name in self.outputs for need in OUTPUTS[name].needs)
 
     def cut(self, block: Mapping[str, slice]) -> "Plan":
-        """The same for a block of the cells."""
+        """Plan a block of the cells alone."""
         return replace(self, cells=self.cells.cut(block))
 
 
@@ -132,21 +133,21 @@ OUTPUTS = {
     "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
     "status": Output("1", "how the cell ended", ("status",)),
 }
-# Their units vary where the motion does not.
+# Fields of `Summary` in units that vary where the motion does not: a column for every variant.
 _VARIED = {"P", "P_stderr", "energy_ratio", "deepest", "fastest"}
-# Few ask for them.
+# Variables that few ask for, and that cost something: a tangent map along the motion, or another sum.
 ON_REQUEST = ("asymmetry", "lyapunov")
 
 
 def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
-    """The map from the fields of `Summary`, each [cells] or [cells, variants] in the flat order of the plan."""
+    """Make the map of the fields of `Summary`, each [cells] or [cells, variants] in the flat order of the plan."""
     import xarray as xr  # here, as importing vijax must not load it
 
     return xr.Dataset(variables(planned, fields_found), coords=coordinates(planned.cells), attrs=provenance(planned))
 
 
 def variables(planned: Plan, fields_found: dict[str, np.ndarray]) -> "dict[str, xr.Variable]":
-    """As `label`, without what is the same for every tile of a plane."""
+    """Make the variables of `label`, without what is the same for every tile of a plane."""
     import xarray as xr
 
     of = planned.cells
@@ -159,7 +160,7 @@ def variables(planned: Plan, fields_found: dict[str, np.ndarray]) -> "dict[str, 
 
 
 def specimen(planned: Plan) -> "xr.Dataset":
-    """The map of the first cell alone, its numbers void: what kind of variables there will be."""
+    """Make the map of the first cell alone, its numbers void: what kind of variables there will be."""
     first = planned.cut({dim: slice(1) for dim in planned.cells.dynamic})
     variants = math.prod(planned.cells.sizes[dim] for dim in planned.cells.variant)
     blank = simulate.blank(1, variants, planned.settings.dtype)
@@ -167,7 +168,7 @@ def specimen(planned: Plan) -> "xr.Dataset":
 
 
 def flagged(status: "xr.Variable") -> "xr.Variable":
-    """A variable of `Status` codes that says what they mean."""
+    """Let a variable of `Status` codes say what they mean."""
     found = status.astype(np.int8)
     found.attrs = status.attrs | {
         "flag_values": [int(status) for status in Status],
@@ -177,7 +178,7 @@ def flagged(status: "xr.Variable") -> "xr.Variable":
 
 
 def best(dataset: "xr.Dataset") -> "xr.DataArray | None":
-    """The largest admissible P with the coordinates of its cell; None if no cell yields any."""
+    """Find the largest admissible P with the coordinates of its cell; None if no cell yields any."""
     power = dataset["P"].where(dataset["admissible"]).fillna(0.0)
     peak = power.isel({dim: int(i) for dim, i in power.argmax(...).items()})
     return peak if peak > 0 else None
@@ -186,7 +187,7 @@ def best(dataset: "xr.Dataset") -> "xr.DataArray | None":
 def warn_if_held(dataset: "xr.Dataset") -> None:
     """Warn where gravity along the axis keeps the ball on a wall in every cell: then there is nothing to see."""
     status, gamma = dataset["status"], dataset["gamma"]
-    # One cell first: a store may be larger than memory.
+    # The first cell is read alone, as a store may be larger than memory.
     if status.isel(dict.fromkeys(status.dims, 0)) != Status.PERMANENT_CONTACT or not gamma.all():
         return
     if (status == Status.PERMANENT_CONTACT).all():
@@ -206,7 +207,7 @@ def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":
 
 
 def coordinates(of: Cells) -> "dict[str, xr.Variable]":
-    """The axes as given and the quantities of the cells, with symbols and units."""
+    """Give the axes as given and the quantities of the cells, with symbols and units."""
     found = {}
     for name, values in {**of.given, **of.quantities}.items():
         found[name] = values.transpose(*(dim for dim in of.sizes if dim in values.dims))
@@ -227,7 +228,7 @@ def provenance(planned: Plan, **further: Any) -> dict[str, Any]:
 
 @cache
 def made_by() -> dict[str, str]:
-    """What computes here: versions, commit, machine."""
+    """Tell what computes here: versions, commit, machine."""
     places = tiles.places()
     return {
         "source": f"vijax {_version('vijax')}",
@@ -240,7 +241,7 @@ def made_by() -> dict[str, str]:
 
 
 def asked(planned: Plan) -> dict[str, Any]:
-    """What a map holds besides its coordinates: settings, outputs, constants, tolerances."""
+    """Tell what a map holds besides its coordinates: settings, outputs, constants, tolerances."""
     # The constants that axes stand for are coordinates.
     constants = [name for name in CONSTANTS if name not in AXES]
     return {
@@ -261,11 +262,11 @@ def _version(package: str) -> str:
 
 
 def _commit() -> str:
-    """Commit of the source that runs, with -dirty if it was changed; "unknown" outside its own repository."""
+    """Find the commit of the source that runs, with -dirty if changed; "unknown" outside its own repository."""
     git = ["git", "-C", str(Path(__file__).parent)]
     options: dict[str, Any] = {"capture_output": True, "text": True, "check": True}
     try:
-        # An installed copy may lie inside some other repository.
+        # An installed copy may lie inside some other repository, whose commit would say nothing.
         subprocess.run([*git, "ls-files", "--error-unmatch", Path(__file__).name], **options)
         described = subprocess.run([*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"], **options)
         return described.stdout.strip()

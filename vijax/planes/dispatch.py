@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _LOG = logging.getLogger(__name__)
-_WAITING = logging.getLogger("vijax.waiting")  # tells at INFO what a run is waiting for; scripts show it
+# Says at INFO what a run is waiting for: the command shows it at its progress bar.
+_WAITING = logging.getLogger("vijax.waiting")
 
 Fields = dict[str, np.ndarray]
 """Fields of `Summary`, by name."""
@@ -40,17 +41,17 @@ class Call(NamedTuple):
 
 
 def rows_for(cells: int) -> int:
-    """Rows of the call for so many cells: a power of two, so that few programs are compiled."""
+    """Find how many rows the call for so many cells has: a power of two, so that few programs are compiled."""
     return max(padded(cells), SMALLEST_TILE)
 
 
 def rows_each(cells: int) -> int:
-    """Rows of a call where there are so many cells for all devices together."""
+    """Find how many rows a call has where there are so many cells for all devices together."""
     return min(rows_for(math.ceil(cells / len(places()))), LARGEST_TILE)
 
 
 def compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
-    """Compute cells, given by flat indices, into fields over all cells; yields how many are done."""
+    """Compute cells, given by flat indices, into fields over all cells; yield how many are done."""
     of, done = planned.cells, 0
     gamma = of.flat(of.quantities["gamma"], wanted)
     # Level cells have a faster program, and one cell with gravity in a call would keep all of it from that.
@@ -62,7 +63,7 @@ def compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None =
 
 
 def _each(planned: Plan, group: np.ndarray, rows: int) -> Iterator[tuple[np.ndarray, Fields]]:
-    """Flat indices and fields of every call over a group of cells, as the calls are done."""
+    """Yield flat indices and fields of every call over a group of cells, as the calls are done."""
     if not group.size:
         return
     # Strided tiles are samples of the whole plane: they cost the same, and nobody is left with the slow corner.
@@ -78,7 +79,7 @@ def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
 
 
 def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None, None]:
-    """Calls, their fields and the seconds they took, as they are done; the next ones run meanwhile."""
+    """Yield calls, their fields and the seconds they took, as they are done; the next ones run meanwhile."""
     calls, here = iter(calls), places()
     free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
     for place in here:
@@ -93,7 +94,7 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
 
     try:
         if first := next(calls, None):
-            # Or the first calls' seconds would hold it.
+            # Programs are compiled before any call, whose seconds would otherwise hold that time.
             _WAITING.info("compiling")
             wait([pool.submit(prepare, first, place) for place in set(here)])
             _WAITING.info("running %s cells side by side, done with the slowest", f"{first.cells.size:,}")
@@ -111,7 +112,7 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
 
 
 def _where_free(call: Call, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
-    """As `perform`, on a device that is free."""
+    """Perform a call on a device that is free."""
     place = free.get()
     try:
         return perform(call, place)
@@ -120,7 +121,7 @@ def _where_free(call: Call, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fiel
 
 
 def perform(call: Call, place: jax.Device) -> tuple[Fields, float]:
-    """Fields for the cells of a call, and the seconds it took."""
+    """Compute the fields for the cells of a call; give them and the seconds it took."""
     began = time.perf_counter()
     _LOG.info("tile %d begins", call.number)
     found: Fields = {}
@@ -136,14 +137,14 @@ def prepare(call: Call, place: jax.Device) -> None:
 
 
 def _kinds(call: Call) -> list[np.ndarray]:
-    """Places of a call's level cells, which have a faster program, and of the others; those that there are."""
+    """Find the places of a call's level cells, which have a faster program, and of the others; those that there are."""
     of = call.planned.cells
     level = of.flat(of.quantities["gamma"], call.cells) == 0
     return [kind for kind in (np.flatnonzero(level), np.flatnonzero(~level)) if kind.size]
 
 
 def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> Fields:
-    """Fields for the first `count` of these cells, padded so that one program serves all."""
+    """Compute fields for the first `count` of these cells, padded so that one program serves all."""
     planned = call.planned
     of, settings = planned.cells, planned.settings
     rows = np.resize(index, call.rows)

@@ -18,11 +18,14 @@ from vijax.runtime.context import door
 from vijax.runtime.files import write_json
 from vijax.runtime.tiles import places
 
+# Seconds and bytes from which on somebody should agree before a run begins.
 _HOUR, _GIGABYTES = 3600.0, 10e9
-# Seconds of a cell and a period by two slow cores; rk4 at 1000 steps.
+# Seconds of a cell and a period where no pace was kept, by two slow cores; of rk4 at 1000 steps. With smaller ones a
+# run that takes the night begins unasked.
 _SLOW = {"exact level": 2e-7, "exact inclined": 2e-6, "ode": 2e-5, "rk4": 2e-6}
-_RECORDED = 1e-5  # the same where the cells' impacts are recorded
-_LEAST_TIMED = 2.0  # seconds, for a pace that is worth keeping
+_RECORDED = 1e-5  # The same where the impacts of cells are recorded.
+# Seconds that a run lasts for its pace to be kept: a shorter one says little of a long one.
+_LEAST_TIMED = 2.0
 _UNITS = (("days", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
 _FILE = "paces.json"
 
@@ -52,7 +55,7 @@ class Estimate(NamedTuple):
 
 @door
 def of(*plans: Plan) -> Estimate:
-    """What runs of such plans take together."""
+    """Estimate what runs of such plans take together."""
     kept = _paces()
     return Estimate(
         sum(plan.count for plan in plans),
@@ -63,7 +66,7 @@ def of(*plans: Plan) -> Estimate:
 
 @door
 def of_recorded(cells: int, periods: int, size: float) -> Estimate:
-    """What cells take whose impacts are recorded: the points of an orbit diagram, the balls of a survey."""
+    """Estimate what cells take whose impacts are recorded: points of an orbit diagram, balls of a survey."""
     return Estimate(cells, size, cells * periods * _RECORDED)
 
 
@@ -84,7 +87,7 @@ class Watch:
         """Keep the pace, if it is one, beside compiled programs."""
         if len(self._seen) < 3:
             return
-        # The first entry is of nothing done yet.
+        # In the first entry nothing is done yet, and programs are compiled until the second.
         (first, began), (last, ended) = self._seen[1], self._seen[-1]
         file = _file()
         if file is not None and ended - began >= _LEAST_TIMED:
@@ -103,7 +106,7 @@ def _level(planned: Plan) -> str:
 
 
 def _kind(planned: Plan) -> str:
-    """Runs of one kind keep one pace."""
+    """Name the kind of a run: those of one kind keep one pace."""
     settings = planned.settings
     devices = f"{len(places())} {places()[0].device_kind}"
     return f"{settings.method} {settings.until} {settings.dtype} {_level(planned)} {devices}"
@@ -120,7 +123,7 @@ def _file() -> Path | None:
 
 
 def _paces() -> dict[str, float]:
-    """What was kept; nothing of a file that is missing or broken."""
+    """Read what was kept; nothing of a file that is missing or broken."""
     file = _file()
     try:
         kept = {} if file is None else json.loads(file.read_text(encoding="utf-8"))

@@ -17,8 +17,10 @@ from vijax.runtime.files import write_json
 
 LIST = "vijax.json"
 TILES = Path("status", "tiles")
-_LONGEST = 1 << 30  # bytes of a list: that of a map in ten million files
-_PART = re.compile(r"\.(\w+)\.\d+\.part(\.json)?")  # what `files.beside` names a file that is being written
+# Bytes of the longest list that is read: that of a map in ten million files.
+_LONGEST = 1 << 30
+# The name that `files.beside` gives to a file that is being written.
+_PART = re.compile(r"\.(\w+)\.\d+\.part(\.json)?")
 
 
 def fingerprint(content: bytes) -> str:
@@ -38,7 +40,7 @@ def fault(file: Path, expected: str | None) -> str:
         _check_way(file)
         return "is missing"
     if not file.is_file():
-        return "is no regular file"  # which must not be read: a pipe would take for ever
+        return "is no regular file"  # It must not be read: a pipe would take for ever.
     if not str(expected).startswith(f"{file.stat().st_size} bytes"):
         return "is not what was written"
     try:
@@ -101,7 +103,8 @@ def listed(path: Path) -> Iterator[tuple[str, str]]:
         yield from faults(path, found["files"])
     elif os.path.lexists(path / LIST):
         yield LIST, fault(path / LIST, None)
-    else:  # nothing to compare with, but to read a pipe would take for ever
+    else:
+        # There is nothing to compare with, but to read a pipe would take for ever.
         odd = (file for file in path.rglob("*") if file.exists() and not file.is_dir() and not file.is_file())
         yield from ((_name(path, file), "is no regular file") for file in odd)
         unread = (file for file in path.glob("*/zarr.json") if content(file) is None)
@@ -143,7 +146,7 @@ def is_store(path: Path) -> bool:
 def foreign(path: Path) -> str | None:
     """Find a file in a store that vijax did not write."""
     listed = read(path)
-    # Whose list is lost or was never written, each of its arrays passes for one of vijax's.
+    # Where the list is lost or was never written, every array passes for one of vijax's.
     arrays = None if listed is None else {name.partition("/")[0] for name in listed["files"]}
     names = (_name(path, file) for file in path.rglob("*") if file.is_symlink() or not file.is_dir())
     return next((name for name in names if not _ours(name, arrays)), None)
@@ -156,7 +159,7 @@ def half_written(path: Path) -> list[Path]:
 
 
 def _ours(name: str, arrays: set[str] | None) -> bool:
-    """Whether vijax gives such names to files of a store with these arrays; with any if None."""
+    """Tell whether vijax gives such names to files of a store with these arrays; with any if None."""
     folder, _, last = name.rpartition("/")
     if part := _PART.fullmatch(last):
         last = part[1] + (part[2] or "")

@@ -35,11 +35,13 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _LOG = logging.getLogger(__name__)
-_WAITING = logging.getLogger("vijax.waiting")  # see `dispatch`
+_WAITING = logging.getLogger("vijax.waiting")  # As in `dispatch`.
 _WAYS: dict[Direction, tuple[str, ...]] = {"down": ("down",), "up": ("up",), "both": ("down", "up")}
 _DEFAULT = DiagramSettings()
-# A call takes chains so many points further: one compiled program for diagrams of every length.
+# Points that a call takes chains further, so that one compiled program serves diagrams of every length: a short one is
+# padded to as many.
 _LINKS = 64
+# Chains that run side by side in a call, at least, where others are padding, and at most.
 _FEWEST_LANES, _MOST_LANES = 8, 512
 _POINTS = {
     **{name: OUTPUTS[name][:2] for name in ("P", "period", "impacts_left", "impacts_right")},
@@ -69,7 +71,7 @@ def orbit_diagram(
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
-    """The impacts of attractors along an axis, by the usual procedure: every point starts where the last one ended.
+    """Record attractors along an axis, impact by impact: every point starts where the last one ended.
 
         orbit_diagram(along="d", values=np.linspace(0.3, 0.05, 126), kappa=[400, 40, 4], r=0.5, direction="both")
         orbit_diagram(along="omega", values=np.linspace(0.5, 15, 200), s=0.2, direction="up")  # one device
@@ -196,7 +198,7 @@ def plan(
 
 @door
 def run(diagram: Diagram, progress: Callable[[int, int], None] | None = None) -> "xr.Dataset":
-    """The dataset of a plan, its chains run tile by tile on every core; see `orbit_diagram`."""
+    """Run the chains of a plan tile by tile on every core, and make the dataset; see `orbit_diagram`."""
     tell = checks.function("progress", progress) or (lambda done, total: None)
     if diagram.expected.long:
         _LOG.warning("a long run begins: %s", diagram.expected)
@@ -217,21 +219,21 @@ def run(diagram: Diagram, progress: Callable[[int, int], None] | None = None) ->
 
 
 def _widened(values: np.ndarray, widest: int, name: str) -> np.ndarray:
-    """The impacts of a chain, padded as those of the chain with the most."""
+    """Pad the impacts of a chain as those of the chain with the most."""
     if name not in _IMPACTS:
         return values
     return np.pad(values, ((0, 0), (0, widest - values.shape[-1])), constant_values=np.nan)
 
 
 def _orders(diagram: Diagram) -> np.ndarray:
-    """Where every chain finds its points in the order in which it visits them, [chain, point]."""
+    """Find where every chain has its points in the order in which it visits them, [chain, point]."""
     rising = np.argsort(diagram.planned.cells.given[diagram.along].values, kind="stable")
     each = diagram.count // (diagram.points * len(diagram.ways))
     return np.concatenate([np.tile(rising[::-1] if way == "down" else rising, (each, 1)) for way in diagram.ways])
 
 
 def _table(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Parameters, units and starts of every chain in the order of its visit, [chain, point]."""
+    """Give parameters, units and starts of every chain in the order of its visit, [chain, point]."""
     of, orders = diagram.planned.cells, _orders(diagram)
     dims = {dim: size for dim, size in diagram.dims.items() if dim != "direction"}
 
@@ -248,7 +250,7 @@ def _table(diagram: Diagram) -> dict[str, np.ndarray]:
 
 
 def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """Indices and fields of every tile of chains, as the tiles are done."""
+    """Yield indices and fields of every tile of chains, as the tiles are done."""
     level = (table["gamma"] == 0).all(axis=1)
     pool = context.pool(workers())
     try:
@@ -262,7 +264,7 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
             chains = f"{tiles[0].size:,} chains of {diagram.points:,} points side by side"
             if number > 1:
                 _WAITING.info("compiling")
-                # Compiles; all threads at once would each do so.
+                # One short call compiles before all threads would do so at once.
                 brief = {name: x[:, :1] for name, x in table.items()}
                 pool.submit(_simulate, diagram, brief, tiles[0][:1], lanes, 1, 1).result()
                 _WAITING.info("running %s", chains)
@@ -280,7 +282,7 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
 def _simulate(
     diagram: Diagram, table: dict[str, np.ndarray], index: np.ndarray, lanes: int, periods: int, keep: int
 ) -> dict[str, np.ndarray]:
-    """The fields of the dataset for these chains, [chain, point] or [chain, point, impact or strobe]."""
+    """Compute the fields of the dataset for these chains, [chain, point] or [chain, point, impact or strobe]."""
     planned = diagram.planned
     table = {name: x[index].astype(planned.settings.dtype) for name, x in table.items()}
     summary = _follow(planned, table, lanes, periods, keep)
@@ -307,7 +309,7 @@ def _simulate(
 
 
 def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: int, keep: int) -> Any:
-    """The summary of every point, [chain, point], the chains taken so many points further by every call."""
+    """Summarise every point, [chain, point], the chains taken so many points further by every call."""
     chains, points = table["d"].shape
     growth = {name: np.ones_like(table[name]) for name in ("metres", "speed")}
     for name, units in growth.items():
@@ -342,7 +344,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
 
 
 def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -> Record:
-    """The kept periods of every point, flown again from where they begin."""
+    """Fly the kept periods of every point again, from where they begin."""
     soft = planned.settings.wall == "soft"
     d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
@@ -352,7 +354,7 @@ def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -
 
 
 def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
-    """The dataset from the fields of all chains, each in the order of its visit."""
+    """Make the dataset of the fields of all chains, each in the order of its visit."""
     import xarray as xr  # here, as importing vijax must not load it
 
     planned, sizes = diagram.planned, diagram.dims
@@ -366,9 +368,9 @@ def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
             variables[name] = xr.Variable((*sizes, *further), values, {"units": units, "long_name": text})
     variables["status"] = flagged(variables["status"])
     of = planned.cells
-    # A start is that of the first points alone.
+    # Later points start where the one before ended: a start that was not given is no coordinate.
     known = {name: x for name, x in coordinates(of).items() if name in of.given or name not in STARTS}
-    # Text of fixed width has no place in the third format of zarr.
+    # The third format of zarr has no lasting place for text of fixed width.
     names = np.array(diagram.ways, dtype=np.dtypes.StringDType())
     ways = {"direction": ("direction", names)} if "direction" in sizes else {}
     title = {"title": "Orbit diagram of a vibro-impact pair"}

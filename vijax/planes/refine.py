@@ -17,19 +17,22 @@ import numpy as np
 
 from vijax.model.label import ordered
 
-TOLERANCE = 0.01  # relative: P by interpolation may miss by so much, and by so many standard errors of both
+# Relative error that P may have by interpolation between computed cells. A smaller one computes more of them.
+TOLERANCE = 0.01
+# Standard errors of both that are forgiven besides: with fewer, noise of aperiodic cells is refined.
 SURE = 3.0
-# Fields of `Summary` that refinement looks at.
+# Fields of `Summary` that decide what is computed next.
 NEEDS = ("P", "P_stderr", "period", "impacts_left", "impacts_right", "restitution_left", "restitution_right", "status")
-# What a field is in the mirror image: another field, and its sign.
+# The mirror image of a field is another field, with a sign; one that is not here is the same in both.
 _MIRROR = {
     "restitution_left": ("restitution_right", 1),
     "restitution_right": ("restitution_left", 1),
     "asymmetry": ("asymmetry", -1),
 }
-# Between fewer points than these steps leave nothing would tell that an interpolation misses.
+# Steps that the coarsest lattice has along an axis, at least: with fewer, nothing would tell that interpolation misses.
 _FEWEST_STEPS = 4
-_AT_ONCE = 1 << 16  # cells filled together: few enough to stay in cache
+# Cells that are filled together: few enough to stay in cache.
+_AT_ONCE = 1 << 16
 
 Cells = np.ndarray
 """Flat indices of cells."""
@@ -38,7 +41,7 @@ Found = Mapping[str, np.ndarray]
 
 
 def most_levels(longest: int) -> int:
-    """Levels to which an axis of so many points can be coarsened; 0 if it cannot be."""
+    """Find to how many levels an axis of so many points can be coarsened; 0 if it cannot be."""
     return max((longest - 1) // _FEWEST_STEPS, 1).bit_length() - 1
 
 
@@ -76,32 +79,32 @@ class Mesh:
         return [np.argsort(order) for order in self._orders]
 
     def _shift(self, axis: int, level: int) -> int:
-        """The step along an axis as a power of two; level `levels + 1` is coarser than what is computed first."""
+        """Find the step along an axis as a power of two; level `levels + 1` is coarser than what comes first."""
         coarsest = min(most_levels(self.shape[axis]), self.levels)
         return min(level, coarsest) + (level > self.levels)
 
     def ranks(self, axis: int, level: int) -> np.ndarray:
-        """Ranks along an axis of the points of a lattice."""
+        """Find the ranks along an axis of the points of a lattice."""
         last = self.shape[axis] - 1
         return np.append(np.arange(0, last, 1 << self._shift(axis, level)), last)
 
     def ranks_of(self, cells: Cells) -> list[np.ndarray]:
-        """Ranks of cells along each axis."""
+        """Find the ranks of cells along each axis."""
         return [ranks[i] for ranks, i in zip(self._ranks, np.unravel_index(cells, self.shape), strict=True)]
 
     def lattice(self, level: int) -> Cells:
-        """The points of a lattice, as an array over the axes."""
+        """Find the points of a lattice, as an array over the axes."""
         points = (order[self.ranks(axis, level)] for axis, order in enumerate(self._orders))
         return np.asarray(np.ravel_multi_index(np.ix_(*points), self.shape))
 
     def blocks(self, axis: int, level: int, ranks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places along an axis of the blocks that a point belongs to: two where it is between them, else one twice."""
+        """Find the blocks along an axis that a point belongs to: two where it is between them, else one twice."""
         shift = self._shift(axis, level)
         last = (self.shape[axis] - 2) >> shift
         return np.maximum(ranks - 1, 0) >> shift, np.minimum(ranks >> shift, last)
 
     def corners(self, cells: Cells, level: int) -> tuple[np.ndarray, np.ndarray, Cells]:
-        """Corners [corner, cell] of the blocks that cells lie in, their weights there, and the nearest corner.
+        """Find the corners [corner, cell] of the blocks that cells lie in, their weights there, the nearest corner.
 
         Weights are linear in the logarithms of an axis, or in its values unless all are positive. On a block's border
         only corners of that border have a weight; the nearest stands for the others.
@@ -124,7 +127,7 @@ class Mesh:
 
 
 def rounds(mesh: Mesh, found: Found, level_ground: np.ndarray) -> Iterator[Cells]:
-    """Cells to compute, round by round, each once; those of a round must be in `found` when the next is asked for.
+    """Yield cells to compute, round by round, each once; those of a round are in `found` when the next is asked for.
 
     Args:
         mesh: The plane.
@@ -166,13 +169,13 @@ class _Front:
         self.there, self.seen, self.unlike, self.bad, self.done = (np.zeros(blocks, bool) for _ in range(5))
 
     def mark(self, cells: Cells) -> None:
-        """These cells say that the blocks they belong to must be split, be they there yet or not."""
+        """Mark the blocks that these cells belong to as ones that must be split, be they there yet or not."""
         sides = [self.mesh.blocks(axis, self.level, rank) for axis, rank in enumerate(self.mesh.ranks_of(cells))]
         for block in itertools.product(*sides):
             self.bad[block] = True
 
     def split(self, found: Found, level_ground: np.ndarray) -> np.ndarray:
-        """Blocks to split now: those on a border and their neighbours, and those that a cell contradicts."""
+        """Find the blocks to split now: those on a border and their neighbours, and those that a cell contradicts."""
         fresh = np.nonzero(self.there & ~self.seen)
         self.seen |= self.there
         corners = np.stack([self.points[place] for place in itertools.product(*((i, i + 1) for i in fresh))])
@@ -184,7 +187,7 @@ class _Front:
 
 
 def _kind(found: Found, level_ground: np.ndarray, cells: Cells) -> np.ndarray:
-    """The kind of motion of cells: numbers along a last dimension, all equal where motions are alike."""
+    """Tell the kind of motion of cells: numbers along a last dimension, all equal where motions are alike."""
     period, left, right, status = (found[name][cells] for name in ("period", "impacts_left", "impacts_right", "status"))
     few, many = ordered(left, right, level_ground[cells])
     return np.stack([period, few, many, status, found["P"][cells, 0] > 0], axis=-1)
@@ -193,7 +196,7 @@ def _kind(found: Found, level_ground: np.ndarray, cells: Cells) -> np.ndarray:
 def _surprises(
     mesh: Mesh, found: Found, level_ground: np.ndarray, cells: Cells, level: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which cells are of another kind than a corner of their block, and in which of the others P is missed."""
+    """Find cells of another kind than a corner of their block, and those of the others where P is missed."""
     corners, weights, _ = mesh.corners(cells, level)
     unlike = (_kind(found, level_ground, corners) != _kind(found, level_ground, cells)).any((0, -1))
 
@@ -209,7 +212,7 @@ def _surprises(
 
 
 def _with_neighbours(blocks: np.ndarray) -> np.ndarray:
-    """These blocks and those that share a face with one."""
+    """Add to blocks those that share a face with one."""
     found = blocks.copy()
     for axis in range(blocks.ndim):
         here, grown = np.moveaxis(blocks, axis, 0), np.moveaxis(found, axis, 0)
@@ -219,7 +222,7 @@ def _with_neighbours(blocks: np.ndarray) -> np.ndarray:
 
 
 def _closure(mesh: Mesh, blocks: np.ndarray, level: int) -> np.ndarray:
-    """Which points of the next lattice lie in these blocks or on their borders."""
+    """Find which points of the next lattice lie in these blocks or on their borders."""
     for axis in range(blocks.ndim):
         below, above = mesh.blocks(axis, level, mesh.ranks(axis, level - 1))
         blocks = blocks.take(below, axis) | blocks.take(above, axis)
@@ -227,7 +230,7 @@ def _closure(mesh: Mesh, blocks: np.ndarray, level: int) -> np.ndarray:
 
 
 def _children(mesh: Mesh, blocks: np.ndarray, level: int) -> np.ndarray:
-    """Which blocks of the next level lie in these."""
+    """Find which blocks of the next level lie in these."""
     for axis in range(blocks.ndim):
         _, above = mesh.blocks(axis, level, mesh.ranks(axis, level - 1)[:-1])
         blocks = blocks.take(above, axis)
@@ -282,14 +285,14 @@ def _fill(
 
 
 def _turned(found: Found, level_ground: np.ndarray, cells: Cells) -> np.ndarray:
-    """Which cells hold the one of two mirror images that counts as the other one turned."""
+    """Tell which cells hold the one of two mirror images that counts as the other one turned."""
     more_left = found["impacts_left"][cells] - found["impacts_right"][cells]
     harder_left = found["restitution_left"][cells] > found["restitution_right"][cells]
     return level_ground[cells] & ((more_left > 0) | ((more_left == 0) & harder_left))
 
 
 def _blend(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Values [corner, cell, ...] by their weights, by logarithm where all are positive."""
+    """Blend values [corner, cell, ...] by their weights, by logarithm where all are positive."""
     weights = weights.reshape(weights.shape + (1,) * (values.ndim - 2))
     positive = (values > 0).all(0)
     logs = np.log(np.where(positive, values, 1.0))

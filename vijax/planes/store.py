@@ -16,7 +16,7 @@ from vijax.runtime.files import check_ending, check_folder, recover, replacing_f
 if TYPE_CHECKING:
     import xarray as xr
 
-# Level 3 of compression takes twice as long and saves a thousandth more.
+# Level of zstd. Level 3 takes twice as long and saves a thousandth more.
 _LEVEL = 1
 
 
@@ -98,14 +98,14 @@ def seal(path: Path, **facts: Any) -> None:
 
 
 def compressors() -> tuple[Any, ...]:
-    """Of every chunk, its checksum last."""
+    """Make the codecs of every chunk, its checksum last."""
     from zarr.codecs import Crc32cCodec, ZstdCodec  # here, as importing vijax must not load it
 
     return ZstdCodec(level=_LEVEL), Crc32cCodec()
 
 
 def encoded(chunk: np.ndarray) -> bytes:
-    """The file of a chunk in the format of `compressors`, as zarr writes it at three times the cost."""
+    """Encode the file of a chunk in the format of `compressors`, as zarr does at three times the cost."""
     from numcodecs import Zstd
     from numcodecs.checksum32 import CRC32C
 
@@ -114,7 +114,7 @@ def encoded(chunk: np.ndarray) -> bytes:
 
 
 def load(path: str | Path) -> "xr.Dataset":
-    """The map that `save` wrote, equal to the one that was saved, or what there is of a study.
+    """Load the map that `save` wrote, equal to the one that was saved, or what there is of a study.
 
     Raises:
         FileNotFoundError: If there is no store.
@@ -138,7 +138,7 @@ def load(path: str | Path) -> "xr.Dataset":
 
 
 def view(path: str | Path) -> "xr.Dataset":
-    """As `load`, but nothing is read before it is looked at, nor are the files of tiles compared with their records."""
+    """Open a map as `load` does, but read nothing before it is looked at, nor compare files of tiles with records."""
     import xarray as xr  # here, as importing vijax must not load it
 
     target = Path(path)
@@ -160,7 +160,7 @@ def _check(path: Path, faults: Iterator[tuple[str, str]]) -> None:
 
 @contextmanager
 def _in_one_line(path: str | Path) -> Iterator[None]:
-    """What zarr and xarray say of a store that has no list, and that they cannot read."""
+    """Raise in one line what zarr and xarray say of a store that they cannot read."""
     try:
         yield
     except MemoryError:

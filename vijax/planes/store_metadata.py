@@ -19,7 +19,7 @@ from vijax.runtime.files import replacing
 if TYPE_CHECKING:
     import xarray as xr
 
-_SHOWN = 3  # so many of the settings that differ are named
+_SHOWN = 3  # Settings that differ which an error names; of others it says how many.
 
 
 def write(planned: Plan, tile: Mapping[str, int], birth: str, path: Path) -> None:
@@ -111,7 +111,7 @@ def _mend_list(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, s
 
 @contextmanager
 def _fresh(planned: Plan, tile: Mapping[str, int], birth: str) -> Iterator[Path]:
-    """The store of a plan as it would be made now."""
+    """Make the store of a plan as it would be made now, for a while."""
     with tempfile.TemporaryDirectory() as folder:
         write(planned, tile, birth, Path(folder, "fresh"))
         yield Path(folder, "fresh")
@@ -142,7 +142,7 @@ def check_same(planned: Plan, path: Path) -> None:
 
 
 def _differences(planned: Plan, store: "xr.Dataset") -> Iterator[str]:
-    """What was asked otherwise than the store has it, a phrase each."""
+    """Find what was asked otherwise than the store has it, a phrase each."""
     for name, value in json.loads(json.dumps(asked(planned))).items():
         if store.attrs.get(name, "left out") != value:
             yield f"{name} is {store.attrs.get(name, 'left out')}, and not {value}"
@@ -159,7 +159,7 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _words(values: "xr.Variable | xr.DataArray | None") -> str:
-    """A coordinate in a few words."""
+    """Write a coordinate in a few words."""
     if values is None:
         return "left out"
     if values.ndim == 0:

@@ -59,7 +59,7 @@ def sweep(
     workers: cluster.Workers | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
-    """Energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
+    """Map the energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
 
     Each axis is a number or a 1-D array, or such a quantity of pint; arrays become dimensions in the order given:
 
@@ -202,7 +202,7 @@ def run(
     overwrite: bool = False,
     workers: cluster.Workers | None = None,
 ) -> "xr.Dataset":
-    """The map of a plan, its cells simulated tile by tile on every device; see `sweep`."""
+    """Simulate the cells of a plan tile by tile on every device, and make its map; see `sweep`."""
     watch = estimate.Watch(checks.function("progress", progress) or (lambda done, total: None))
     checks.flag("overwrite", overwrite)
     if workers is not None:
@@ -286,7 +286,7 @@ def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
 
 
 def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
-    """The map of a plan of which a part is computed, in rounds, and the rest filled."""
+    """Make the map of a plan of which a part is computed, in rounds, and the rest filled."""
     of = planned.cells
     varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
     mesh = refinement.Mesh(tuple(of.given[dim].values for dim in varied), planned.refine)
@@ -343,7 +343,7 @@ def _fill(plane: tiled_store.Study, tell: Callable[[int, int], None], workers: c
 def _made(
     tiles: Iterable[tiled_store.Tile], rows: int, workers: cluster.Workers | None
 ) -> Generator[tiled_store.Tile, None, None]:
-    """Tiles as they are done, by whomever."""
+    """Yield tiles as they are done, by whomever."""
     if workers is None:
         yield from _here(tiles, rows)
     else:
@@ -351,7 +351,7 @@ def _made(
 
 
 def _here(tiles: Iterable[tiled_store.Tile], rows: int) -> Iterator[tiled_store.Tile]:
-    """Tiles, simulated and written by this process, as they are done."""
+    """Yield tiles, simulated and written by this process, as they are done."""
     running: dict[int, tiled_store.Tile] = {}
 
     def one_each() -> Iterator[Call]:
@@ -375,5 +375,5 @@ def _make(rows: int, tile: tiled_store.Tile) -> None:
 
 
 def _whole(tile: tiled_store.Tile, rows: int) -> Call:
-    """All cells of a tile of a study."""
+    """Make the call for all cells of a tile of a study."""
     return Call(tile.planned, np.arange(tile.planned.count), rows, tile.number)

@@ -12,11 +12,16 @@ if TYPE_CHECKING:
     from vijax.engine.method import Method
     from vijax.model.membrane import Law
 
-STARTS = 64  # that fractions of basins are told by in every cell, to a standard error of 0.06 at most
-START_POINTS = 256  # along either side of a plane of starts: its picture is as fine as a page shows it
-SPEED = 0.6  # starts are drawn up to this speed, the one that the field's basins are drawn to
+# Starts in every cell unless told otherwise: shares of random ones have a standard error of 0.0625 at most.
+STARTS = 64
+# Starts along either side of a plane of them unless told otherwise.
+START_POINTS = 256
+# Speed up to which starts lie unless told otherwise: the one that basins are drawn to in the field.
+SPEED = 0.6
 
-_OPTIONS = ("solver", "rtol", "atol", "membrane", "steps")  # what methods are told, each its own
+# Settings that methods are told, each its own ones.
+_OPTIONS = ("solver", "rtol", "atol", "membrane", "steps")
+# Settings that an orbit diagram reads, in the order of its attributes.
 _OF_DIAGRAMS = ("direction", "periods", "keep", "wall", "dtype")
 
 

@@ -29,12 +29,17 @@ from vijax.runtime.tiles import places
 if TYPE_CHECKING:
     import xarray as xr
 
-# A second or two of a core: large enough to keep lanes full and files few, small enough to lose.
+# Cells of a tile: the largest take a core a second or two, large enough to keep lanes full and files few, small enough
+# to lose.
 SMALLEST_TILE, LARGEST_TILE = 1024, 32768
-_SHARES = 2  # tiles of a small plane for everyone who takes some: blocks do not cost the same
-_ROUNDING = 1.1  # such a share may be so much larger, as halves of odd lengths are rounded up
-_LARGEST_CHUNK = 1 << 21  # numbers: of many variants a tile has fewer cells
-_LONGEST_BIRTH = 100  # characters: of a lock file that somebody wrote over no more are read
+# Tiles of a small plane for everyone who takes some. With one each, all wait for whoever has the dearest block.
+_SHARES = 2
+# Factor by which a share may be larger, as halves of odd lengths are rounded up: without, it would be halved once more.
+_ROUNDING = 1.1
+# Numbers of a chunk, at most: of many variants a tile has fewer cells.
+_LARGEST_CHUNK = 1 << 21
+# Characters that are read of a lock file, at most: somebody may have written over it.
+_LONGEST_BIRTH = 100
 _LOG = logging.getLogger(__name__)
 
 
@@ -73,12 +78,12 @@ class Study:
         return math.prod(self.extents.values())
 
     def place(self, tile: int) -> dict[str, int]:
-        """Number of a tile along every dynamic dimension."""
+        """Find the number of a tile along every dynamic dimension."""
         numbers = np.unravel_index(tile, self.counts) if self.extents else ()
         return {dim: int(number) for dim, number in zip(self.extents, numbers, strict=True)}
 
     def block(self, tile: int) -> dict[str, slice]:
-        """Where a tile lies in the plane."""
+        """Find where a tile lies in the plane."""
         sizes, place = self.planned.cells.sizes, self.place(tile)
         return {
             dim: slice(place[dim] * extent, min((place[dim] + 1) * extent, sizes[dim]))
@@ -86,18 +91,18 @@ class Study:
         }
 
     def count(self, tile: int) -> int:
-        """Cells of a tile."""
+        """Count the cells of a tile."""
         return math.prod(part.stop - part.start for part in self.block(tile).values())
 
     def tile(self, number: int) -> "Tile":
-        """A tile alone."""
+        """Cut out a tile alone."""
         block, path = self.block(number), self.path.absolute()
         chunk = {**self.planned.cells.sizes, **self.extents}
         shapes = {name: tuple(chunk[dim] for dim in along) for name, along in self.dims.items()}
         return Tile(number, path, self.birth, self.planned.cut(block), self.dims, shapes, self.place(number))
 
     def record(self, tile: int) -> Path:
-        """Where it is written that a tile is done."""
+        """Name the file where it is written that a tile is done."""
         return _record(self.path, tile)
 
 
@@ -129,7 +134,7 @@ def _record(path: Path, tile: int) -> Path:
 
 
 def extents(sizes: dict[str, int], most: int) -> dict[str, int]:
-    """Lengths of blocks of at most so many cells, by halving the longest dimension."""
+    """Find the lengths of blocks of at most so many cells, by halving the longest dimension."""
     found = dict(sizes)
     while math.prod(found.values()) > most:
         longest = max(found, key=lambda dim: found[dim])
@@ -138,7 +143,7 @@ def extents(sizes: dict[str, int], most: int) -> dict[str, int]:
 
 
 def blocks(of: Cells) -> dict[str, int]:
-    """Lengths of the tiles of a new store."""
+    """Find the lengths of the tiles of a new store."""
     return extents({dim: of.sizes[dim] for dim in of.dynamic}, _most(of))
 
 
@@ -162,14 +167,14 @@ def check(planned: Plan, path: str | Path, overwrite: bool = False) -> None:
 
 
 def _target(path: str | Path, overwrite: bool) -> Path:
-    """Where to write: nothing is there, or a store, or what may be replaced."""
+    """Find where to write: nothing is there, or a store, or what may be replaced."""
     target = check_place("out", path)
     return target if inventory.is_store(target) and not overwrite else check_store("out", path, overwrite)
 
 
 @contextmanager
 def opened(planned: Plan, path: str | Path, overwrite: bool = False) -> Iterator[Study]:
-    """The study of a plane, made or found, which no one else may write meanwhile.
+    """Open the study of a plane, made or found, which no one else may write meanwhile.
 
     Raises:
         As `check`.
@@ -186,7 +191,7 @@ def opened(planned: Plan, path: str | Path, overwrite: bool = False) -> Iterator
 
 
 def _make(planned: Plan, target: Path) -> None:
-    """A store without any tile, unless another run was faster."""
+    """Make a store without any tile, unless another run was faster."""
     part = beside(target, "part")
     try:
         _write_blank(planned, part)
@@ -206,7 +211,7 @@ def _write_blank(planned: Plan, path: Path) -> None:
 
 
 def _lock(path: Path) -> Path:
-    """The file that a writer of the store locks; within, the birth of the store."""
+    """Name the file that a writer of the store locks; within, the birth of the store."""
     return path / inventory.TILES / "lock"
 
 
@@ -216,14 +221,14 @@ def _birth(path: Path) -> str:
 
 
 def _most(of: Cells) -> int:
-    """Cells of a tile, at most."""
+    """Find how many cells a tile has, at most."""
     share = max(int(_ROUNDING * of.count / (_SHARES * len(places()))), SMALLEST_TILE)
     room = _LARGEST_CHUNK // math.prod(of.sizes[dim] for dim in of.variant)
     return min(share, LARGEST_TILE, max(room, 1))
 
 
 def _found(planned: Plan, path: Path) -> Study:
-    """The study that a store is, its tiles as long as they were when it was made."""
+    """Describe the study that a store is, its tiles as long as they were when it was made."""
     with view(path) as store:
         dims = {name: tuple(map(str, store[name].dims)) for name in planned.outputs}
         chunks = store["status"].encoding["chunks"]
@@ -232,7 +237,7 @@ def _found(planned: Plan, path: Path) -> Study:
 
 @contextmanager
 def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
-    """Alone with a store; the lock ends with its process, however that ends. What was saved whole nobody writes."""
+    """Be alone with a store; the lock ends with its process, however that ends. What was saved whole nobody writes."""
     from filelock import FileLock, Timeout  # here, as importing vijax would take a twentieth longer
 
     if not inventory.is_study(path):
@@ -272,7 +277,7 @@ def _check_same(planned: Plan, path: Path) -> None:
 
 
 def left(study: Study, say: Callable[[str], None]) -> list[int]:
-    """Tiles that are not done, and those whose files are no longer what was written; of these is said why."""
+    """Find tiles that are not done, and those whose files are no longer what was written; of these say why."""
     for file in inventory.half_written(study.path):
         file.unlink(missing_ok=True)  # a worker that lost its driver may still be writing
     found = []
@@ -288,7 +293,7 @@ def left(study: Study, say: Callable[[str], None]) -> list[int]:
 
 
 def _damage(study: Study, tile: int) -> str:
-    """What is wrong with the files of a tile, nothing if all are as they were written."""
+    """Say what is wrong with the files of a tile, nothing if all are as they were written."""
     record = inventory.content(study.record(tile))
     if record is None or not isinstance(record.get("files"), dict):
         inventory.fault(study.record(tile), None)
@@ -304,7 +309,7 @@ def _damage(study: Study, tile: int) -> str:
 
 
 def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, int]) -> Iterator[tuple[str, Path]]:
-    """The chunk of every variable of a tile."""
+    """Name the chunk of every variable of a tile."""
     for name, along in dims.items():
         yield name, path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in along))
 
@@ -341,7 +346,7 @@ def write(tile: Tile, found: "Mapping[str, xr.Variable]", seconds: float) -> Non
 
 
 def _filled(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """A chunk of a variable, void where it reaches beyond the plane."""
+    """Fill a chunk of a variable, void where it reaches beyond the plane."""
     chunk = np.full(shape, store_metadata.void(name, values.dtype), values.dtype)
     chunk[tuple(slice(size) for size in values.shape)] = values
     return chunk
