@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import malformed
 import numpy as np
 import pytest
+from helpers import stand_in
 
 import vijax
+from vijax.batch import simulate
 from vijax.cli import arguments, process
 from vijax.planes import estimate, sweep
 from vijax.planes.axes import parse_axis
@@ -34,17 +36,23 @@ class BegunError(Exception):
     """What a run raises that was begun."""
 
 
-@pytest.fixture
-def unrun(monkeypatch):
-    """Plans whose run was begun, none of which runs."""
-    begun = []
+def begin(*_):
+    """Take the first word of progress, which comes before the first cell."""
+    raise BegunError
 
-    def run(planned, *_):
-        begun.append(planned)
+
+@pytest.fixture
+def begun(monkeypatch):
+    """How many cells each run of the command was to have, none of which runs: they end where their bar begins."""
+    totals = []
+
+    def bar(*, total, **_):
+        totals.append(total)
         raise BegunError
 
-    monkeypatch.setattr(sweep, "_run", run)
-    return begun
+    bar.write = print
+    monkeypatch.setattr("tqdm.tqdm", bar)
+    return totals
 
 
 @pytest.mark.parametrize("case", CALLS, ids=[case.text for case in CALLS])
@@ -101,21 +109,21 @@ def test_an_axis_from_a_file_without_an_end_is_refused_unread():
         parse_axis("d", "@/dev/zero")
 
 
-def test_what_does_not_fit_in_memory_names_its_arguments(monkeypatch, unrun):
+def test_what_does_not_fit_in_memory_names_its_arguments(monkeypatch):
     monkeypatch.setattr(checks, "memory", lambda: 1e6)
     plane = {"d": np.linspace(0.1, 0.3, 100), "kappa": np.linspace(3, 40, 100)}
     with pytest.raises(ValueError, match=r"d and kappa must be so few that 10,000 cells fit in memory, 0.001 GB"):
-        vijax.sweep(**plane)
+        vijax.sweep(**plane, progress=begin)
     with pytest.raises(ValueError, match="starts must be so few"):
-        vijax.basin_fractions(d=0.2, kappa=3.0, starts=9999)
-    assert not unrun
+        vijax.basin_fractions(d=0.2, kappa=3.0, starts=9999, progress=begin)
 
 
-def test_a_store_may_be_larger_than_memory(monkeypatch, unrun, tmp_path):
+def test_a_store_may_be_larger_than_memory(monkeypatch, tmp_path):
     monkeypatch.setattr(checks, "memory", lambda: 1e6)
-    with pytest.raises(BegunError):
-        vijax.sweep(d=np.linspace(0.1, 0.3, 100), kappa=np.linspace(3, 40, 100), out=tmp_path / "map.zarr")
-    assert len(unrun) == 1
+    monkeypatch.setattr(simulate, "summarise", stand_in)
+    found = vijax.sweep(d=np.linspace(0.1, 0.3, 100), kappa=np.linspace(3, 40, 100), out=tmp_path / "map.zarr")
+    assert found.nbytes > 1e6
+    assert not (found.status == vijax.Status.NOT_RUN).any()
 
 
 @pytest.fixture
@@ -166,33 +174,35 @@ def test_a_pace_that_cannot_be_read_is_none(kept):
     assert estimate.of(planned(100)).seconds == pytest.approx(2e-7 * 400 * 10**4)
 
 
-def test_a_long_run_asks_and_wants_yes(kept, folder, capsys, unrun):
+def test_a_long_run_asks_and_wants_yes(kept, folder, capsys, begun):
     plane = ["--d", "0.1:0.3:30000", "--kappa", "3:40:30000", "--out", "map.zarr"]
     assert script.main(plane) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: yes must be given beyond an hour or 10 GB; got 900,000,000 cells, up to 130 GB")
     assert said.count("\n") == 1
-    assert not unrun
+    assert not begun
     assert not list(folder.glob("*.zarr"))
     with pytest.raises(BegunError):
         script.main([*plane, "--yes"])
-    assert [plan.count for plan in unrun] == [900_000_000]
+    assert begun == [900_000_000]
 
 
 @pytest.mark.parametrize(("answer", "end"), [("y\n", BegunError), ("n\n", SystemExit)])
-def test_a_terminal_is_asked(kept, folder, monkeypatch, unrun, answer, end):
+def test_a_terminal_is_asked(kept, folder, monkeypatch, begun, answer, end):
     terminal = StringIO(answer)
     terminal.isatty = lambda: True
     monkeypatch.setattr(sys, "stdin", terminal)
     monkeypatch.setattr(process.os, "_exit", sys.exit)
     with pytest.raises(end):
         script.main(["--d", "0.1:0.3:30000", "--kappa", "3:40:30000", "--out", "map.zarr"])
-    assert len(unrun) == (end is BegunError)
+    assert len(begun) == (end is BegunError)
 
 
-def test_a_long_run_in_python_is_told_in_the_log(kept, folder, caplog, unrun):
+def test_a_long_run_in_python_is_told_in_the_log(kept, folder, monkeypatch, caplog):
+    monkeypatch.setattr(simulate, "summarise", stand_in)
+    plane = {"d": np.linspace(0.1, 0.3, 30_000), "kappa": np.linspace(3, 40, 30_000)}
     with pytest.raises(BegunError):
-        vijax.sweep(d=np.linspace(0.1, 0.3, 30_000), kappa=np.linspace(3, 40, 30_000), out="map.zarr")
+        vijax.sweep(**plane, out="map.zarr", progress=begin)
     assert "a long run begins: 900,000,000 cells" in caplog.text
 
 

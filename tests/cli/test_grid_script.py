@@ -1,5 +1,6 @@
 """`scripts/grid.py`: from its arguments to a store and a picture, and nothing at all after bad input or Ctrl-C."""
 
+import logging
 import os
 import re
 import signal
@@ -299,7 +300,7 @@ def test_the_bar_says_what_is_waited_for(folder, capsys):
     assert script.main([*TINY, "--out", "map.zarr"]) == 0
     err = capsys.readouterr().err
     assert err.index("starting") < err.index("compiling") < err.index("running 6 cells side by side") < err.index("6/6")
-    assert not progress._WAITING.handlers
+    assert not logging.getLogger("vijax.waiting").handlers
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import pint
 import pytest
 
 import vijax
-from vijax.cli import orbit_diagram as page
 from vijax.design import variables
 from vijax.model import quantities, units
 from vijax.model.device import CONSTANTS, Harvester, with_constants
@@ -139,7 +138,7 @@ def test_a_ball_that_gravity_holds_is_warned_of(tmp_path):
 def test_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     asked = []
-    monkeypatch.setattr(page, "_run", lambda planned: asked.append(planned) or _stop())
+    monkeypatch.setattr(orbit_diagram, "run", lambda planned, _: asked.append(planned) or _stop())
     chosen = ["--along", "omega=2Hz:10Hz:3", "--s", "30cm", "--set", "penetration_limit=4mm", "--set", "V=1.7kV"]
     with pytest.raises(_StopError):
         diagram_script.main(chosen)

@@ -30,7 +30,7 @@ Workers = int | str
 # Processes of one machine, at most: more are taken for a slip of the finger.
 _MOST_WORKERS = 4096
 # Seconds that a scheduler has to answer: with fewer, a busy one counts as absent.
-_ANSWER = 10
+ANSWER = 10
 # Tasks for a thread of a worker: while one runs the next waits beside it, so that the thread never does.
 _WAITING = 2
 # Loggers that print tracebacks of connections that are lost.
@@ -39,8 +39,12 @@ _LOGS = ("distributed.batched", "distributed.client", "distributed.core", "distr
 _CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
 
-def check(workers: Workers) -> None:
+def check(workers: Workers, answer: float = ANSWER) -> None:
     """Raise unless there are such workers, or can be; starts none.
+
+    Args:
+        workers: So many processes, or the address of a scheduler.
+        answer: Seconds that a scheduler has to answer.
 
     Raises:
         ValueError: If a number is none, or an address no address.
@@ -48,7 +52,7 @@ def check(workers: Workers) -> None:
         ModuleNotFoundError: Without Dask.
     """
     if isinstance(workers, str):
-        with _joined(workers):
+        with _joined(workers, answer):
             pass
     else:
         _dask()
@@ -117,7 +121,7 @@ def _dask() -> ModuleType:
 
 
 @contextmanager
-def _joined(address: str) -> "Iterator[Client]":
+def _joined(address: str, answer: float = ANSWER) -> "Iterator[Client]":
     """Join the scheduler at an address."""
     dask = _dask()
     try:
@@ -127,14 +131,14 @@ def _joined(address: str) -> "Iterator[Client]":
             f"workers or scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}"
         ) from None
     try:
-        client = dask.Client(address, timeout=_ANSWER, set_as_default=False)
+        client = dask.Client(address, timeout=answer, set_as_default=False)
     except TypeError as error:  # which TLS without certificates raises
         raise ValueError(
             f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
         ) from None
     except OSError:
         raise ConnectionError(
-            f"workers or scheduler must answer within {_ANSWER} s; got {address}, where none did; start it, or give "
+            f"workers or scheduler must answer within {answer} s; got {address}, where none did; start it, or give "
             "its address"
         ) from None
     with _quiet(), client:
