@@ -11,6 +11,7 @@ from paper.cached import branches, diagram, orbits
 from paper.captions import BRANCHES_FROM, BRANCHES_WITHIN, FIGURES, PaperFigure, Run, Source, View
 from paper.portrait import Layer, Panel, phase_plane, small_multiples, time_series
 from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.quantities import AXES
 from vijax.orbits.motion import Curve, curve, states
 from vijax.orbits.orbit_properties import path
 
@@ -49,8 +50,13 @@ QUANTITIES = {
     "energy": Quantity("E", r"$E_j$ [$\mu$J]", factor=MICRO),
     "power": Quantity("P", r"$P$ [$\mu$J]", factor=MICRO),
 }
-_NAMES = {"d": "$d$", "kappa": r"$\kappa$", "omega": r"$\omega$ [rad/s]", "r": "$r$"}
 _LOGARITHMIC = {"energy", "power"}
+
+
+def axis_label(name: str) -> str:
+    """Symbol and unit of the axis that a figure sweeps, as the paper writes them."""
+    axis = AXES[name]
+    return f"${axis.attributes['symbol']}$" + (f" [{axis.unit}]" if axis.unit else "")
 
 
 def selected(source: Source) -> "xr.Dataset":
@@ -142,7 +148,7 @@ def _sweep(figure: PaperFigure, view: View) -> Panel:
         label = r"$E_j$, $P$ [$\mu$J]"
     return Panel(
         view.title,
-        _NAMES[run.along],
+        axis_label(run.along),
         label,
         layers,
         upright=figure.marks if view.shows.startswith("speed") else (),
