@@ -30,18 +30,42 @@ CLIMBED = {
     "barrier_factor": (0.5, {"barrier_power": 1.0}),
     "barrier_power": (1.1, {}),
 }
-CHANGED = SURVEYED | CLIMBED | {"active_margin": (0.9, {})}
+RIVALS = {"min_rival": (1.0, {}), "max_excess": (1e-6, {})}
+CHANGED = SURVEYED | CLIMBED | RIVALS | {"active_margin": (0.9, {})}
+# Changed where designs of aperiodic motion are tested.
+ELSEWHERE = (
+    "min_chaos",
+    "max_places",
+    "places_apart",
+    "limit_price",
+    "ensemble_balls",
+    "ensemble_periods",
+    "ensemble_radius",
+    "last_radius",
+    "max_ensembles",
+    "least_gain",
+    "confirm_balls",
+    "confirm_periods",
+    "expected_balls",
+    "limit_room",
+    "max_confirmations",
+)
 # Its motion is chaotic from kappa 22 to 23, periodic at most others.
 UNIT = vijax.Harvester(A=2.460536, omega=9.218106, r=0.854762)
 DEVICE = dataclasses.replace(UNIT, s=0.073195 * UNIT.length_unit)
 
 
-def surveyed(tune=("kappa", "r"), steps=64, **settings):
+def surveyed(tune=("kappa", "r"), steps=64, orbits_alone=True, **settings):
     """Where ascents begin."""
     box = optimise.check([DEVICE], tune, {"kappa": (3.0, 400.0)}, "P", ())
     far = optimise.effort(steps, 1, 16)._replace(settings=DesignSettings(**settings))
-    met, looked = multistart.find([DEVICE], tune, box, "P", far)
+    met, _, looked = multistart.find([DEVICE], tune, box, "P", far, orbits_alone=orbits_alone)
     return met.z.tolist(), looked[0].orbits
+
+
+def rivalled(**settings):
+    """Where ascents begin, where any motion may win."""
+    return surveyed(orbits_alone=False, **settings)
 
 
 def climbed(**settings):
@@ -72,14 +96,16 @@ def designed(**settings):
 
 def test_every_setting_has_a_sentence_and_is_changed_here():
     fields = [field.name for field in dataclasses.fields(DesignSettings)]
-    assert sorted(fields) == sorted([*CHANGED, "same_optimum"])
+    # Those of aperiodic motion are changed where such designs are tested.
+    assert sorted(fields) == sorted([*CHANGED, "same_optimum", *ELSEWHERE])
     assert [name for name in fields if f"\n        {name}: " not in (DesignSettings.__doc__ or "")] == []
 
 
 @pytest.mark.parametrize("name", CHANGED)
 def test_every_setting_is_read(name):
     value, others = CHANGED[name]
-    told = surveyed if name in SURVEYED else climbed if name in CLIMBED else designed
+    kinds = ((SURVEYED, surveyed), (CLIMBED, climbed), (RIVALS, rivalled))
+    told = next((told for kind, told in kinds if name in kind), designed)
     assert told(**others) != told(**others, **{name: value})
 
 

@@ -25,7 +25,7 @@ def found(given, low, high, steps, balls, periods=200):
     """What `find` finds between two kappa: the starts, their kinds (period, more and fewer impacts), their kappa."""
     bounds = {"kappa": (low, high)}
     box = optimise.check([given], ("kappa",), bounds, "P", ())
-    met, looked = multistart.find([given], ("kappa",), box, "P", Effort(steps, balls, 16, periods))
+    met, _, looked = multistart.find([given], ("kappa",), box, "P", Effort(steps, balls, 16, periods))
     left, right = ((met.flown.side == side).sum(axis=1) for side in (-1, 1))
     kinds = np.column_stack([met.flown.span / 2, np.maximum(left, right), np.minimum(left, right)]).astype(int)
     assert looked[0].orbits >= len(kinds)
@@ -62,7 +62,7 @@ def test_starts_of_one_device_do_not_depend_on_the_others():
 
     def of(some):
         box = optimise.check(some, ("kappa",), {"kappa": (2.0, 400.0)}, "P", ())
-        met, looked = multistart.find(some, ("kappa",), box, "P", Effort(128, 2, 16, 200))
+        met, _, looked = multistart.find(some, ("kappa",), box, "P", Effort(128, 2, 16, 200))
         return [
             (met.flown.pair.kappa[own], met.flown.knots[own], looked[i].orbits)
             for i in range(len(some))

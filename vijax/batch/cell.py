@@ -38,6 +38,7 @@ class Plan(eqx.Module):
         tangent: Whether the tangent map is wanted; the search for an attractor needs it.
         variants: How many devices share the motion of a cell.
         chained: Whether a cell starts in the last one's state (`chain`).
+        devices: Whether every cell has electrical constants of its own.
     """
 
     until: str = eqx.field(static=True, default="attractor")
@@ -49,6 +50,7 @@ class Plan(eqx.Module):
     tangent: bool = eqx.field(static=True, default=True)
     variants: int = eqx.field(static=True, default=1)
     chained: bool = eqx.field(static=True, default=False)
+    devices: bool = eqx.field(static=True, default=False)
 
 
 class Settings(eqx.Module):
@@ -72,6 +74,7 @@ class Entry(eqx.Module):
         u, v: Its start; of a chained cell how displacement and velocity grow from the last cell's units to its own,
             until the state that it is handed stands there.
         t: Phase of the start; None where every cell starts at phase 0.
+        device: Its electrical constants (`device.electrical`); None where all cells share those of the settings.
     """
 
     pair: ImpactPair
@@ -80,6 +83,7 @@ class Entry(eqx.Module):
     u: Values
     v: Values
     t: Values | None
+    device: Harvester | None = None
 
 
 class Harvest(eqx.Module):
@@ -155,6 +159,7 @@ class Cell(eqx.Module):
     course: Course | None
     length: Lane
     speed: Lane
+    device: Harvester | None
     ball: Ball
     held: Lane  # mode of a start in contact
     running: Mask

@@ -17,7 +17,7 @@ from vijax.batch.summary import Summary, shapes, unload
 from vijax.engine import exact, quick_contact
 from vijax.engine.impact import Arrival, Ball
 from vijax.engine.method import Method
-from vijax.model.device import Harvester, check_device
+from vijax.model.device import Harvester, check_device, electrical
 from vijax.model.membrane import HuntCrossley
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.runtime import checks, export_cache
@@ -57,6 +57,7 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
         course=None if method is None else solver_steps.set_off(method, plan, pair, ball, held),
         length=entry.length,
         speed=entry.speed,
+        device=entry.device,
         ball=ball,
         held=held,
         running=~no,
@@ -81,7 +82,8 @@ def entry_shapes(plan: Plan, dtype: Any) -> Entry:
     """What a run is told of a cell, as shapes."""
     one: Any = jax.ShapeDtypeStruct((1,), dtype)
     pair = ImpactPair(one, None if plan.rigid else one, one, one)
-    return Entry(pair, length=one, speed=one, u=one, v=one, t=one if plan.chained else None)
+    device = jax.tree.map(lambda _: one, electrical(Harvester())) if plan.devices else None
+    return Entry(pair, length=one, speed=one, u=one, v=one, t=one if plan.chained else None, device=device)
 
 
 def _program(plan: Plan, settings: Settings) -> lanes.Program:
@@ -245,28 +247,30 @@ def blank(count: int, variants: int, dtype: str) -> Summary:
 @door
 def attractors(
     pair: ImpactPair,
-    u0: Float[AnyArray, "cell"],
-    v0: Float[AnyArray, "cell"],
+    device: Harvester,
+    starts: "Starts",
     *,
     periods: int,
     keep: int,
     count: int | None = None,
 ) -> Summary:
-    """Run a tile of soft cells from phase 0, each until its attractor is certain, in one jitted call; with their ends.
+    """Run a tile of devices with soft walls, each until its attractor is certain, in one jitted call; with their ends.
 
     Args:
         pair: Cells.
-        u0, v0: Starts.
+        device: Those that they are the nondimensional form of: arrays [cell].
+        starts: At any phase, in contact too.
         periods: The most that the search for an attractor may take.
         keep: Periods at the end whose impacts will be wanted.
         count: How many cells are real, the rest being padding; all unless given.
 
     Returns:
-        The summary, in the units of `pair`, with its `handover`.
+        The summary with its `handover`; energies are those of each cell's own device.
     """
-    one, zero = jnp.ones_like(pair.d), jnp.zeros_like(pair.d)
-    cells = rows.pack(Entry(pair, one, one, u0, v0, zero))
-    plan = _chained(pair)
+    length: Any = device.length_unit
+    speed: Any = device.speed_unit
+    cells = rows.pack(Entry(pair, length, speed, starts.u, starts.v, starts.t, electrical(device)))
+    plan = dataclasses.replace(_chained(pair), devices=True)
     number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
     settings = _chained_settings(pair, Harvester(), periods, keep)
     return _run(plan, cells, number, settings)

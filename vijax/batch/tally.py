@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 
 from vijax.batch.attractor_search import recur
@@ -124,8 +125,9 @@ def _harvested(settings: Settings, cell: Cell, old: Harvest, hit: Hit, counted: 
     """What has been harvested with one impact more."""
     metres = (present(hit.depth) * cell.length)[:, None] * settings.length_variant
     speeds = cell.speed[:, None] * settings.speed_variant
-    got = energy.harvested_energy(settings.device, metres)
-    given = settings.device.m_b * speeds * speeds * present(hit.work)[:, None]
+    device = settings.device if cell.device is None else jax.tree.map(lambda x: x[:, None], cell.device)
+    got = energy.harvested_energy(device, metres)
+    given = device.m_b * speeds * speeds * present(hit.work)[:, None]
     wide, ended = counted[:, None], turned[:, None]
     return Harvest(
         batch=jnp.where(ended, 0.0, old.batch) + jnp.where(wide, got, 0.0),

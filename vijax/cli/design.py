@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _FILES = ("design.json", "design.png")
 _POINTS, _NEAR = 320, 160  # the picture shows P at so many points, its close view at so many more
-_OVER_TOLERANCES = ("mean", "worst")
+_OVER_TOLERANCES = ("mean", "worst", "expected")
 _BASINS = 2000  # starts that show what attracts at the optimum
 _STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the last
 
@@ -78,6 +78,8 @@ def _asked(
     bounds: tuple[str, ...],
     tolerance: tuple[str, ...],
     objective: str,
+    motion: str,
+    reliability: str,
     over: str | None,
     constants: tuple[str, ...],
     steps: int,
@@ -93,7 +95,9 @@ def _asked(
     within = _bounds(bounds)
     weighed = scatter if objective in _OVER_TOLERANCES else ()
     optimise.check(devices, names, within, objective, weighed)
-    search = {"tune": names, "bounds": within, "objective": objective, "tolerances": weighed}
+    share = optimise.check_motion(motion, objective, part("reliability", reliability))
+    search: dict[str, Any] = {"tune": names, "bounds": within, "objective": objective, "tolerances": weighed}
+    search |= {"motion": motion, "reliability": share}
     return Asked(devices, along, scatter, search | {"steps": steps, "balls": balls, "impacts": impacts})
 
 
@@ -222,13 +226,17 @@ def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
 
 def _judged(found: "Design", scatter: "tuple[Tolerance, ...]", alone: bool) -> dict[str, Any]:
     """Find what becomes of the best design over the tolerances; what lies around it, where it is the only one."""
+    from vijax.design.off_design import arrival, extents
     from vijax.design.optimise import under
     from vijax.design.robustness import surroundings
 
     if found.best is None:
         return {"tolerances": scatter}
-    around = surroundings(found.best, starts=_BASINS) if alone else None
-    return {"tolerances": scatter, "spread": under(found.best, scatter) if scatter else None, "surroundings": around}
+    judged: dict[str, Any] = {"tolerances": scatter, "spread": under(found.best, scatter) if scatter else None}
+    if alone:
+        judged["surroundings"] = surroundings(found.best, starts=_BASINS)
+        judged |= {"extents": extents(found.best), "arrival": arrival(found.best)}
+    return judged
 
 
 # --- the page --------------------------------------------------------------------------------------------------------
@@ -237,12 +245,16 @@ def _judged(found: "Design", scatter: "tuple[Tolerance, ...]", alone: bool) -> d
 def _goal_options() -> list[click.Parameter]:
     shown: dict[str, Any] = {"show_default": True}
     within = "of a tuned quantity [kappa 2 to 400, r 0.05 to 0.95]"
-    off, goal = "by how much a constant may be off", "what is made most; mean and worst are over the tolerances"
+    off, goal = "by how much a constant may be off", "what is made most; mean, worst, expected are over the tolerances"
+    motion = "any takes chaos too, by its averages"
+    reliability = "share of the balls that keep the limits, with expected"
     return [
         click.Option(["--tune"], default="omega0", metavar="NAME,NAME", help="what is tuned", **shown),
         click.Option(["--bounds"], multiple=True, metavar="NAME=LO:HI", help=within),
         click.Option(["--tolerance"], multiple=True, metavar="NAME=5%[:lognormal]", help=off),
         click.Option(["--objective"], type=Choice(options.OBJECTIVES), default="P", help=goal, **shown),
+        click.Option(["--motion"], type=Choice(options.MOTIONS), default="any", help=motion, **shown),
+        click.Option(["--reliability"], default="1", metavar="SHARE", help=reliability, **shown),
         click.Option(["--over"], metavar="NAME=VALUES", help="axis along which to find the best designs"),
     ]
 
@@ -266,6 +278,7 @@ _EXAMPLES = (
     "",
     "--d 0.2 --r 0.5 --A 3 --omega 10pi --set V=1700 --tolerance omega0=5%",
     "--d 0.2 --tune omega0,r --bounds r=0.3:0.8 --tolerance omega0=5%,s=1% --objective worst",
+    "--d 0.088 --r 0.27 --A 2 --omega 6 --set V=1700 --objective expected --tolerance omega0=2% --reliability 99%",
     "--over d=0.05:0.3:64 --out designs.json --plot designs.png",
 )
 

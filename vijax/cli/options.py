@@ -7,11 +7,12 @@ what they mean.
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, get_args
 
 import click
 
 from vijax.cli.kinds import Choice, NewFile
+from vijax.model.choices import Motion, Objective
 from vijax.model.quantities import AXES, Quantity, synonyms
 from vijax.planes.sweep_settings import SweepSettings, choices
 
@@ -25,7 +26,7 @@ DEVICE = {name for name, axis in AXES.items() if axis.unit}
 PHYSICAL = {name for of in ("d", "kappa") for name in synonyms(of) if name in DEVICE}
 
 MEMBRANES = ("linear", "hunt-crossley")
-OBJECTIVES = ("P", "power", "speed", "mean", "worst")
+OBJECTIVES, MOTIONS = get_args(Objective), get_args(Motion)
 
 
 def axis_options(

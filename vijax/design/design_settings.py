@@ -13,6 +13,8 @@ Rule = tuple[str, Callable[[float], bool]]
 _SHARE: Rule = ("a number between 0 and 1", lambda x: 0 < x < 1)
 _NUMBERS: dict[str, Rule] = {
     "min_promise": ("a positive number of at most 1", lambda x: 0 < x <= 1),
+    "min_rival": ("a positive number of at most 1", lambda x: 0 < x <= 1),
+    "max_excess": ("a positive number of at most 100", lambda x: 0 < x <= 100),
     "max_step": ("a positive number of at most 10", lambda x: 0 < x <= 10),
     "max_approach": _SHARE,
     "first_barrier": ("a positive number of at most 1", lambda x: 0 < x <= 1),
@@ -21,8 +23,28 @@ _NUMBERS: dict[str, Rule] = {
     "barrier_power": ("a number from 1 to 2", lambda x: 1 <= x <= 2),
     "same_optimum": _SHARE,
     "active_margin": _SHARE,
+    "min_chaos": ("a positive number of at most 1", lambda x: 0 < x <= 1),
+    "places_apart": ("a positive number of at most 1000", lambda x: 0 < x <= 1000),
+    "ensemble_radius": ("a positive number of at most 1", lambda x: 0 < x <= 1),
+    "last_radius": ("a positive number of at most 1", lambda x: 0 < x <= 1),
+    "least_gain": _SHARE,
+    "limit_price": ("a positive number of at most 100", lambda x: 0 < x <= 100),
+    "limit_room": _SHARE,
 }
-_COUNTS = ("min_steps_apart", "max_sure_impacts", "closer_cells", "curvature_pairs")
+_COUNTS = (
+    "min_steps_apart",
+    "max_sure_impacts",
+    "closer_cells",
+    "curvature_pairs",
+    "max_places",
+    "ensemble_balls",
+    "ensemble_periods",
+    "max_ensembles",
+    "confirm_balls",
+    "confirm_periods",
+    "expected_balls",
+    "max_confirmations",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +64,10 @@ class DesignSettings:
             narrow windows, where no climb leads far.
         min_promise: Share of the best that an orbit of more impacts has to promise to be climbed from, and chaos to be
             looked at closer, 0.8. A smaller one spends time on what cannot win.
+        min_rival: Share of the best that an orbit has to promise to be climbed from at all, where any motion may win,
+            0.5.
+        max_excess: Nor is one climbed there that exceeds a limit by more, as a logarithm, 0.3. Of 200 random devices
+            none lost its best orbit by these two; four fifths of the ascents are saved.
         closer_cells: Times as many cells as before about a step that is looked at closer, 8. With fewer, narrow windows
             of periodic motion in chaos are missed.
         max_step: Longest step of an ascent, 0.2. Longer ones leave the branch of their orbit, and are halved until they
@@ -55,6 +81,23 @@ class DesignSettings:
         barrier_power: And to this power, 1.5, as the path is smoother near its end. With 2, steps overshoot more.
         same_optimum: Two optima nearer than this are one, 1e-4. Much less, and ends of one hill count as several.
         active_margin: A constraint is told as active whose margin's logarithm is below, 1e-6.
+        min_chaos: Share of the best orbit that aperiodic motion has to promise to be climbed, 0.9. From one step of a
+            survey to the next it changes by some 5 %.
+        max_places: Places of a device at which the averages of aperiodic motion are climbed, 4.
+        places_apart: They are so many radii of the first ensemble apart, 2.
+        limit_price: A place beyond a limit is worth less by this power of what it exceeds the limit by, 2.5. An energy
+            grows about so with the depth.
+        ensemble_balls, ensemble_periods: Balls about a place, and the forcing periods that each is flown, 64 and 400;
+            the first quarter is left out. Noise falls with the square root of both.
+        ensemble_radius: How far the first balls are spread about a place, 0.02; a step leads as far.
+        last_radius: How far the last ones are, 0.002. A wider one averages over more than the design.
+        max_ensembles: Ensembles about a place, at most, 10.
+        least_gain: A place has arrived where a step promises less, as a logarithm, or less than the noise, 2e-4.
+        confirm_balls, confirm_periods: The long flight at the end, 64 balls for 5,000 periods.
+        expected_balls: Balls of an ensemble for the objective "expected", which starts and tolerances scatter, 1024;
+            four times as many are flown at the end, for `ensemble_periods`.
+        limit_room: How far below a limit the fitted extremes are kept, as a logarithm, 2e-4.
+        max_confirmations: Long flights about one place, at most, 6.
 
     Raises:
         ValueError: A value that cannot be.
@@ -65,6 +108,8 @@ class DesignSettings:
     min_steps_apart: int = 256
     max_sure_impacts: int = 8
     min_promise: float = 0.8
+    min_rival: float = 0.5
+    max_excess: float = 0.3
     closer_cells: int = 8
     max_step: float = 0.2
     max_approach: float = 0.95
@@ -75,6 +120,21 @@ class DesignSettings:
     barrier_power: float = 1.5
     same_optimum: float = 1e-4
     active_margin: float = 1e-6
+    min_chaos: float = 0.9
+    max_places: int = 4
+    places_apart: float = 2.0
+    limit_price: float = 2.5
+    ensemble_balls: int = 64
+    ensemble_periods: int = 400
+    ensemble_radius: float = 0.02
+    last_radius: float = 0.002
+    max_ensembles: int = 10
+    least_gain: float = 2e-4
+    confirm_balls: int = 64
+    confirm_periods: int = 5000
+    expected_balls: int = 1024
+    limit_room: float = 2e-4
+    max_confirmations: int = 6
 
     def __post_init__(self) -> None:
         self._set("max_period", checks.whole("max_period", self.max_period, 1, _MOST_PERIOD))

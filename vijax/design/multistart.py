@@ -6,19 +6,17 @@ found, for narrow windows of periodic motion lie there -> the best of every kind
 
 import itertools
 import math
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
+from vijax.batch.simulate import Starts
+from vijax.design.averages import LIMITS, Averages, averages
 from vijax.design.design_settings import DEFAULT, DesignSettings
-from vijax.design.survey import Flown, Survey, survey
-from vijax.design.variables import moving, tuned, values
+from vijax.design.survey import Flown, Survey, flown, survey
+from vijax.design.variables import cells, moving, values
 from vijax.model.device import Harvester
-from vijax.model.energy import harvested_energy
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.runtime import tiles
@@ -46,6 +44,8 @@ class Looked(NamedTuple):
         restless: How many values of the tuned quantities have other motion: aperiodic, not settled, or too long.
         P: Most that such motion harvests per half forcing period without breaking a constraint [J]; 0 if none does.
         values: Of the tuned quantities where it does; none if none does.
+        limit, excess: Which limit the motion breaks that is nearest to breaking none, and by what part; "" and 0 where
+            one keeps both, or nothing was met.
         held, silent: Shares of the starts that end on one wall for ever, and without a wall.
     """
 
@@ -54,20 +54,24 @@ class Looked(NamedTuple):
     restless: int
     P: float
     values: dict[str, float]
+    limit: str
+    excess: float
     held: float
     silent: float
 
 
 class Met(NamedTuple):
-    """Motions that were met: as flown, the device with what was tuned there, the variables; where they were met.
+    """Motions that were met, [motion]: what each gave, how it ended, the device there and its variables; where it was.
 
     Attributes:
+        pair, ended: Parameters, and the `Summary`.
         owner: Which of the devices given.
         level, step: Of the survey's values of the other quantities together, and of the first one.
-        device: Leaves [motion].
     """
 
-    flown: Flown
+    found: Averages
+    pair: ImpactPair
+    ended: Any
     device: Harvester
     z: np.ndarray
     owner: np.ndarray
@@ -75,6 +79,19 @@ class Met(NamedTuple):
     step: np.ndarray
 
     def some(self, index: np.ndarray) -> "Met":
+        """Those with the given indices."""
+        return jax.tree.map(lambda x: x[index], self)
+
+
+class Begun(NamedTuple):
+    """Where ascents begin, [start]: an orbit as it was flown, its device and variables, which of the devices it is."""
+
+    flown: Flown
+    device: Harvester
+    z: np.ndarray
+    owner: np.ndarray
+
+    def some(self, index: np.ndarray) -> "Begun":
         """Those with the given indices."""
         return jax.tree.map(lambda x: x[index], self)
 
@@ -95,9 +112,16 @@ class _Places(NamedTuple):
 
 
 def find(
-    devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, objective: str, effort: Effort
-) -> tuple[Met, list[Looked]]:
-    """The attractors to climb from, and what else was met of every device.
+    devices: list[Harvester],
+    tune: tuple[str, ...],
+    box: np.ndarray,
+    objective: str,
+    effort: Effort,
+    *,
+    orbits_alone: bool = True,
+    all_starts: bool = False,
+) -> tuple[Begun, Met, list[Looked]]:
+    """The attractors to climb from, all motion that is no orbit to climb from, and what was met of every device.
 
     Args:
         devices: Where quantities that are not tuned are taken from.
@@ -105,42 +129,61 @@ def find(
         box: Bounds of these, [device, 2, variable].
         objective: Of `OBJECTIVES`; starts for tolerances are those for P.
         effort: How far to look.
+        orbits_alone: Whether chaos is no answer, but a place where narrow windows may hide an orbit.
+        all_starts: Whether what every start came to is the answer: then nothing is looked at closer, and all that was
+            met is given in place of what is no orbit.
     """
     first, levels = _first(tune), _levels(tune, effort)
     steps = 1 if first is None else effort.steps
     owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
     scene = _Scene(devices, tune, box, effort)
-    cells = owner.size // len(devices)  # every device has as many
+    count = owner.size // len(devices)  # every device has as many
     # The same for every device, whatever the others are: designs of one do not depend on them.
-    draws = np.random.default_rng(0).uniform(-1, 1, (2, cells)), np.random.default_rng(1).uniform(-1, 1, (2, cells))
-    places = _Places(owner, level, step / max(steps - 1, 1), np.arange(owner.size) % cells)
+    draws = np.random.default_rng(0).uniform(-1, 1, (2, count)), np.random.default_rng(1).uniform(-1, 1, (2, count))
+    places = _Places(owner, level, step / max(steps - 1, 1), np.arange(owner.size) % count)
     seen = _look(scene, places, draws[0])
-    met, unrest = seen.met(seen.found.orbits(effort.impacts)), seen.met(seen.found.unrest(effort.impacts))
+    met, unrest = seen.orbits(effort.impacts), seen.restless(effort.impacts)
+    if all_starts:
+        looked = [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
+        none = met.some(np.arange(0))
+        nothing = flown(none.pair, none.ended, effort.impacts)
+        return Begun(nothing, none.device, none.z, none.owner), seen.every(), looked
     if first is not None:
-        most = _most(_promise(met, objective), met.owner, len(devices))
-        again = _closer(unrest, most, objective, effort, cells)
+        most = _most(promise(met, objective), met.owner, len(devices))
+        if not orbits_alone:
+            most = np.maximum(most, _most(promise(unrest, objective), unrest.owner, len(devices)))
+        again = _closer(unrest, most, objective, effort, count)
         if again.owner.size:
             closer = _look(scene, again, draws[1])
-            more = closer.met(closer.found.orbits(effort.impacts))
-            met = jax.tree.map(lambda *x: np.concatenate(x), met, more)
-    chosen = _promising(met, objective, len(devices), steps, effort.settings)
-    return met.some(chosen), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
+            more = closer.orbits(effort.impacts), closer.restless(effort.impacts)
+            met, unrest = jax.tree.map(lambda *x: np.concatenate(x), (met, unrest), more)
+    looked = [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
+    chosen = met.some(_promising(met, objective, len(devices), steps, effort.settings))
+    if not orbits_alone:
+        chosen = chosen.some(_rivals(chosen, unrest, objective, len(devices), effort.settings))
+    flights = flown(chosen.pair, chosen.ended, effort.impacts)
+    return Begun(flights, chosen.device, chosen.z, chosen.owner), unrest, looked
 
 
 def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
-    """What was met of a device, the closer survey's orbits among it."""
+    """What was met of a device, by the closer survey too."""
     met, unrest = met.some(met.owner == one), unrest.some(unrest.owner == one)
-    broken, rest = _promise(met, "P").lacks < 0, _promise(unrest, "P")
+    broken, rest = promise(met, "P").lacks < 0, promise(unrest, "P")
     power = np.where(rest.lacks < 0, 0.0, np.nan_to_num(np.exp(rest.value)))
     best = float(power.max(initial=0.0))
     where = np.asarray(values(tune, unrest.z[power.argmax()])).tolist() if best else []
+    room = np.concatenate([one.found.margins(one.device) for one in (met, unrest)])
+    nearest = room[np.nan_to_num(room, nan=-np.inf).min(axis=1).argmax()] if len(room) else np.zeros(2)
+    breaks = bool(nearest.min() < 0)
     status = seen.found.ended.status[seen.places.owner == one]
     return Looked(
         orbits=broken.size,
         admissible=int((~broken).sum()),
-        restless=power.size,
+        restless=len(np.unique(unrest.z, axis=0)),
         P=best,
         values=dict(zip(tune, where, strict=bool(best))),
+        limit=LIMITS[int(nearest.argmin())] if breaks else "",
+        excess=math.expm1(-float(nearest.min())) if breaks else 0.0,
         held=float((status == Status.PERMANENT_CONTACT).mean()),
         silent=float((status == Status.NO_IMPACT).mean()),
     )
@@ -177,10 +220,22 @@ class _Seen(NamedTuple):
     places: _Places
     step: np.ndarray
 
-    def met(self, flown: Flown) -> Met:
-        """Some motions of the survey, with where they were met."""
-        device, z, places, step = jax.tree.map(lambda x: x[flown.cell], self[1:])
-        return Met(flown, device, z, places.owner, places.level, step)
+    def orbits(self, impacts: int) -> Met:
+        """The periodic attractors of at most so many impacts."""
+        return self._met(self.found.closing(impacts))
+
+    def restless(self, impacts: int) -> Met:
+        """What was met that is no such orbit."""
+        return self._met(self.found.restless(impacts))
+
+    def every(self) -> Met:
+        """All that was met."""
+        return self._met(np.arange(self.step.size))
+
+    def _met(self, cells: np.ndarray) -> Met:
+        run = (self.found.pair, self.found.ended)
+        (pair, ended), device, z, places, step = jax.tree.map(lambda x: x[cells], (run, *self[1:]))
+        return Met(averages(device, ended), pair, ended, device, z, places.owner, places.level, step)
 
 
 def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
@@ -192,31 +247,25 @@ def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
     low, high = box[places.owner].swapaxes(0, 1)
     z = low + parts * (high - low)
     given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
-    every, pair = tiles.map_tiles(lambda rows: _cells(*rows, tune), (given, z), _TILES)
+    every, pair = tiles.map_tiles(lambda rows: cells(*rows, tune), (given, z), _TILES)
     u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
-    found = survey(pair, u0 * pair.d, v0, longest=effort.settings.max_period, periods=effort.periods)
+    starts = Starts(u0 * pair.d, v0, np.zeros_like(v0))
+    found = survey(pair, every, starts, longest=effort.settings.max_period, periods=effort.periods)
     step = np.round(places.part * (effort.steps - 1)).astype(int)
     return _Seen(found, every, z, places, step)
 
 
-@partial(jax.jit, static_argnames="tune")
-def _cells(devices: Harvester, z: Float[Array, "cell variable"], tune: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
-    """Devices [cell] with tuned quantities, and their pairs."""
-    every = jax.vmap(lambda device, z: tuned(device, tune, z))(devices, z)
-    return every, jax.vmap(lambda device: device.pair())(every)
-
-
-def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, cells: int) -> _Places:
+def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, most_cells: int) -> _Places:
     """About the steps where what is no orbit promises about as much as the best orbit, or more.
 
     Cells of a device, so many at most, are spread evenly over these steps, and over each of them.
     """
-    good = _promise(unrest, objective).total > most[unrest.owner] + math.log(effort.settings.min_promise)
+    good = promise(unrest, objective).total > most[unrest.owner] + math.log(effort.settings.min_promise)
     owner, level, step = np.unique(np.column_stack([unrest.owner, unrest.level, unrest.step])[good], axis=0).T
     places = [_Places(*np.zeros((4, 0), int))]
     for one in np.unique(owner):
         here = np.flatnonzero(owner == one)
-        number = np.arange(min(here.size * effort.settings.closer_cells * effort.balls, cells))
+        number = np.arange(min(here.size * effort.settings.closer_cells * effort.balls, most_cells))
         index, turn = here[number % here.size], number // here.size
         part = (step[index] + (turn + 0.5) / (turn.max() + 1) - 0.5) / (effort.steps - 1)
         places.append(_Places(owner[index], level[index], np.clip(part, 0.0, 1.0), number))
@@ -228,12 +277,12 @@ def _promising(met: Met, objective: str, devices: int, steps: int, settings: Des
 
     A kind is given by span and impacts; the walls may change places where the tube is level.
     """
-    promise = _promise(met, objective)
-    score = np.where(promise.lacks < 0, _HOPELESS + promise.lacks, promise.value)
-    left, right = _impacts(met.flown)
-    kind = np.column_stack([met.owner, met.level, met.flown.span, left, right])
+    hope = promise(met, objective)
+    score = np.where(hope.lacks < 0, _HOPELESS + hope.lacks, hope.value)
+    left, right = _impacts(met)
+    kind = np.column_stack([met.owner, met.level, met.ended.period, left, right])
     found = highest(kind, met.step, score, max(1, steps // settings.min_steps_apart))
-    enough = promise.total > _most(promise, met.owner, devices)[met.owner] + math.log(settings.min_promise)
+    enough = hope.total > _most(hope, met.owner, devices)[met.owner] + math.log(settings.min_promise)
     return found[(enough | (left + right <= settings.max_sure_impacts))[found]]
 
 
@@ -258,10 +307,10 @@ def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) 
     return np.sort(best[top])
 
 
-def _impacts(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right impacts of motions; in a level tube the more and the fewer."""
-    left, right = ((flown.side == side).sum(axis=1) for side in (-1, 1))
-    swap = (flown.pair.gamma == 0) & (right > left)
+def _impacts(met: Met) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right impacts of orbits; in a level tube the more and the fewer."""
+    left, right = met.ended.impacts_left, met.ended.impacts_right
+    swap = (met.pair.gamma == 0) & (right > left)
     return np.where(swap, right, left), np.where(swap, left, right)
 
 
@@ -277,21 +326,26 @@ class _Promise(NamedTuple):
         return self.value + self.lacks
 
 
-def _promise(met: Met, objective: str) -> _Promise:
-    device, flown = met.device, met.flown
-    deep = flown.depth * np.asarray(device.length_unit)[:, None]
-    gained = np.asarray(jax.vmap(harvested_energy)(device, jnp.asarray(deep)))
-    given = flown.work * np.asarray(device.m_b * device.speed_unit**2)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        lacks = np.minimum(np.log(given / gained), np.log(np.asarray(device.depth_limit)[:, None] / deep))
-        value = np.log(np.nansum(gained, axis=1) / flown.span)
-    if objective == "speed":
-        value = np.log(flown.knots[..., 1].max(axis=1, initial=0.0))
-    return _Promise(value, np.nanmin(lacks, axis=1, initial=0.0))
+def promise(met: Met, objective: str) -> _Promise:
+    """What motions gave, and what they lacked."""
+    with np.errstate(divide="ignore"):
+        value = np.log(np.nan_to_num(met.found.value(objective, met.device)))
+    return _Promise(value, np.nanmin(met.found.margins(met.device), axis=1, initial=0.0))
 
 
-def _most(promise: _Promise, owner: np.ndarray, devices: int) -> np.ndarray:
+def _rivals(met: Met, unrest: Met, objective: str, devices: int, settings: DesignSettings) -> np.ndarray:
+    """Indices of the attractors that may lead to the best design, where any motion may win.
+
+    What promises too little, or exceeds a limit by far, never did.
+    """
+    hope = promise(met, objective)
+    most = np.maximum(_most(hope, met.owner, devices), _most(promise(unrest, objective), unrest.owner, devices))
+    near = hope.lacks >= -settings.max_excess
+    return np.flatnonzero(near & (hope.total >= most[met.owner] + math.log(settings.min_rival)))
+
+
+def _most(hope: _Promise, owner: np.ndarray, devices: int) -> np.ndarray:
     """What the best admissible attractor of every device promises; -inf where there is none."""
     most = np.full(devices, -np.inf)
-    np.maximum.at(most, owner, np.where(promise.lacks < 0, -np.inf, promise.value))
+    np.maximum.at(most, owner, np.where(hope.lacks < 0, -np.inf, hope.value))
     return most

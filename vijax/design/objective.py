@@ -1,7 +1,7 @@
 """What a design maximises, as an optimiser looks at it: the objective over all tolerances, the margins, derivatives."""
 
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,18 +11,19 @@ from jaxtyping import Array, Bool, Float
 
 from vijax.design import variables
 from vijax.design.ascent import Look
+from vijax.model.choices import Objective
 from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.orbits import shooting, steady
 from vijax.orbits.shooting import Sequence
 
-Objective = Literal["P", "power", "speed", "mean", "worst"]
-OBJECTIVES: dict[str, str] = {
+OBJECTIVES: dict[Objective, str] = {
     "P": "energy harvested per half forcing period [J]",
     "power": "harvested power [W]",
     "speed": "largest speed into a wall [m/s]",
     "mean": "mean of P over the tolerances, a device whose orbit is lost counting nothing [J]",
     "worst": "least P over the tolerances [J]",
+    "expected": "mean of P over all starts, each attractor by its share of them, and over the tolerances [J]",
 }
 _STEPS = 4  # so many lead from the nominal orbit to that of a device off by its tolerance
 _TRIPS = 16  # Newton's search near a known orbit gives up after so many: lost ones take them all

@@ -6,29 +6,34 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 
 import itertools
 import logging
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vijax.design import aperiodic_search, long_flight, off_design
 from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
 from vijax.design.design_settings import DEFAULT, DesignSettings, check_settings
-from vijax.design.multistart import Effort, Looked, Met, find
-from vijax.design.objective import OBJECTIVES, Batch, Objective, Scene
-from vijax.design.optimum import End, Optimum, verified
-from vijax.design.tolerance import Tolerance, check_tolerances, nodes
+from vijax.design.ensemble import Task
+from vijax.design.multistart import Begun, Effort, Looked, find
+from vijax.design.objective import OBJECTIVES, Batch, Scene
+from vijax.design.optimum import AnyOptimum, AperiodicOptimum, End, Optimum, verified
+from vijax.design.tolerance import Spread, Tolerance, check_tolerances, nodes
 from vijax.design.variables import NAMES, check_names, limits, values, variables
+from vijax.model.choices import Motion, Objective
 from vijax.model.device import Harvester, one_device
 from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
 from vijax.runtime import checks, context, tiles, xla
 from vijax.runtime.context import door
 
+OVER_TOLERANCES = ("mean", "worst")
 _LOG = logging.getLogger(__name__)
 _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
@@ -38,7 +43,9 @@ _BALL = 1000  # bytes that a survey keeps of a ball
 
 @dataclass(frozen=True)
 class Design:
-    """What was found for one device: the distinct optima, the best first (none if no admissible orbit was found).
+    """What was found for one device: the distinct optima, the best first (none if no motion is admissible).
+
+    One of them, the best, may be of a motion that is no orbit (`AperiodicOptimum`).
 
     Attributes:
         optima: See there.
@@ -49,16 +56,16 @@ class Design:
         starts: How many of them climbed.
     """
 
-    optima: tuple[Optimum, ...]
+    optima: tuple[Optimum | AperiodicOptimum, ...]
     tune: tuple[str, ...]
     bounds: dict[str, tuple[float, float]]
-    objective: str
+    objective: Objective
     tolerances: tuple[Tolerance, ...]
     looked: Looked
     starts: int
 
     @property
-    def best(self) -> Optimum | None:
+    def best(self) -> Optimum | AperiodicOptimum | None:
         """The highest optimum."""
         return self.optima[0] if self.optima else None
 
@@ -70,7 +77,9 @@ def optimise(
     tune: str | Iterable[str] = ("omega0",),
     bounds: Mapping[str, tuple[float, float]] | None = None,
     objective: Objective = "P",
+    motion: Motion = "any",
     tolerances: Iterable[Tolerance] = (),
+    reliability: float = 1.0,
     samples: int | None = None,
     looks: int = 60,
     steps: int = 256,
@@ -83,8 +92,9 @@ def optimise(
 
     Args:
         device: Where quantities that are not tuned are taken from; Tables I and II unless given.
-        tune, bounds, objective, tolerances, samples, looks, steps, balls, impacts, periods, settings: As in
+        tune, bounds, objective, motion, tolerances, reliability, samples: What is sought: as in
             `vijax.design.optimise.optimise_all`, which takes many devices at once.
+        looks, steps, balls, impacts, periods, settings: How far to look: likewise.
 
     Raises:
         ValueError: Which argument, what must hold, what came.
@@ -94,7 +104,9 @@ def optimise(
         tune=tune,
         bounds=bounds,
         objective=objective,
+        motion=motion,
         tolerances=tolerances,
+        reliability=reliability,
         samples=samples,
         looks=looks,
         steps=steps,
@@ -111,8 +123,10 @@ def optimise_all(
     *,
     tune: str | Iterable[str] = ("omega0",),
     bounds: Mapping[str, tuple[float, float]] | None = None,
-    objective: str = "P",
+    objective: Objective = "P",
+    motion: Motion = "any",
     tolerances: Iterable[Tolerance] = (),
+    reliability: float = 1.0,
     samples: int | None = None,
     looks: int = 60,
     steps: int = 256,
@@ -131,8 +145,12 @@ def optimise_all(
         devices: Where quantities that are not tuned are taken from; scalars.
         tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's.
         bounds: Of tuned quantities; see `variables.limits` for the others.
-        objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P.
-        tolerances: How constants scatter, for "mean" and "worst".
+        objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P on
+            one orbit; "expected" P, over balls that start anywhere and over the tolerances, if there are any.
+        motion: "any" takes the best motion, chaos too, whose averages ensembles of balls climb (`aperiodic_search`);
+            "periodic" the best orbit. Over tolerances orbits alone are followed.
+        tolerances: How constants scatter, for "mean", "worst" and "expected".
+        reliability: Share of the balls of "expected" that have to keep the limits in all that is flown.
         samples: Random devices for these, in place of a quadrature.
         looks: Evaluations of objective with gradient that a start may take.
         steps: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself, where
@@ -151,6 +169,7 @@ def optimise_all(
     devices = checks.sequence("devices", devices, Harvester, "vijax.Harvester records")
     tune, bounds = checks.words("tune", tune, NAMES), {} if bounds is None else bounds
     scatter = check_tolerances(tolerances)
+    reliability = check_motion(motion, objective, reliability)
     looks, far = (
         checks.whole("looks", looks, 2, _MOST_LOOKS),
         effort(steps, balls, impacts, periods)._replace(settings=check_settings(settings)),
@@ -160,9 +179,21 @@ def optimise_all(
         _LOG.warning("a long run begins: %s", asked)
     cloud = nodes(scatter, samples)
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    starts, looked = find(devices, tune, box, objective, far)
+    any_motion = motion == "any" and objective not in OVER_TOLERANCES
+    expected_value = objective == "expected"
+    starts, unrest, looked = find(
+        devices, tune, box, objective, far, orbits_alone=not any_motion, all_starts=expected_value
+    )
     ends = _climbed(scene, starts, box, looks, settings)
-    optima = verified(scene, starts, ends, devices, looks, settings)
+    climbed = verified(scene, starts, ends, devices, looks, settings)
+    optima: list[list[Optimum | AperiodicOptimum]] = [list(some) for some in climbed]
+    if any_motion:
+        known = np.array([math.log(some[0].height) if some else -math.inf for some in optima])
+        weighed = scatter if expected_value else ()
+        task = Task(devices, tune, box, objective, weighed, reliability, settings)
+        places = aperiodic_search.search(task, unrest, known)
+        for some, beyond in zip(optima, long_flight.prove(task, places, known), strict=True):
+            some[:0] = [beyond] if beyond is not None else []
     return [
         Design(
             optima=tuple(optima[owner]),
@@ -177,34 +208,24 @@ def optimise_all(
     ]
 
 
-class Spread(NamedTuple):
-    """P of a design over tolerances, each device on its own orbit, followed from the nominal one.
-
-    Attributes:
-        mean: A device whose orbit is lost, or inadmissible, counting nothing [J].
-        worst: The least; 0 if the orbit of one is lost [J].
-        lost, inadmissible: Shares of devices.
-    """
-
-    mean: float
-    worst: float
-    lost: float
-    inadmissible: float
-
-
 @door
-def under(optimum: Optimum, tolerances: Iterable[Tolerance], samples: int | None = None) -> Spread:
+def under(optimum: Optimum | AperiodicOptimum, tolerances: Iterable[Tolerance], samples: int | None = None) -> Spread:
     """What becomes of a design when constants scatter.
 
+    Of a motion that is no orbit the balls of random devices tell, each of which starts on it.
+
     Args:
+        optimum: Of `optimise`.
         tolerances: How they do.
-        samples: Random devices, in place of a quadrature.
+        samples: Random devices, in place of a quadrature; of chaos 256 unless given.
 
     Raises:
         ValueError: A tolerance that cannot be.
     """
-    checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best")
+    checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     scatter = check_tolerances(tolerances)
+    if isinstance(optimum, AperiodicOptimum):
+        return off_design.scattered(optimum, scatter, samples)
     cloud, none = nodes(scatter, samples), jnp.zeros((1, 0))
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), (), cloud.names, "P")
     device = jax.tree.map(lambda x: jnp.array([x], float), optimum.device)
@@ -247,12 +268,23 @@ def check(
     for device in devices:
         if not float(one_device(device).V):
             raise ValueError("V must not be zero for a design to harvest; got 0")
-    over = objective in ("mean", "worst")
-    if over != bool(tolerances):
-        need = "come with objective mean or worst" if tolerances else "be given with objective mean or worst"
+    over = objective in OVER_TOLERANCES
+    if over != bool(tolerances) and objective != "expected":
+        need = "come with objective mean, worst or expected" if tolerances else "be given with objective mean or worst"
         raise ValueError(f"tolerances must {need}; got {len(tolerances)} with objective {objective!r}")
     check_tolerances(tolerances, bounded=objective == "worst")
     return np.array([variables(tune, limits(tune, bounds, device)) for device in devices])
+
+
+def check_motion(motion: str, objective: str, reliability: float) -> float:
+    """The reliability, if motion, objective and it go together; raises ValueError as `optimise_all` does."""
+    checks.choice("motion", motion, get_args(Motion))
+    if motion == "periodic" and objective == "expected":
+        raise ValueError('motion must be "any" with objective expected, which takes every start; got "periodic"')
+    share = checks.real("reliability", reliability, "a number from 0.5 to 1", lambda x: 0.5 <= x <= 1)
+    if share < 1 and objective != "expected":
+        raise ValueError(f"reliability must be 1 unless the objective is expected; got {share:g} with {objective!r}")
+    return share
 
 
 @lru_cache(maxsize=8)
@@ -264,7 +296,7 @@ def _compiled(looks: int, settings: DesignSettings):
     return jax.jit(climb, compiler_options=xla.compiler_options())
 
 
-def _climbed(scene: Scene, starts: Met, box: np.ndarray, looks: int, settings: DesignSettings) -> list[End]:
+def _climbed(scene: Scene, starts: Begun, box: np.ndarray, looks: int, settings: DesignSettings) -> list[End]:
     """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
     count, work = (starts.flown.side != 0).sum(axis=1), _compiled(looks, settings)
     ends: list[End | None] = [None] * count.size

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vijax.batch.simulate import Starts
 from vijax.design.design_settings import DesignSettings
-from vijax.design.multistart import Met
+from vijax.design.multistart import Begun
 from vijax.design.objective import Scene
 from vijax.design.variables import tuned, values
 from vijax.model.device import Harvester
@@ -28,39 +29,88 @@ from vijax.runtime.context import door
 _FEW = (16, 256)  # optima of one compiled call
 
 
-@dataclass(frozen=True)
-class Optimum:
-    """A design at which an ascent ended, verified.
+@dataclass(frozen=True, kw_only=True)
+class AnyOptimum:
+    """A design, whichever its motion is; see `Optimum` and `AperiodicOptimum`.
 
     Attributes:
         values: The tuned quantities by name.
         device: The device that has them.
-        orbit: Its orbit, along a leading axis of one; multipliers are its own.
-        label: n:m/pT of the orbit.
+        label: Of the motion: n:m/pT, or "aperiodic".
         height: The objective.
-        state: Energies, depths, margins' parts, condition and clearance of the nominal device; see `Steady`.
+        P, P_stderr: Energy harvested per half forcing period, and its standard error [J]: 0 of an orbit; of chaos from
+            the spread of the balls.
         gradient: Derivative of the objective's logarithm in the logarithm of each quantity (in an inclination itself).
-        active: What holds it there: constraints at which impact, bounds of which quantity.
-        stopped: "maximum"; "supremum", where the objective rises up to the end of the orbit, which no orbit attains;
-            "looks", when these were spent; "stalled", where no step is higher though the gradient is not zero: at a
-            kink, such as a worst case has where two devices are alike; "weighted", of `robustness.weighted`.
-        looks: Evaluations of objective with gradient that it took.
-        path: Accepted points [look, quantity], the start first, and the objective there.
+        active: What holds it there: constraints, bounds of which quantity.
+        stopped: Why the search ended there.
+        path: Accepted points [point, quantity], the first one first, and the objective there.
         heights: See `path`.
     """
 
     values: dict[str, float]
     device: Harvester
-    orbit: Orbit
     label: str
     height: float
-    state: Steady
+    P: float
+    P_stderr: float
     gradient: dict[str, float]
     active: tuple[str, ...]
     stopped: str
-    looks: int
     path: np.ndarray
     heights: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimum(AnyOptimum):
+    """A design at which an ascent ended, verified.
+
+    Attributes:
+        orbit: Its orbit, along a leading axis of one; multipliers are its own.
+        state: Energies, depths, margins' parts, condition and clearance of the nominal device; see `Steady`.
+        looks: Evaluations of objective with gradient that it took.
+
+    What holds it there names impacts. `stopped` is "maximum"; "supremum", where the objective rises up to the end of
+    the orbit, which no orbit attains; "looks", when these were spent; "stalled", where no step is higher though the
+    gradient is not zero: at a kink, such as a worst case has where two devices are alike; "weighted", of
+    `robustness.weighted`.
+    """
+
+    orbit: Orbit
+    state: Steady
+    looks: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class AperiodicOptimum(AnyOptimum):
+    """A design whose motion is no orbit, confirmed by a long flight of many balls at exactly its values.
+
+    Attributes:
+        power: [W].
+        speed, max_penetration, energy_ratio: The largest of all that was flown [m/s], [m], [1].
+        lyapunov: Largest Lyapunov exponent per forcing period, the mean of the balls; NaN where none has any.
+        admissible: Share of the balls that broke no limit.
+        shares: Of the balls that ended on each motion, by its label, the largest first.
+        gradient_stderr: Standard errors of the gradient; both were fitted to the last ensemble.
+        ensembles: How many were flown about it.
+        flown: How many balls were flown at the end, and for how many forcing periods each.
+        starts: Where these were at last.
+
+    The label is n:m/pT where the motion turned out to be an orbit too long to be climbed from. `stopped` is "maximum",
+    where less is left to gain than the noise, or "ensembles", when these were spent. The path is that of the centres
+    of ensembles, with the objective fitted there.
+    """
+
+    power: float
+    speed: float
+    max_penetration: float
+    energy_ratio: float
+    lyapunov: float
+    admissible: float
+    shares: dict[str, float]
+    gradient_stderr: dict[str, float]
+    ensembles: int
+    flown: tuple[int, int]
+    starts: Starts
 
 
 class End(NamedTuple):
@@ -80,7 +130,7 @@ class End(NamedTuple):
 
 def verified(
     scene: Scene,
-    starts: Met,
+    starts: Begun,
     ends: list[End],
     devices: list[Harvester],
     looks: int,
@@ -112,6 +162,8 @@ def verified(
                 orbit=found[row : row + 1],
                 label=str(names[row]),
                 height=end.height,
+                P=float(seen[row].P),
+                P_stderr=0.0,
                 state=seen[row],
                 gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
                 active=_active(scene, end, found.sequence.side[row], settings.active_margin),

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vijax.design.objective import OBJECTIVES
-from vijax.design.optimise import Design, Spread
-from vijax.design.optimum import Optimum
+from vijax.design.off_design import Arrival, Extent
+from vijax.design.optimise import Design
+from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.robustness import Surroundings
-from vijax.design.tolerance import Tolerance
+from vijax.design.tolerance import Spread, Tolerance
 from vijax.design.variables import LINEAR, constant, value_of
 from vijax.model.device import CONSTANTS
 from vijax.model.energy import energy_ratio
@@ -22,13 +23,16 @@ if TYPE_CHECKING:
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15}
 _TIE = 1e-6  # optima whose objectives differ by less, relative, are a tie
 _MOST_ROWS = 12
-_LOSSES = {"lost": "lose the orbit", "inadmissible": "are inadmissible"}
+_NARROW = 1.0  # percent
+_LOSSES = {"lost": "lose the motion", "inadmissible": "are inadmissible"}
 
 
 def describe(
     design: Design,
     *,
     surroundings: Surroundings | None = None,
+    extents: Sequence[Extent] = (),
+    arrival: Arrival | None = None,
     diagram: "xr.Dataset | None" = None,
     tolerances: Sequence[Tolerance] = (),
     spread: Spread | None = None,
@@ -37,13 +41,14 @@ def describe(
 
     Args:
         design: What `vijax.optimise` returned.
-        surroundings: Of its best optimum.
+        surroundings, extents, arrival: Of its best optimum: what attracts there, how far off each tuned quantity may
+            be before the motion is another one, and how balls arrive at it.
         diagram: P up and down along an axis at the best optimum, `vijax.orbit_diagram` in both directions.
         tolerances, spread: Over which tolerances the best optimum was judged, and a `vijax.design.optimise.under`
             of them.
 
     Returns:
-        `best` (None if no admissible orbit was found), `others`, and what was asked. With `diagram`, `highest`: the
+        `best` (None if no admissible motion was found), `others`, and what was asked. With `diagram`, `highest`: the
         largest P it holds, admissible or not, which is what an optimiser without constraints would report.
     """
     checks.instance("design", design, Design, "vijax.optimise(...)")
@@ -64,32 +69,67 @@ def describe(
         "best": optimum(design.best) if design.best else None,
         "others": [optimum(one) for one in design.optima[1:]],
         "surroundings": _surroundings(surroundings) if surroundings else None,
+        "extents": [_extent(one) for one in extents],
+        "arrival": arrival._asdict() if arrival else None,
         "tolerances": [one._asdict() for one in tolerances],
         "spread": spread._asdict() if spread else None,
         "highest": _highest(diagram) if diagram is not None else None,
     }
 
 
-def optimum(one: Optimum) -> dict[str, Any]:
-    """An optimum as plain data; per impact: penetration, energy, energy given to the membrane, their ratio."""
-    checks.instance("one", one, Optimum, "vijax.optimise(...).best")
-    state, device = one.state, one.device
-    count = int(np.asarray(one.orbit.count)[0])
-    energy, work = state.energy[:count], state.work[:count]
+def optimum(one: Optimum | AperiodicOptimum) -> dict[str, Any]:
+    """An optimum as plain data.
+
+    Of an orbit, for each impact: penetration, energy, energy given to the membrane, their ratio. Of any other motion
+    the largest penetration and ratio of all that was flown, and the standard errors of averages.
+    """
+    checks.instance("one", one, AnyOptimum, "vijax.optimise(...).best")
+    device = one.device
     kappa = float(value_of(device, "kappa"))
-    return {
+    common = {
         "values": one.values,
         "label": one.label,
         "height": one.height,
-        "P": float(state.P),
-        "power": float(state.power),
-        "speed": float(state.speed),
+        "P": one.P,
+        "P_stderr": one.P_stderr,
         "omega0": float(device.omega0),
         "pair": {"d": float(value_of(device, "d")), "kappa": kappa, "r": float(device.r)}
         | {"gamma": float(value_of(device, "gamma"))},
         "device": {name: float(getattr(device, name)) for name in CONSTANTS},
-        "penetration": state.depth[:count],
         "penetration_limit": float(device.depth_limit),
+        "gradient": one.gradient,
+        "active": list(one.active),
+        "stopped": one.stopped,
+        "path": one.path,
+        "heights": one.heights,
+    }
+    return common | (_averaged(one) if isinstance(one, AperiodicOptimum) else _orbit(one))
+
+
+def _averaged(one: AperiodicOptimum) -> dict[str, Any]:
+    return {
+        "power": one.power,
+        "speed": one.speed,
+        "penetration": [one.max_penetration],
+        "energy_ratio": [one.energy_ratio],
+        "lyapunov": one.lyapunov,
+        "kept_limits": one.admissible,
+        "shares": one.shares,
+        "gradient_stderr": one.gradient_stderr,
+        "balls": one.flown[0],
+        "periods": one.flown[1],
+        "looks": one.ensembles,
+    }
+
+
+def _orbit(one: Optimum) -> dict[str, Any]:
+    state = one.state
+    count = int(np.asarray(one.orbit.count)[0])
+    energy, work = state.energy[:count], state.work[:count]
+    return {
+        "power": float(state.power),
+        "speed": float(state.speed),
+        "penetration": state.depth[:count],
         "energy": energy,
         "work": work,
         "energy_ratio": np.asarray(energy_ratio(energy, work)),
@@ -98,21 +138,20 @@ def optimum(one: Optimum) -> dict[str, Any]:
         "condition": float(state.condition),
         "clearance": {name: float(x) for name, x in state.clearance._asdict().items()},
         "residual": float(state.residual),
-        "gradient": one.gradient,
-        "active": list(one.active),
-        "stopped": one.stopped,
         "looks": one.looks,
-        "path": one.path,
-        "heights": one.heights,
     }
+
+
+def _extent(one: Extent) -> dict[str, Any]:
+    return {"name": one.name, "below": one.below._asdict(), "above": one.above._asdict()}
 
 
 def _surroundings(found: Surroundings) -> dict[str, Any]:
     return {
         "share": found.share,
         "attractors": [one._asdict() for one in found.attractors],
-        "below": found.below._asdict(),
-        "above": found.above._asdict(),
+        "below": found.below._asdict() if found.below else None,
+        "above": found.above._asdict() if found.above else None,
     }
 
 
@@ -159,10 +198,11 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
     yield f"survey: {report['survey']['orbits']:,} periodic attractors met, {report['starts']:,} climbed"
     best = report["best"]
     if best is None:
-        yield "no admissible attracting orbit was found; what the survey met instead:"
+        yield "no admissible motion was found; what the survey met instead:"
         yield from (f"  {what}" for what in _instead(report["survey"]))
     else:
         yield from _best(best, report["objective"])
+        yield from _off_design(best, report["extents"], report["arrival"])
         yield from _around(best, report["surroundings"])
         yield from _others(best, report["others"], report["objective"])
         yield from _off(report)
@@ -171,6 +211,11 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
 
 def _instead(survey: dict[str, Any]) -> Iterator[str]:
     """What a survey met where no design came of it, and what to do about each."""
+    if survey["limit"]:
+        yield (
+            f"the {survey['limit']} stands everywhere: the motion nearest to keeping the limits exceeds it by "
+            f"{100 * survey['excess']:.3g} %"
+        )
     broken = survey["orbits"] - survey["admissible"]
     if broken:
         yield f"{broken:,} periodic orbits that break a constraint: widen the bounds or the penetration limit"
@@ -180,8 +225,8 @@ def _instead(survey: dict[str, Any]) -> Iterator[str]:
         where = ", ".join(quantity(*item) for item in survey["values"].items())
         harvest = f"P up to {amount(survey['P'], 'J', 4)} admissibly, at {where}" if where else "none of it admissible"
         yield (
-            f"aperiodic or long motion at {survey['restless']:,} of the values looked at, {harvest}: it has no "
-            "gradient; move the bounds, or look for narrow windows with more steps and balls"
+            f"aperiodic or long motion at {survey['restless']:,} of the values looked at, {harvest}: move the bounds, "
+            "or look at more values, from more starts"
         )
     if survey["held"]:
         yield f"{100 * survey['held']:.3g} % of the starts on one wall for ever: raise A or lower beta"
@@ -195,8 +240,13 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
     tuned = ", ".join(quantity(name, value) for name, value in best["values"].items())
     pair = best["pair"]
     yield f"best: {tuned}   ({', '.join(f'{name} {value:.6g}' for name, value in pair.items())})"
+    kind, error = best["label"], ""
+    if "balls" not in best:
+        kind = f"orbit {kind}"
+    elif best["P_stderr"]:
+        error = f" +- {amount(best['P_stderr'], 'J', 2)}"
     yield (
-        f"  orbit {best['label']}: P {amount(best['P'], 'J')} per half period, {amount(best['power'], 'W')}, "
+        f"  {kind}: P {amount(best['P'], 'J')}{error} per half period, {amount(best['power'], 'W')}, "
         f"largest speed into a wall {best['speed']:.6g} m/s"
     )
     if objective in ("mean", "worst"):
@@ -206,6 +256,42 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
         f"  penetration {deepest:.6g} mm of {limit:.6g} allowed; "
         f"harvested at most {100 * max(best['energy_ratio']):.4g} % of the energy that an impact gives"
     )
+    if "balls" in best:
+        yield from _flown(best)
+    else:
+        yield from _regular(best)
+    errors = best.get("gradient_stderr", {})
+    gradient = ", ".join(
+        f"{name} {slope:.3g}" + (f" +- {errors[name]:.2g}" if name in errors else "")
+        for name, slope in best["gradient"].items()
+    )
+    interior = best["stopped"] == "maximum"
+    held = ", ".join(best["active"]) or ("nothing, an interior optimum" if interior else "nothing")
+    why = {
+        "supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains",
+        "ensembles": "all of them spent",
+        "stalled": "no step is higher though the gradient is not zero: a kink",
+    }
+    counted = "ensembles" if "balls" in best else "evaluations"
+    yield f"  stopped after {best['looks']} {counted}: {why.get(best['stopped'], best['stopped'])}"
+    yield f"  held by: {held}"
+    smooth = ", of a smoothed minimum" if objective == "worst" else ""
+    yield f"  log-gradient at the end{smooth}: {gradient}"
+
+
+def _flown(best: dict[str, Any]) -> Iterator[str]:
+    """What proves a motion that is no orbit."""
+    exponent = f"; Lyapunov exponent {best['lyapunov']:.3g} a period" if np.isfinite(best["lyapunov"]) else ""
+    yield f"  {best['balls']} balls flown for {best['periods']:,} periods each at exactly these values{exponent}"
+    if best["kept_limits"] < 1:
+        yield f"  {100 * best['kept_limits']:.4g} % of them kept the limits"
+    if len(best["shares"]) > 1:
+        shares = ", ".join(f"{name} {100 * share:.3g} %" for name, share in list(best["shares"].items())[:_MOST_ROWS])
+        yield f"  they ended on: {shares}"
+
+
+def _regular(best: dict[str, Any]) -> Iterator[str]:
+    """What proves an orbit."""
     modulus = ", ".join(f"{np.hypot(*one):.4g}" for one in best["multipliers"])
     yield f"  |multipliers| {modulus}; condition of I - DP {best['condition']:.4g}; residual {best['residual']:.1e}"
     room = best["clearance"]
@@ -213,24 +299,35 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
         f"  clear of grazing: slowest impact {room['speed']:.4g}, room in flight {room['flight']:.4g}, "
         f"in contact {room['contact']:.4g}, slowest exit over its entry {room['exit']:.4g}"
     )
-    gradient = ", ".join(f"{name} {slope:.3g}" for name, slope in best["gradient"].items())
-    interior = best["stopped"] == "maximum"
-    held = ", ".join(best["active"]) or ("nothing, an interior optimum" if interior else "nothing")
-    why = {
-        "supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains",
-        "stalled": "no step is higher though the gradient is not zero: a kink",
-    }
-    yield f"  stopped after {best['looks']} evaluations: {why.get(best['stopped'], best['stopped'])}"
-    yield f"  held by: {held}"
-    smooth = ", of a smoothed minimum" if objective == "worst" else ""
-    yield f"  log-gradient at the end{smooth}: {gradient}"
+
+
+def _off_design(best: dict[str, Any], extents: list[dict[str, Any]], arrival: dict[str, Any] | None) -> Iterator[str]:
+    """How far the motion lasts, what comes after it, and how balls arrive at it."""
+    for one in extents:
+        for way in ("below", "above"):
+            side = one[way]
+            if side["lasts"]:
+                yield f"  {one['name']} {way}: the same motion as far as {side['percent']:.3g} % off"
+                continue
+            narrow = f", narrower than {_NARROW:g} %" if side["percent"] < _NARROW else ""
+            kept = "within the limits" if side["admissible"] else "beyond the limits"
+            yield (
+                f"  {one['name']} {way}: lasts {side['percent']:.3g} %{narrow}; then {side['label']}, "
+                f"with P {amount(side['P'], 'J', 4)}, {kept}"
+            )
+    if arrival is not None:
+        when = ""
+        if np.isfinite(arrival["median"]):
+            when = f", half of these within {arrival['median']:.0f} periods, 90 % within {arrival['most']:.0f}"
+        yield f"  {100 * arrival['share']:.3g} % of the balls arrive there in {arrival['periods']:,} periods{when}"
 
 
 def _around(best: dict[str, Any], around: dict[str, Any] | None) -> Iterator[str]:
     if around is None:
         return
-    yield f"  nearest bifurcation along omega0: below, {_edge(around['below'])}; above, {_edge(around['above'])}"
-    yield f"  basin of the orbit: {100 * around['share']:.4g} % of the starts; all attractors there:"
+    if around["below"]:
+        yield f"  nearest bifurcation along omega0: below, {_edge(around['below'])}; above, {_edge(around['above'])}"
+    yield f"  basin of the motion: {100 * around['share']:.4g} % of the starts; all attractors there:"
     shown = around["attractors"][:_MOST_ROWS]
     for one in shown:
         flaw = "" if one["admissible"] else "  inadmissible"
@@ -290,7 +387,7 @@ def table(report: dict[str, Any]) -> Iterator[str]:
     for value, one in zip(values, report["designs"], strict=True):
         best = one["best"]
         if best is None:
-            yield f"{name} {value:.5g}: no admissible attracting orbit; {next(_instead(one['survey']))}"
+            yield f"{name} {value:.5g}: no admissible motion; {next(_instead(one['survey']))}"
             continue
         tuned = ", ".join(quantity(*item) for item in best["values"].items())
         spread = f", at worst {amount(one['spread']['worst'], 'J', 5)}" if one["spread"] else ""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.design.optimise import Design
-from vijax.design.optimum import Optimum, states
+from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum, states
 from vijax.design.variables import tuned, values, variables
 from vijax.model.device import Harvester
 from vijax.model.records import Status
@@ -53,19 +53,22 @@ class Surroundings(NamedTuple):
     """What lies around an optimum.
 
     Attributes:
-        share: Part of all starts that its orbit (and the mirror image) attracts.
+        share: Part of all starts that its motion (and the mirror image) attracts.
         attractors: All that were met there, its own among them, the largest share first.
-        below, above: Along omega0, all else of the device as it is.
+        below, above: Along omega0, all else of the device as it is; None of a motion that is no orbit, which has no
+            bifurcations of its own (`off_design.extents` says how far it lasts).
     """
 
     share: float
     attractors: tuple[Neighbour, ...]
-    below: Edge
-    above: Edge
+    below: Edge | None
+    above: Edge | None
 
 
 @door
-def surroundings(optimum: Optimum, *, starts: int = 2000, reach: float = 0.5, seed: int | None = None) -> Surroundings:
+def surroundings(
+    optimum: Optimum | AperiodicOptimum, *, starts: int = 2000, reach: float = 0.5, seed: int | None = None
+) -> Surroundings:
     """Look around an optimum.
 
     Args:
@@ -77,9 +80,12 @@ def surroundings(optimum: Optimum, *, starts: int = 2000, reach: float = 0.5, se
     Raises:
         ValueError: reach outside (0, 1), or starts that cannot be.
     """
-    checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best")
+    checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     reach, seed = _checked(reach), checks.seed(seed)
     attractors = _attractors(optimum.device, checks.whole("starts", starts, 1, MOST_STARTS), seed)
+    if not isinstance(optimum, Optimum):
+        share = sum(one.share for one in attractors if one.label == optimum.label)
+        return Surroundings(share, attractors, None, None)
     own = float(orbit_properties.power(optimum.orbit, optimum.device)[0])
     share = sum(one.share for one in attractors if math.isclose(one.P, own, rel_tol=_SAME))
     return Surroundings(share, attractors, _edge(optimum, "down", reach), _edge(optimum, "up", reach))
@@ -136,7 +142,7 @@ def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int
     starts, reach, seed = checks.whole("starts", starts, 1, MOST_STARTS), _checked(reach), checks.seed(seed)
     best: Optimum | None = None
     for one in design.optima:
-        if best is None or float(one.state.P) > best.height:
+        if isinstance(one, Optimum) and (best is None or best.height < one.P):
             found = _searched(design, one, starts, reach, seed)
             best = found if best is None or found.height > best.height else best
     return best
@@ -162,13 +168,15 @@ def _searched(design: Design, optimum: Optimum, starts: int, reach: float, seed:
                 z, height = line[int(np.argmax(scores))], max(scores)
     device = _device(optimum, names, z)
     orbit = _followed(optimum, device)
+    (state,) = states([device], orbit)
     return dataclasses.replace(
         optimum,
         values=dict(zip(names, np.asarray(values(names, z)).tolist(), strict=True)),
         device=device,
         orbit=orbit,
         height=height,
-        state=states([device], orbit)[0],
+        P=float(state.P),
+        state=state,
         gradient={},
         active=(),
         stopped="weighted",

@@ -9,6 +9,8 @@ import numpy as np
 
 from vijax.batch import simulate
 from vijax.batch.impact_log import record
+from vijax.batch.simulate import Starts
+from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
 from vijax.orbits.shooting import Sequence
@@ -21,12 +23,12 @@ _SAME = 1e-6  # relative difference within which attractors of one pair are the 
 
 
 class Flown(NamedTuple):
-    """Motions as they were flown, in the order of the cells that met them first.
+    """Orbits as they were flown, in the order of the cells that met them first.
 
     Attributes:
         pair: Parameters of each [motion].
         side, knots: Its impacts, [motion, impact], padded with side 0 and zeros; see `Orbit`.
-        span: Time after which an orbit closes; how long another motion was looked at.
+        span: Time after which an orbit closes.
         depth, work: Largest penetration and energy given to the membrane (per unit mass) of each impact; NaN beyond.
         cell: Which one met it first.
     """
@@ -62,24 +64,19 @@ class Survey(NamedTuple):
 
         Of cells that differ in their starts alone each one once.
         """
-        some = np.flatnonzero(self._closing(impacts))
-        own, ended = jax.tree.map(lambda x: x[some], (self.pair, self.ended))
-        once = _distinct(own, ended)
-        own, ended = jax.tree.map(lambda x: x[once], (own, ended))
-        # A period more, lest rounding moves an impact at phase 0 out of it.
-        table = _recorded(own, ended.handover, ended.period + 1, impacts)
-        count = ended.impacts_left + ended.impacts_right
-        return _flown(own, 2.0 * ended.period, table, np.arange(impacts) < count[:, None], some[once])
+        some = self.closing(impacts)
+        pair, ended = jax.tree.map(lambda x: x[some], (self.pair, self.ended))
+        return flown(pair, ended, impacts)._replace(cell=some)
 
-    def unrest(self, impacts: int) -> Flown:
-        """What is no such orbit: chaos, and what is not settled or too long; one motion of every pair."""
+    def closing(self, impacts: int) -> np.ndarray:
+        """Cells that met such an attractor first."""
+        some = np.flatnonzero(self._closing(impacts))
+        return some[_distinct(*jax.tree.map(lambda x: x[some], (self.pair, self.ended)))]
+
+    def restless(self, impacts: int) -> np.ndarray:
+        """Cells whose motion is no such orbit: chaos, what has not settled, what takes too many periods or impacts."""
         going = np.isin(self.ended.status, (*_SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
-        some = np.flatnonzero(going & ~self._closing(impacts))
-        _, first = np.unique(np.column_stack(jax.tree.leaves(self.pair))[some], axis=0, return_index=True)
-        some = some[np.sort(first)]
-        own, handover = jax.tree.map(lambda x: x[some], (self.pair, self.ended.handover))
-        table = _recorded(own, handover, np.full(some.size, self.longest), None)
-        return _flown(own, np.full(some.size, 2.0 * self.longest), table, np.isfinite(table["n"]), some)
+        return np.flatnonzero(going & ~self._closing(impacts))
 
     def _closing(self, impacts: int) -> np.ndarray:
         """Which cells ended on an orbit that is wanted."""
@@ -88,20 +85,29 @@ class Survey(NamedTuple):
         return np.isin(ended.status, _SETTLED) & some
 
 
-def survey(pair: ImpactPair, u0: np.ndarray, v0: np.ndarray, *, longest: int, periods: int) -> Survey:
+def survey(pair: ImpactPair, device: Harvester, starts: Starts, *, longest: int, periods: int) -> Survey:
     """Run soft cells until their attractors are certain.
 
     Args:
         pair: Cells [cell].
-        u0, v0: Where each starts, at phase 0.
+        device: Those that they are the nondimensional form of.
+        starts: Where each starts.
         longest: Most forcing periods of an orbit that will be wanted.
         periods: Forcing periods that the search for an attractor may take.
     """
-    pair = jax.tree.map(np.asarray, pair)
-    return Survey(pair, _ended(pair, (u0, v0), longest, periods), longest)
+    pair, device, starts = jax.tree.map(np.asarray, (pair, device, starts))
+    return Survey(pair, _ended(pair, device, starts, longest, periods), longest)
 
 
-def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int, periods: int) -> Any:
+def flown(pair: ImpactPair, ended: Any, impacts: int) -> Flown:
+    """The orbits of cells that ended on some, of at most so many impacts, flown once more impact by impact."""
+    # A period more, lest rounding moves an impact at phase 0 out of it.
+    table = _recorded(pair, ended.handover, ended.period + 1, impacts)
+    count = ended.impacts_left + ended.impacts_right
+    return _flown(pair, 2.0 * ended.period, table, np.arange(impacts) < count[:, None], np.arange(count.size))
+
+
+def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, periods: int) -> Any:
     """How every cell ended, a `Summary`, in tiles on every core."""
     cells = pair.d.size
     share = math.ceil(cells / workers())
@@ -111,8 +117,8 @@ def _ended(pair: ImpactPair, starts: tuple[np.ndarray, np.ndarray], longest: int
     tiles = [np.arange(first, cells, number) for first in range(number)]
 
     def part(rows: np.ndarray) -> Any:
-        own, u0, v0 = jax.tree.map(lambda x: jnp.asarray(x[np.resize(rows, size)]), (pair, *starts))
-        summary = simulate.attractors(own, u0, v0, periods=periods, keep=longest, count=rows.size)
+        own = jax.tree.map(lambda x: jnp.asarray(x[np.resize(rows, size)]), (pair, device, starts))
+        summary = simulate.attractors(*own, periods=periods, keep=longest, count=rows.size)
         return jax.tree.map(lambda x: x[: rows.size], summary)
 
     with context.pool(workers()) as pool:
@@ -134,8 +140,8 @@ def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
 _COLUMNS = "n", "t", "side", "v_in", "duration", "depth", "work"
 
 
-def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int | None) -> dict[str, np.ndarray]:
-    """The first impacts of the last periods of cells by name, [cell, impact], NaN beyond; all unless so many."""
+def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int) -> dict[str, np.ndarray]:
+    """So many first impacts of the last periods of cells by name, [cell, impact], NaN beyond."""
     u, v, t, n, held = jax.tree.leaves((handover.mark, handover.held))
     mark = State(u, v, t, n.astype(np.int32), held.astype(np.int32))
 
@@ -147,11 +153,10 @@ def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int
     parts = [rows for some in alike for rows in np.array_split(some, min(workers(), some.size))]
     with context.pool(workers()) as pool:
         found = list(pool.map(part, parts))
-    width = max((one["n"].shape[1] for one in found), default=0) if impacts is None else impacts
-    table = {name: np.full((u.size, width), np.nan) for name in _COLUMNS}
+    table = {name: np.full((u.size, impacts), np.nan) for name in _COLUMNS}
     for rows, one in zip(parts, found, strict=True):
         for name, column in table.items():
-            some = one[name][:, :width]
+            some = one[name][:, :impacts]
             column[rows, : some.shape[1]] = some
     return table
 

@@ -79,15 +79,35 @@ def nodes(tolerances: tuple[Tolerance, ...], samples: int | None = None, seed: i
         return Nodes(names, np.ones((1, 0)), np.ones(1))
     if samples is not None:
         samples = checks.whole("samples", samples, 1, _MOST_SAMPLES)
-        draw = np.random.default_rng(seed)
-        columns = [_factors(one, _drawn(one, draw, samples)) for one in tolerances]
-        factors, weights = np.stack(columns, axis=1), np.full(samples, 1 / samples)
+        factors, weights = drawn(tolerances, samples, seed)[1], np.full(samples, 1 / samples)
     else:
         rules = [_rule(one, _NODES.get(len(tolerances), 3)) for one in tolerances]
         columns = [_factors(one, x) for one, (x, _) in zip(tolerances, rules, strict=True)]
         factors = np.array(list(itertools.product(*columns)))
         weights = np.array([np.prod(ws) for ws in itertools.product(*(w for _, w in rules))])
     return Nodes(names, np.vstack([np.ones(len(names)), factors]), np.append(0.0, weights))
+
+
+class Spread(NamedTuple):
+    """P of a design over tolerances, each device on the design's motion.
+
+    Attributes:
+        mean: A device whose motion is lost, or inadmissible, counting nothing [J].
+        worst: The least; 0 if the motion of one is lost [J].
+        lost, inadmissible: Shares of devices.
+    """
+
+    mean: float
+    worst: float
+    lost: float
+    inadmissible: float
+
+
+def drawn(tolerances: tuple[Tolerance, ...], count: int, seed: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names of the constants, and factors [device, constant] of so many random devices."""
+    draw = np.random.default_rng(seed)
+    columns = [_factors(one, _drawn(one, draw, count)) for one in tolerances]
+    return tuple(one.name for one in tolerances), np.stack(columns, axis=1)
 
 
 def _factors(one: Tolerance, x: np.ndarray) -> np.ndarray:

@@ -3,13 +3,17 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from vijax.model import units
 from vijax.model.device import CONSTANTS, Harvester
+from vijax.model.pair import ImpactPair
 from vijax.model.quantities import PARAMETERS, check
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -55,6 +59,13 @@ def tuned(device: Harvester, names: tuple[str, ...], z: Any) -> Harvester:
         if name in given:
             device = _decided(device, name, given[name])
     return device
+
+
+@partial(jax.jit, static_argnames="names")
+def cells(devices: Harvester, z: Float[Array, "cell variable"], names: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
+    """Give devices [cell] with the quantities that the variables say, and their pairs."""
+    every = jax.vmap(lambda device, z: tuned(device, names, z))(devices, z)
+    return every, jax.vmap(lambda device: device.pair())(every)
 
 
 def _decided(device: Harvester, name: str, x: Any) -> Harvester:

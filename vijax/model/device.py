@@ -159,6 +159,16 @@ def with_constants(device: Harvester, **constants: Real) -> Harvester:
     return dataclasses.replace(device, **constants)
 
 
+def electrical(device: Harvester) -> Harvester:
+    """Leave out of a device what the energy of an impact of known depth does not depend on: those fields are None."""
+    return eqx.tree_at(
+        lambda one: (one.s, one.omega0, one.r, one.A, one.omega, one.beta, one.g, one.penetration_limit),
+        device,
+        (None,) * 8,
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
 def check_device(device: Any) -> Harvester:
     """Return the device, if it is one."""
     return checks.instance("device", device, Harvester, "vijax.Harvester(...)")

@@ -44,7 +44,7 @@ _LINKS = 64
 # Chains that run side by side in a call, at least, where others are padding, and at most.
 _FEWEST_LANES, _MOST_LANES = 8, 512
 _POINTS = {
-    **{name: OUTPUTS[name][:2] for name in ("P", "period", "impacts_left", "impacts_right")},
+    **{name: OUTPUTS[name][:2] for name in ("P", "P_stderr", "period", "impacts_left", "impacts_right")},
     "status": ("1", "how the point ended"),
     "filled": ("1", "impacts in the kept periods"),
     **{name: OUTPUTS[name][:2] for name in ("max_penetration", "energy_ratio", "admissible")},
@@ -300,7 +300,11 @@ def _simulate(
         "u_strobe": flown.u,
         "v_strobe": flown.v,
     }
-    points = {"P": summary.P[..., 0], "energy_ratio": summary.energy_ratio[..., 0]}
+    points = {
+        "P": summary.P[..., 0],
+        "P_stderr": summary.P_stderr[..., 0],
+        "energy_ratio": summary.energy_ratio[..., 0],
+    }
     points["max_penetration"] = summary.deepest * table["depth"]
     within = points["max_penetration"] <= float(planned.device.depth_limit)
     points["admissible"] = within & (points["energy_ratio"] <= 1)

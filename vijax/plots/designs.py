@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _WAYS = {"down": ("#1f77b4", "#aec7e8", 3.4, "falling"), "up": ("#ff7f0e", "#ffbb78", 1.7, "rising")}
 _VEIL: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "0.75", "hatch": "////", "linewidth": 0, "zorder": 0}
 _BAND: dict[str, Any] = {"color": "#2ca02c", "alpha": 0.25, "linewidth": 0, "zorder": 1}
+_WINDOW: dict[str, Any] = {"color": "#9467bd", "alpha": 0.15, "linewidth": 0, "zorder": 1}
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 13, "color": "#2ca02c", "markeredgecolor": "black", "mew": 0.6}
 _PATH: dict[str, Any] = {
     "marker": "o",
@@ -34,7 +35,9 @@ _WIDE = 4.0  # ratio of the bounds from which on an axis is logarithmic
 _DECADES = 6  # P is shown down to so many decades below the largest
 _NEAR, _TILT = 0.25, 0.05  # the close view, to either side: in parts of the optimum; of an inclination
 _HEADROOM = 1.25
-_JOULES = ("P", "mean", "worst")
+_JOULES = ("P", "mean", "worst", "expected")
+_CHAOS: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 2.2, "mew": 0, "color": "#9467bd"}
+_ERRORS = 3  # standard errors, half the height of the band of an average
 
 
 @styled
@@ -109,6 +112,19 @@ def _curves(axes: Axes, diagram: "xr.Dataset", x: np.ndarray) -> None:
         style: Any = {"linestyle": "none", "marker": ".", "mew": 0, "markersize": 2 * size}
         axes.plot(x[~good], power[~good], color=pale, **style)
         axes.plot(x[good], power[good], color=colour, label=f"{name} {symbol(diagram[one.attrs['along']])}", **style)
+    _averages(axes, diagram, x)
+
+
+def _averages(axes: Axes, diagram: "xr.Dataset", x: np.ndarray) -> None:
+    """Averages of admissible chaos over its orbits' dots, each with the band of its standard error."""
+    if "P_stderr" not in diagram:
+        return
+    chaotic = ((diagram["period"] == 0) & diagram["admissible"]).values
+    power, error = diagram["P"].values, _ERRORS * diagram["P_stderr"].values
+    at = np.broadcast_to(x, chaotic.shape)[chaotic]
+    if at.size:
+        axes.plot(at, power[chaotic], label="average of chaos", zorder=3, **_CHAOS)
+        axes.vlines(at, (power - error)[chaotic], (power + error)[chaotic], color=_CHAOS["color"], lw=0.7, zorder=3)
 
 
 def _unconstrained(axes: Axes, report: dict[str, Any]) -> None:
@@ -127,17 +143,27 @@ def _mark(axes: Axes, report: dict[str, Any], along: str) -> None:
         axes.axvspan(here * band[0], here * band[1], label="tolerance", **_BAND)
     if report["surroundings"]:
         _edges(axes, report["surroundings"], best["omega0"], here, along)
+    _ends(axes, report["extents"], here, along)
     if along in report["tune"] and report["objective"] in _JOULES:
         column = np.asarray(best["path"])[:, report["tune"].index(along)]
         axes.plot(column, best["heights"], zorder=4, label="ascent", **_PATH)
     axes.plot([here], [best["P"]], zorder=5, linestyle="none", label=f"optimum: {_micro(best['P'])}", **_STAR)
 
 
+def _ends(axes: Axes, extents: list[dict[str, Any]], here: float, along: str) -> None:
+    """How far off the quantity may be before the motion is another one."""
+    for one in extents:
+        if one["name"] == along and not (one["below"]["lasts"] and one["above"]["lasts"]):
+            low, high = (0.01 * one[side]["percent"] * sign for side, sign in (("below", -1), ("above", 1)))
+            ends = (here + low, here + high) if along in LINEAR else (here * (1 + low), here * (1 + high))
+            axes.axvspan(*ends, label="as far as this motion lasts", **_WINDOW)
+
+
 def _edges(axes: Axes, around: dict[str, Any], omega0: float, here: float, along: str) -> None:
     """Where the optimum's orbit meets its first bifurcations."""
     for side in ("below", "above"):
         edge = around[side]
-        if constant(along) == "omega0" and edge["kind"] != "none":
+        if edge and constant(along) == "omega0" and edge["kind"] != "none":
             power = 2 if along == "k" else 1
             axes.axvline(here * (edge["omega0"] / omega0) ** power, label=edge["kind"], **_EDGE)
 

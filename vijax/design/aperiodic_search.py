@@ -1,0 +1,245 @@
+"""The best motion that is no orbit: ensembles of balls climb the averages of chaos, and a long flight proves them.
+
+`search` is the line: the most promising places of a survey -> ensembles about each, whose fitted surface optax climbs
+within a trust region -> the best of every device, flown for long at exactly its design (`long_flight`).
+Derivatives along a chaotic flight grow with its Lyapunov exponent and say nothing of averages; differences between
+balls in devices that are a little apart do.
+"""
+
+import dataclasses
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vijax.batch.simulate import Starts
+from vijax.design import multistart
+from vijax.design.ascent import Box, Look, ascend
+from vijax.design.design_settings import DesignSettings
+from vijax.design.ensemble import AVERAGED, Ensemble, Task, alike, fly
+from vijax.design.multistart import Met
+from vijax.design.response_surface import Surface, fit, unknown
+from vijax.runtime import tiles, xla
+
+_FITS = (16, 128)  # surfaces that are climbed in one compiled call
+_LOOKS = 60  # evaluations of a surface, which cost next to nothing
+_FAR = 0.06  # what lacks more than this to its limits, as a logarithm, is no place to begin
+_FEWEST = 8  # no surface is fitted to fewer balls
+_NARROW = 0.25  # windows of chaos are looked at with this part of the last radius
+_SURE = 3  # standard errors
+
+
+@dataclasses.dataclass
+class Place:
+    """A design that climbs, and the motion that it climbs with.
+
+    Attributes:
+        owner: Its device.
+        z: Where the next ensemble is.
+        radius: How far its balls are spread, and how far the next step may lead.
+        starts: Balls on the motion.
+        best, surface: Where the best ensemble was, and what was fitted to it.
+        gain: What the next step promises of the objective, as a logarithm.
+        ahead: The logarithm of the objective that it promises to reach, less a price where limits stay broken.
+        path: Centres and fitted objectives of the ensembles that were taken.
+        ensembles: How many were flown.
+        going: Whether there is more to gain.
+    """
+
+    owner: int
+    z: np.ndarray
+    radius: float
+    starts: Starts
+    best: np.ndarray
+    surface: Surface
+    gain: float = np.inf
+    ahead: float = -np.inf
+    path: list[tuple[np.ndarray, float]] = dataclasses.field(default_factory=list)
+    ensembles: int = 0
+    going: bool = True
+
+    @property
+    def known(self) -> bool:
+        """Whether an ensemble was taken."""
+        return bool(self.path)
+
+    @property
+    def sure(self) -> float:
+        """Logarithm of the objective that it has reached for certain."""
+        kept = self.known and self.surface.margins.min() >= 0
+        return float(self.surface.value - _SURE * self.surface.value_error) if kept else -np.inf
+
+
+def _place(owner: int, z: np.ndarray, radius: float, starts: Starts) -> Place:
+    return Place(owner, z, radius, starts, z, unknown(z.size))
+
+
+def search(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
+    """Climb from the most promising places of every device.
+
+    Args:
+        task: See there.
+        unrest: What surveys met that is no orbit to climb from; of "expected" all that they met.
+        known: Logarithm of the best objective of an orbit of each device, -inf where there is none.
+    """
+    places = _begun(task, unrest, known)
+    for _ in range(task.settings.max_ensembles):
+        going = [one for one in places if one.going]
+        if not going:
+            break
+        places += _advance(task, places, going, known)
+    return [one for one in places if one.known]
+
+
+# --- where to begin ---------------------------------------------------------------------------------------------------
+
+
+def _begun(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
+    """The most promising places of every device, apart from each other."""
+    settings, places = task.settings, []
+    promise = multistart.promise(unrest, task.objective)
+    least = known + np.log(settings.min_chaos)
+    for owner in np.unique(unrest.owner).tolist():
+        own = np.flatnonzero(unrest.owner == owner)
+        z, which = np.unique(unrest.z[own], axis=0, return_inverse=True)
+        value, lacks = _told(task, which.ravel(), np.exp(promise.value[own]), promise.lacks[own])
+        score = value + settings.limit_price * lacks
+        score[lacks < -_FAR] = -np.inf
+        reach = settings.places_apart * settings.ensemble_radius * task.unit(owner)
+        chosen: list[int] = []
+        for row in np.argsort(-score, kind="stable").tolist():
+            if len(chosen) == settings.max_places or not score[row] > least[owner]:
+                break
+            if all((np.abs(z[row] - z[other]) > reach).any() for other in chosen):
+                chosen.append(row)
+        met = (unrest.found.some(own[which.ravel() == row]).end for row in chosen)
+        places += [_place(owner, z[row], settings.ensemble_radius, x) for row, x in zip(chosen, met, strict=True)]
+    return places
+
+
+def _told(task: Task, which: np.ndarray, value: np.ndarray, lacks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What the balls that were met at each value say of it: logarithm of their mean, and what lacks to the limits.
+
+    The worst of them, or of the share that counts, says how much room there is.
+    """
+    count = np.bincount(which)
+    with np.errstate(divide="ignore"):
+        mean = np.log(np.bincount(which, value) / count)
+    order = np.lexsort((lacks, which))
+    first = np.concatenate([[0], np.cumsum(count)[:-1]])
+    return mean, lacks[order][first + np.floor((1 - task.reliability) * (count - 1)).astype(int)]
+
+
+# --- a round of ensembles ---------------------------------------------------------------------------------------------
+
+
+def _advance(task: Task, places: list[Place], going: list[Place], known: np.ndarray) -> list[Place]:
+    """Fly an ensemble about every place that climbs and take the step that its surface advises; give new places."""
+    settings = task.settings
+    owner, centre = np.array([one.owner for one in going]), np.array([one.z for one in going])
+    radius = np.array([one.radius for one in going])
+    starts = [one.starts for one in going]
+    flown = fly(task, owner, centre, radius, starts, settings.ensemble_periods, task.balls)
+    for one, ensemble in zip(going, flown, strict=True):
+        _judge(task, one, ensemble)
+    best = np.array(known, float)
+    np.maximum.at(best, [one.owner for one in places], [one.sure for one in places])
+    new = [] if task.expected else _windows(task, going, centre, radius, flown, best)
+    some = [one for one in going if one.going and one.known]
+    for one, ahead in zip(some, climbed(task, some) if some else (), strict=True):
+        _step(task, one, ahead, best[one.owner])
+    return new
+
+
+def _judge(task: Task, place: Place, ensemble: Ensemble) -> None:
+    """Take an ensemble as the place's best, or go back to the best and look closer about it."""
+    settings = task.settings
+    place.ensembles += 1
+    good = np.isfinite(ensemble.found.P) if task.expected else alike(ensemble.found)
+    some = ensemble.some(good)
+    value = some.found.value(task.objective, some.device)
+    enough = good.sum() >= max(_FEWEST, 0.5 * good.size) and value.any()
+    if enough:
+        surface = fit(some.offsets, value, some.found.margins(some.device), share=task.reliability)
+        noise = _SURE * float(surface.value_error + place.surface.value_error) + settings.least_gain
+        here = np.zeros_like(place.z)
+        enough = surface.worth(here, settings.limit_price) > place.surface.worth(here, settings.limit_price) - noise
+    if not enough:
+        place.radius, place.z = place.radius / 4, place.best
+        place.going = place.known and place.radius > 0.1 * settings.last_radius
+        return
+    place.best, place.surface, place.starts = place.z, surface, some.found.end
+    place.path.append((place.z, float(np.exp(surface.value))))
+
+
+def _step(task: Task, place: Place, ahead: np.ndarray, best: float) -> None:
+    """Take a place's next step, look closer where it is short, and stop where nothing is left to gain or to win."""
+    settings, surface, step = task.settings, place.surface, ahead - place.best
+    place.z, place.ahead = ahead, surface.worth(step, settings.limit_price)
+    place.gain = surface.worth(step, 0.0) - float(surface.value)
+    short = (np.abs(step) < 0.5 * place.radius * task.unit(place.owner)).all()
+    if surface.margins.min() >= -settings.limit_room and short:
+        noise = max(2 * float(surface.value_error), settings.least_gain)
+        place.going &= place.gain >= noise or place.radius > settings.last_radius
+        place.radius = min(place.radius, settings.last_radius)
+    place.going &= place.ahead + _SURE * float(surface.value_error) > best - settings.least_gain
+
+
+def _windows(
+    task: Task, going: list[Place], centre: np.ndarray, radius: np.ndarray, flown: list[Ensemble], best: np.ndarray
+) -> list[Place]:
+    """Narrow windows: where a ball has left chaos for an orbit that gives more than the best of its device."""
+    settings = task.settings
+    new: dict[int, Place] = {}
+    for place, at, wide, (offsets, found, device) in zip(going, centre, radius, flown, strict=True):
+        good = (found.period > 0) & np.isin(found.status, AVERAGED) & (found.margins(device).min(axis=1) >= 0)
+        if wide <= settings.last_radius or not good.any() or not place.known:
+            continue
+        value = np.where(good, found.value(task.objective, device), 0.0)
+        ball = int(value.argmax())
+        if np.log(value[ball]) > best[place.owner] + settings.least_gain:
+            start = found.some(np.array([ball])).end
+            new.setdefault(place.owner, _place(place.owner, at + offsets[ball], _NARROW * settings.last_radius, start))
+    return list(new.values())
+
+
+# --- the surface ------------------------------------------------------------------------------------------------------
+
+
+def climbed(task: Task, some: list[Place], room: np.ndarray | float = 0.0) -> np.ndarray:
+    """Where the surfaces are highest within the trust regions and the limits less some room, by optax's L-BFGS."""
+    centre = np.array([one.best for one in some])
+    surface = Surface(*(np.array(x) for x in zip(*(one.surface for one in some), strict=True)))
+    surface = surface._replace(margins=surface.margins - np.broadcast_to(room, len(some))[:, None])
+    reach = np.array([one.radius * task.unit(one.owner) for one in some])
+    owner = [one.owner for one in some]
+    low, high = np.maximum(task.box[owner, 0], centre - reach), np.minimum(task.box[owner, 1], centre + reach)
+    work = _compiled(task.settings)
+    found = np.asarray(tiles.map_tiles(lambda rows: work(*rows), (centre, surface, low, high), _FITS))
+    # Where limits are broken, mending them would lead out of the region where the surface is known.
+    return np.clip(found, low, high)
+
+
+@lru_cache(maxsize=4)
+def _compiled(settings: DesignSettings):
+    def climb(centre, surface, low, high):
+        look, box = partial(_look, centre, surface), Box(low, high, settings.max_step)
+        return ascend(look, jnp.clip(centre, low, high), centre, box, _LOOKS, settings).z
+
+    return jax.jit(climb, compiler_options=xla.compiler_options())
+
+
+def _look(centre, surface: Any, z, near, memory) -> Look:
+    """What is seen of surfaces at points, for `ascent.ascend`."""
+    x = z - centre
+    bend = (surface.curvature * x[:, None]).sum(axis=2)
+    return Look(
+        value=((surface.gradient + 0.5 * bend) * x).sum(axis=1),
+        gradient=surface.gradient + bend,
+        margins=surface.margins + (surface.slopes * x[:, None]).sum(axis=2),
+        slopes=surface.slopes,
+        there=jnp.ones(z.shape[0], bool),
+        memory=memory,
+    )

@@ -1,0 +1,80 @@
+"""Averages of motions that are no orbit to climb from: what each ball gave over all that was flown, and where it is."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from vijax.batch.simulate import Starts
+from vijax.model.device import Harvester
+
+LIMITS = "penetration limit", "energy given to the membrane"
+_MOST = 20.0  # logarithms of margins end here: no contact, no voltage
+
+
+class Averages(NamedTuple):
+    """What balls gave and met, [ball], each in a device of its own.
+
+    Attributes:
+        P, P_stderr: Energy harvested per half forcing period, and its standard error by batch means [J].
+        speed: Largest speed into a wall [m/s].
+        depth: Largest penetration [m].
+        ratio: Largest ratio of harvested energy to energy given to the membrane.
+        lyapunov: Largest Lyapunov exponent per forcing period.
+        period, left, right, status: Of the label; see `Summary`.
+        periods_run: Forcing periods that were flown, up to where an orbit was certain.
+        end: Where each ball was at last.
+    """
+
+    P: np.ndarray
+    P_stderr: np.ndarray
+    speed: np.ndarray
+    depth: np.ndarray
+    ratio: np.ndarray
+    lyapunov: np.ndarray
+    period: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    status: np.ndarray
+    periods_run: np.ndarray
+    end: Starts
+
+    def some(self, index: Any) -> "Averages":
+        """Those with the given indices."""
+        return jax.tree.map(lambda x: x[index], self)
+
+    def value(self, objective: str, device: Harvester) -> np.ndarray:
+        """Give an objective of `OBJECTIVES` for each ball; those over tolerances are P here."""
+        if objective == "speed":
+            return self.speed
+        return self.P * np.asarray(device.omega) / np.pi if objective == "power" else self.P
+
+    def margins(self, device: Harvester) -> np.ndarray:
+        """Logarithms [ball, 2] of the room that is left below the penetration limit and the energy that was given."""
+        with np.errstate(divide="ignore"):
+            room = np.stack([np.log(np.asarray(device.depth_limit) / self.depth), -np.log(self.ratio)], axis=-1)
+        return np.minimum(room, _MOST)
+
+
+def averages(device: Harvester, ended: Any) -> Averages:
+    """What a survey's cells gave.
+
+    Args:
+        device: Of every cell: arrays [cell].
+        ended: Their `Summary`, of a program whose cells have devices of their own.
+    """
+    length, speed = np.asarray(device.length_unit), np.asarray(device.speed_unit)
+    return Averages(
+        P=ended.P[:, 0],
+        P_stderr=ended.P_stderr[:, 0],
+        speed=ended.fastest * speed,
+        depth=ended.deepest * length,
+        ratio=ended.energy_ratio[:, 0],
+        lyapunov=ended.lyapunov,
+        period=ended.period,
+        left=ended.impacts_left,
+        right=ended.impacts_right,
+        status=ended.status,
+        periods_run=ended.periods_run,
+        end=Starts(ended.handover.u, ended.handover.v, ended.handover.t),
+    )

@@ -1,0 +1,158 @@
+"""Ensembles: many balls about one design, each in a device of its own, flown together with those of other designs.
+
+What is fitted to them, and what is made of it, is elsewhere (`response_surface`, `aperiodic_search`).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from vijax.batch.simulate import Starts
+from vijax.design.averages import Averages, averages
+from vijax.design.design_settings import DesignSettings
+from vijax.design.survey import survey
+from vijax.design.tolerance import Tolerance, drawn
+from vijax.design.variables import LINEAR, cells
+from vijax.model.device import Harvester
+from vijax.model.records import Status
+from vijax.planes.basins import spread
+from vijax.runtime import tiles
+
+AVERAGED = Status.OK, Status.STICKING, Status.SLOW  # a ball that ended so has averages
+_TILES = (512, 4096, 32768)  # cells of one compiled call
+_FIRST = 10  # a first flight of so much fewer periods refutes most of what a long one would
+_MORE = 4  # so many times the balls of an ensemble prove a design whose balls start anywhere
+_SPEED = 0.6  # a ball that starts anywhere has at most this velocity
+
+
+class Task(NamedTuple):
+    """What is sought.
+
+    Attributes:
+        devices: Where quantities that are not tuned are taken from.
+        tune: Names of the others.
+        box: Bounds of these, [device, 2, variable].
+        objective: Of `OBJECTIVES`.
+        tolerances: How constants scatter about each design.
+        reliability: Share of the balls that have to keep within the limits.
+        settings: See there.
+    """
+
+    devices: list[Harvester]
+    tune: tuple[str, ...]
+    box: np.ndarray
+    objective: str
+    tolerances: tuple[Tolerance, ...]
+    reliability: float
+    settings: DesignSettings
+
+    @property
+    def expected(self) -> bool:
+        """Whether balls start anywhere; else they start on the motion that is meant."""
+        return self.objective == "expected"
+
+    @property
+    def balls(self) -> int:
+        """How many make an ensemble."""
+        return self.settings.expected_balls if self.expected else self.settings.ensemble_balls
+
+    @property
+    def last_flights(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Balls and forcing periods of the flights that refute a design, and that prove it."""
+        settings = self.settings
+        if self.expected:
+            balls = _MORE * settings.expected_balls
+            return (balls, settings.ensemble_periods), (balls, settings.ensemble_periods)
+        balls, periods = settings.confirm_balls, settings.confirm_periods
+        return (balls, max(periods // _FIRST, 1)), (balls, periods)
+
+    def unit(self, owner: int) -> np.ndarray:
+        """What a radius of 1 is in every variable: a factor of e; of an inclination the width of its bounds."""
+        low, high = self.box[owner]
+        return np.where([name in LINEAR for name in self.tune], high - low, 1.0)
+
+
+class Ensemble(NamedTuple):
+    """Balls about one design: their offsets in the variables [ball, variable], what they gave, their devices."""
+
+    offsets: np.ndarray
+    found: Averages
+    device: Harvester
+
+    def some(self, index: np.ndarray) -> "Ensemble":
+        """Those with the given indices."""
+        return Ensemble(self.offsets[index], self.found.some(index), jax.tree.map(lambda x: x[index], self.device))
+
+
+def fly(
+    task: Task,
+    owner: np.ndarray,
+    centre: np.ndarray,
+    radius: np.ndarray,
+    starts: list[Starts],
+    periods: int,
+    balls: int,
+) -> list[Ensemble]:
+    """Fly so many balls about every centre.
+
+    Args:
+        task: See there.
+        owner: The device of each centre.
+        centre: Variables [centre, variable].
+        radius: How far the balls are spread about each; 0 for all of them at the centre.
+        starts: Balls on the motion that is meant, for each centre; unused where balls start anywhere.
+        periods: Forcing periods of every ball.
+        balls: How many.
+    """
+    unit = np.array([task.unit(one) for one in owner])
+    offsets = (radius[:, None] * unit)[:, None] * pairs(balls, len(task.tune))
+    z = np.clip(centre[:, None] + offsets, task.box[owner, 0][:, None], task.box[owner, 1][:, None])
+    each = np.repeat(owner, balls)
+    given = jax.tree.map(lambda *x: np.array(x, float)[each], *task.devices)
+    device, _ = tiles.map_tiles(lambda rows: cells(*rows, task.tune), (given, z.reshape(-1, len(task.tune))), _TILES)
+    if task.tolerances:
+        names, factors = drawn(task.tolerances, balls)
+        off = {name: getattr(device, name) * np.tile(x, len(owner)) for name, x in zip(names, factors.T, strict=True)}
+        device = _changed(device, off)
+    # Tuned already: what is left to do is the nondimensional form.
+    device, pair = tiles.map_tiles(lambda rows: cells(*rows, ()), (device, np.zeros((each.size, 0))), _TILES)
+    device, pair = jax.tree.map(np.asarray, (device, pair))
+    begun = _anywhere(pair.d, len(owner), balls) if task.expected else _on(starts, balls)
+    found = averages(device, survey(pair, device, begun, longest=1, periods=periods).ended)
+    whole = Ensemble((z - centre[:, None]).reshape(-1, len(task.tune)), found, device)
+    return [whole.some(np.arange(i * balls, (i + 1) * balls)) for i in range(len(owner))]
+
+
+def _changed(device: Harvester, constants: dict[str, np.ndarray]) -> Harvester:
+    import equinox as eqx
+
+    return eqx.tree_at(lambda one: [getattr(one, name) for name in constants], device, list(constants.values()))
+
+
+def pairs(balls: int, size: int) -> np.ndarray:
+    """Offsets in [-1, 1] [ball, variable], evenly spread in every variable, in pairs of opposite ones."""
+    half = (balls + 1) // 2
+    order = np.random.default_rng(size).permuted(np.tile(np.arange(half), (size, 1)), axis=1).T
+    some = (2 * order + 1) / half - 1
+    return np.concatenate([some, -some])[:balls]
+
+
+def _on(starts: list[Starts], balls: int) -> Starts:
+    """So many balls on the motion of every centre, in turn where fewer are known."""
+    turn = [jax.tree.map(lambda x: np.resize(x, balls), one) for one in starts]
+    return jax.tree.map(lambda *x: np.concatenate(x), *turn)
+
+
+def _anywhere(d: np.ndarray, centres: int, balls: int) -> Starts:
+    """Balls anywhere in the gap, in every ensemble the same ones."""
+    u, v = (np.tile(x.values, centres) for x in spread(balls, None))
+    begun: Any = u * d, 2 * _SPEED * v, np.zeros_like(d)
+    return Starts(*begun)
+
+
+def alike(found: Averages) -> np.ndarray:
+    """Which balls are on the kind of motion that most of them are on; those of another would bend the surface."""
+    fine = np.isin(found.status, AVERAGED) & (found.P > 0)
+    restless, periodic = fine & (found.period <= 0), fine & (found.period > 0)
+    return restless if restless.sum() >= periodic.sum() else periodic

@@ -1,0 +1,161 @@
+"""The proof of a design whose motion is no orbit: many balls flown for long at exactly its values.
+
+Where they break a limit, or end on different motions, the design moves a little and they are flown again.
+"""
+
+import dataclasses
+from collections import Counter
+
+import jax
+import numpy as np
+
+from vijax.design.aperiodic_search import Place, climbed
+from vijax.design.averages import LIMITS
+from vijax.design.ensemble import AVERAGED, Ensemble, Task, fly
+from vijax.design.optimum import AperiodicOptimum
+from vijax.design.variables import tuned, values
+from vijax.model.label import label
+
+_NEAR = 10  # a limit is told as active within so many times the room that is kept below it
+
+
+@dataclasses.dataclass
+class _Proof:
+    """What is to be proved of one device.
+
+    Attributes:
+        places: Those that may be its best, the best last.
+        room: Kept below the limits of the fitted surface, as a logarithm.
+        shift: How far beside the surface's maximum the design is.
+        flights: Flights about the last place that failed.
+        passed: What a first flight, of a tenth of the periods, did not refute; None before it.
+    """
+
+    places: list[Place]
+    room: float
+    shift: float = 0.0
+    flights: int = 0
+    passed: "_Told | None" = None
+
+
+def prove(task: Task, places: list[Place], known: np.ndarray) -> list[AperiodicOptimum | None]:
+    """Find what the best place of every device gives for certain; None where an orbit gives more, or nothing holds.
+
+    Args:
+        task: See there.
+        places: Where ensembles have climbed.
+        known: Logarithm of the best objective of an orbit of each device.
+    """
+    settings = task.settings
+    found: list[AperiodicOptimum | None] = [None] * len(task.devices)
+    proofs: dict[int, _Proof] = {}
+    for one in sorted(places, key=lambda one: one.ahead):
+        if one.ahead > known[one.owner] and one.surface.margins.min() > -settings.ensemble_radius:
+            one.radius = max(one.radius, settings.last_radius)
+            proofs.setdefault(one.owner, _Proof([], settings.limit_room)).places.append(one)
+    while proofs:
+        for long in (False, True):
+            some = {owner: proof for owner, proof in proofs.items() if (proof.passed is not None) == long}
+            for owner, told in _flown(task, some, long).items():
+                proof = some[owner]
+                if told is None or told.lacks < 0:
+                    _move(task, proof, told is None, 0.0 if told is None else told.lacks)
+                elif not long:
+                    proof.passed = told
+                else:
+                    found[owner] = told.optimum if np.log(told.optimum.height) > known[owner] else None
+                    proof.places.clear()
+        proofs = {owner: proof for owner, proof in proofs.items() if proof.places}
+    return found
+
+
+def _flown(task: Task, some: dict[int, _Proof], long: bool) -> "dict[int, _Told | None]":
+    """What flights show of the last places of some proofs, by their owners."""
+    if not some:
+        return {}
+    owner, proofs = np.array(list(some)), list(some.values())
+    places = [proof.places[-1] for proof in proofs]
+    if long:
+        passed = [proof.passed for proof in proofs if proof.passed is not None]
+        z, starts = np.array([one.z for one in passed]), [one.optimum.starts for one in passed]
+    else:
+        shift = np.array([proof.shift for proof in proofs])[:, None]
+        z = climbed(task, places, np.array([proof.room for proof in proofs])) + shift
+        z, starts = np.clip(z, task.box[owner, 0], task.box[owner, 1]), [one.starts for one in places]
+    balls, periods = task.last_flights[long]
+    flown = fly(task, owner, z, np.zeros(len(z)), starts, periods, balls)
+    return {one.owner: _told(task, one, at, whole) for one, at, whole in zip(places, z, flown, strict=True)}
+
+
+def _move(task: Task, proof: _Proof, mixed: bool, lacks: float) -> None:
+    """Where the next long flight goes: further within the limits, beside a window, or to the next best place."""
+    settings = task.settings
+    proof.flights += 1
+    proof.passed = None
+    if mixed:
+        # Beside a window chaos goes on: first above, then below, each time further.
+        proof.shift = settings.last_radius * (-1) ** proof.flights * (1 + proof.flights // 2)
+    else:
+        proof.room += settings.limit_room - lacks
+    if proof.flights == settings.max_confirmations:
+        proof.places.pop()
+        proof.room, proof.shift, proof.flights = settings.limit_room, 0.0, 0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Told:
+    """A design as a flight showed it, its variables, and what its worst ball lacks to the limits, or has left."""
+
+    optimum: AperiodicOptimum
+    z: np.ndarray
+    lacks: float
+
+
+def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble) -> _Told | None:
+    """The design that a long flight showed; None where its balls ended on different motions, or on none."""
+    found, device = ensemble.found, ensemble.device
+    names = label(found.period, found.left, found.right, found.status)
+    shares = Counter(np.where(names == "undecided", "aperiodic", names).tolist())
+    if not task.expected and (len(shares) > 1 or not np.isin(found.status, AVERAGED).all()):
+        return None
+    room = np.quantile(found.margins(device), 1 - task.reliability, axis=0, method="lower")
+    given = found.value(task.objective, device)
+    own = jax.tree.map(float, tuned(task.devices[place.owner], task.tune, z))
+    low, high = task.box[place.owner]
+    P = float(found.P.mean())
+    optimum = AperiodicOptimum(
+        values=dict(zip(task.tune, np.asarray(values(task.tune, z)).tolist(), strict=True)),
+        device=own,
+        label=shares.most_common(1)[0][0],
+        height=float(given.mean()),
+        P=P,
+        P_stderr=float(found.P.std(ddof=1) / np.sqrt(found.P.size)),
+        power=P * float(own.omega) / np.pi,
+        speed=float(found.speed.max()),
+        max_penetration=float(found.depth.max()),
+        energy_ratio=float(found.ratio.max()),
+        lyapunov=float(np.nanmean(found.lyapunov)) if np.isfinite(found.lyapunov).any() else float("nan"),
+        admissible=float((found.margins(device).min(axis=1) >= 0).mean()),
+        shares={name: count / found.P.size for name, count in shares.most_common()},
+        gradient=dict(zip(task.tune, place.surface.gradient.tolist(), strict=True)),
+        gradient_stderr=dict(zip(task.tune, place.surface.gradient_error.tolist(), strict=True)),
+        active=_active(task, z - low, high - z, room),
+        stopped="maximum" if not place.going else "ensembles",
+        ensembles=place.ensembles,
+        flown=(found.P.size, task.last_flights[1][1]),
+        starts=found.end,
+        path=np.asarray(values(task.tune, np.array([at for at, _ in place.path]))),
+        heights=np.array([height for _, height in place.path]),
+    )
+    return _Told(optimum, z, float(room.min()))
+
+
+def _active(task: Task, above: np.ndarray, below: np.ndarray, room: np.ndarray) -> tuple[str, ...]:
+    """What holds a design where it is."""
+    settings = task.settings
+    limits = zip(LIMITS, room, strict=True)
+    words = [word for word, left in limits if left < _NEAR * settings.limit_room]
+    for side, rooms in (("lower", above), ("upper", below)):
+        near = zip(task.tune, rooms, strict=True)
+        words += [f"{side} bound of {name}" for name, left in near if left < settings.active_margin]
+    return tuple(words)
