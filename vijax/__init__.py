@@ -19,8 +19,9 @@ has its Floquet `multipliers`, and `orbit_impacts`, `orbit_labels`, `orbit_power
 `follow_orbits` gives the `Branch` of each along a parameter, `follow_families` also those that begin on it,
 `branch_dataset` both as a dataset; `ContinuationSettings` decide the steps.
 
-The best device: `steady` is the steady state of an orbit, a `Steady` with derivatives; `optimise` finds the `Design`
-that harvests most; `under_tolerances` says what becomes of an `Optimum` when constants scatter as a `Tolerance` says,
+The best device: `steady` is the steady state of an orbit, a `Steady` with derivatives; `average` is that of any motion,
+chaos too, an `Average` with derivatives, their errors and their `Smoothness`; `optimise` finds the `Design` that
+harvests most; `under_tolerances` says what becomes of an `Optimum` when constants scatter as a `Tolerance` says,
 `surroundings` what lies around it (`Surroundings`), `weigh_basins` which is best if its basin counts; `DesignSettings`
 decide where ascents begin and how they climb.
 

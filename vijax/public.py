@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from vijax.batch.run_records import Trajectory
 from vijax.batch.trajectory import trajectory
+from vijax.design.average import Average, Smoothness, average
 from vijax.design.design_settings import DesignSettings
 from vijax.design.optimise import Design, optimise
 from vijax.design.optimise import under as under_tolerances
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from vijax import plots  # loaded, and matplotlib with it, by `vijax.__getattr__`
 
 __all__ = [
+    "Average",
     "Branch",
     "ContinuationSettings",
     "Design",
@@ -50,12 +52,14 @@ __all__ = [
     "ImpactPair",
     "Optimum",
     "Orbit",
+    "Smoothness",
     "State",
     "Status",
     "Steady",
     "Surroundings",
     "Tolerance",
     "Trajectory",
+    "average",
     "basin_fractions",
     "basins",
     "branch_dataset",

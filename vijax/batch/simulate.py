@@ -86,9 +86,10 @@ def entry_shapes(plan: Plan, dtype: Any) -> Entry:
     return Entry(pair, length=one, speed=one, u=one, v=one, t=one if plan.chained else None, device=device)
 
 
-def _program(plan: Plan, settings: Settings) -> lanes.Program:
+def program(plan: Plan, settings: Settings) -> lanes.Program:
+    """What lanes are told of a cell."""
     entry, method = entry_shapes(plan, settings.periods.dtype), settings.method
-    program = lanes.Program(
+    cells = lanes.Program(
         load=lambda table: load(plan, settings, rows.unpack(table, entry)),
         step=partial(advance.step, plan, settings),
         review=partial(review, plan, settings),
@@ -97,12 +98,12 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
         unload=lambda cell: rows.pack(unload(plan, settings, cell)),
     )
     if method is not None:
-        return program._replace(
+        return cells._replace(
             step=partial(solver_steps.step, method),
             review=partial(solver_steps.review_steps, method, plan, settings),
             arithmetic=method.arithmetic,
         )
-    return program._replace(
+    return cells._replace(
         service=lanes.Service(
             declined=lambda cell: cell.declined,
             hard=lambda cell: cell.hard,
@@ -115,17 +116,17 @@ def _program(plan: Plan, settings: Settings) -> lanes.Program:
 
 
 @lru_cache(maxsize=32)
-def _compiled(plan: Plan, width: int) -> export_cache.Program:
+def compiled(plan: Plan, width: int) -> export_cache.Program:
     """The program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
         outputs = rows.width(shapes(plan, cells.dtype))
-        return lanes.run(_program(plan, settings), cells, count, outputs, width)
+        return lanes.run(program(plan, settings), cells, count, outputs, width)
 
     return export_cache.Program(tile, f"{tile.__qualname__} {plan} {width}")
 
 
-def _width(cells: int, level: bool) -> int:
+def width_of(cells: int, level: bool) -> int:
     """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill.
 
     A sampled step holds some dozens of samples a lane.
@@ -233,7 +234,7 @@ def summarise(
 
 def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""], settings: Settings) -> Summary:
     """The summary of a tile, of NumPy's arrays."""
-    table = _compiled(plan, _width(cells.shape[0], plan.level))(cells, count, settings)
+    table = compiled(plan, width_of(cells.shape[0], plan.level))(cells, count, settings)
     return rows.unpack(np.asarray(table), shapes(plan, cells.dtype))
 
 
@@ -335,7 +336,7 @@ def _compiled_chains(plan: Plan) -> export_cache.Program:
         links = links.at[:, 0].set(first)
         succeed = partial(_succeed, plan, settings)
         outputs = rows.width(shapes(plan, links.dtype))
-        return lanes.chain(_program(plan, settings), succeed, links, count, length, outputs)
+        return lanes.chain(program(plan, settings), succeed, links, count, length, outputs)
 
     return export_cache.Program(follow, f"{follow.__qualname__} {plan}")
 
