@@ -38,6 +38,7 @@ import yardstick
 
 import vijax
 from vijax.batch import simulate
+from vijax.batch.simulate import Starts
 from vijax.design import survey
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair, impact_pair
@@ -156,7 +157,9 @@ def steady_states(count: int) -> None:
     kappa = np.exp(draw.uniform(np.log(5), np.log(5e3), count))
     gamma = np.where(draw.random(count) < 0.5, 0.0, draw.uniform(-1, 1, count))
     pair = impact_pair(d, kappa, draw.uniform(0.05, 0.93, count), gamma)
-    met = survey.survey(pair, 0.3 * d, np.full(count, -0.47), longest=1, periods=400).orbits(WIDTH)
+    every = jax.tree.map(lambda x: np.full(count, x), Harvester())
+    starts = Starts(jnp.asarray(0.3 * d), jnp.full(count, -0.47), jnp.zeros(count))
+    met = survey.survey(pair, every, starts, longest=1, periods=400).orbits(WIDTH)
     sequence, device = met.sequence(WIDTH), Harvester()
     said, wrong, lost, pressed, worst = 0, 0, 0, 0, 0.0
     for moved in MOVED:

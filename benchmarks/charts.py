@@ -1,4 +1,4 @@
-"""Charts that benchmarks draw: work against precision, limits of stability."""
+"""Charts that benchmarks draw: work against precision, limits of stability, derivatives of averages."""
 
 import itertools
 import math
@@ -190,3 +190,106 @@ def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
             "path_effects": [Stroke(linewidth=2, foreground="white"), Normal()],
         }
         axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, **style)
+
+
+_DERIVATIVES = {
+    "automatic differentiation": ("#d62728", "x", "--"),
+    "ensemble": ("#1f77b4", "o", "-"),
+    "implicit rule of the orbit": ("#2ca02c", "", ":"),
+}
+_WIDTHS = 0.8, 1.4, 2.2
+_VERDICTS = {"smooth": "#1f77b4", "window": "#ff7f0e", "attractors": "#9467bd", "kink": "#d62728", "failed": "black"}
+_BEST, _WORST = 1e-5, 1e7  # errors of derivatives: better ones are drawn at the edge, worse ones not
+
+
+def averages(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
+    """Four panels: errors by method and length, cells against larger fits, the edge of chaos, what errors miss.
+
+    Args:
+        rows: Those of `averages.Row`.
+        path: Picture to write.
+
+    Raises:
+        ValueError: A format that is none.
+    """
+    if path is not None:
+        check_format(path)
+    parts: dict[str, list[Any]] = {part: [] for part in _PANELS}
+    for row in rows:
+        parts[row.part].append(row)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.2, 6.4), layout="constrained")
+        for axes, (part, draw) in zip(figure.subplots(2, 2).flat, _PANELS.items(), strict=True):
+            axes.grid(color="0.9", linewidth=0.4)
+            axes.set_axisbelow(True)
+            if parts[part]:
+                draw(axes, parts[part])
+        if path is not None:
+            save_figure(figure, path)
+    return figure
+
+
+def _by_length(axes: Axes, rows: list[Any]) -> None:
+    axes.set(xscale="log", yscale="log", ylim=(_BEST, _WORST), xlabel="forcing periods flown")
+    axes.set(title="which method fails where", ylabel=r"error of $d\ln P/d\ln\kappa$")
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    for method, (colour, marker, style) in _DERIVATIVES.items():
+        for scene, width in zip(scenes, _WIDTHS, strict=False):
+            some = [row for row in rows if (row.method, row.scene) == (method, scene)]
+            off = np.maximum([abs(row.value - row.reference) for row in some], _BEST)
+            where = [row.at for row in some]
+            if len(some) == 1:  # the orbit's rule flies no periods
+                axes.axhline(off[0], color=colour, linestyle=style, label=method)
+            elif some:
+                line: dict[str, Any] = {"linewidth": width, "markersize": 3, "linestyle": style}
+                axes.plot(where, off, color=colour, marker=marker, label=f"{method}, {scene}", **line)
+    axes.legend(fontsize=6, loc="upper right")
+
+
+def _against_fits(axes: Axes, rows: list[Any]) -> None:
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="both standard errors, of the derivative",
+        ylabel="difference, of the derivative",
+    )
+    axes.set(title="chaotic cells against ten times as many balls")
+    for verdict, colour in _VERDICTS.items():
+        some = [row for row in rows if row.verdict == verdict]
+        error = [np.hypot(row.stderr, row.reference_stderr) / abs(row.reference) for row in some]
+        off = [max(abs(row.value / row.reference - 1), _BEST) for row in some]
+        if some:
+            axes.plot(error, off, ".", color=colour, markersize=3, label=verdict)
+    edge = np.array(axes.get_xlim())
+    axes.plot(edge, 2 * edge, color="0.5", linewidth=0.8, label="2 standard errors")
+    axes.set_xlim(*edge)
+    axes.legend(fontsize=7, loc="upper left")
+
+
+def _edge_of_chaos(axes: Axes, rows: list[Any]) -> None:
+    axes.set(title="the edge of chaos", xlabel=r"$\kappa$", ylabel=r"$d\ln P/d\ln\kappa$")
+    some = [row for row in rows if row.quantity == "kappa"]
+    axes.plot([row.at for row in some], [row.reference for row in some], color="0.6", label="differences of neighbours")
+    for verdict, colour in _VERDICTS.items():
+        own = [row for row in some if row.verdict == verdict]
+        if own:
+            where, value, error = ([getattr(row, name) for row in own] for name in ("at", "value", "stderr"))
+            axes.errorbar(where, value, error, fmt="o", color=colour, markersize=3, linewidth=0.8, label=verdict)
+    axes.legend(fontsize=7)
+
+
+def _missed_attractor(axes: Axes, rows: list[Any]) -> None:
+    axes.set(xscale="log", yscale="log", ylim=(1e-10, 1), xlabel="balls", ylabel="of P")
+    axes.set(title="0.5 % of the starts end on another attractor")
+    balls = [row.at for row in rows]
+    axes.plot(
+        balls, [abs(row.value / row.reference - 1) for row in rows], "o-", color="#d62728", label="error", markersize=3
+    )
+    axes.plot(balls, [row.stderr / row.value for row in rows], "o-", color="0.4", label="standard error", markersize=3)
+    for row in rows:
+        said: dict[str, Any] = {"fontsize": 6, "rotation": 90, "ha": "center", "va": "bottom", "in_layout": False}
+        axes.text(row.at, 0.013, row.verdict, color=_VERDICTS[row.verdict], **said)
+    axes.legend(fontsize=7, loc="lower left")
+
+
+_PANELS = {"growth": _by_length, "cells": _against_fits, "edge": _edge_of_chaos, "missed": _missed_attractor}

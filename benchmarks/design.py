@@ -1,4 +1,4 @@
-"""Are designs the best there are? Against a dense scan, exact gradients, the clock, and cliffs.
+"""Are designs on orbits the best there are? Against a dense scan, exact gradients, the clock, and cliffs.
 
     python benchmarks/design.py                # all figures
     python benchmarks/design.py --only scan    # one part
@@ -57,6 +57,7 @@ import mpmath as mp
 import numpy as np
 
 import vijax
+from vijax.batch.simulate import Starts
 from vijax.design import optimise
 from vijax.design.optimise import Design
 from vijax.design.optimum import Optimum
@@ -115,8 +116,9 @@ def random_cells() -> Orbit:
     tilt = np.where(np.arange(DRAWN) % 2 == 0, 0.0, draw.uniform(-0.05, 0.05, shape))
     kappa = np.exp(draw.uniform(math.log(3), math.log(400), shape))
     columns = draw.uniform(0.05, 0.3, shape), kappa, draw.uniform(0.2, 0.9, shape), tilt
-    rest, speed = np.zeros(shape), np.full(shape, 0.25)
-    flown = survey(ImpactPair(*map(jnp.asarray, columns)), rest, speed, longest=4, periods=400).orbits(8)
+    device = jax.tree.map(lambda x: np.full(shape, x), Harvester())
+    starts = Starts(jnp.zeros(shape), jnp.full(shape, 0.25), jnp.zeros(shape))
+    flown = survey(ImpactPair(*map(jnp.asarray, columns)), device, starts, longest=4, periods=400).orbits(8)
     found = periodic.solve(jax.tree.map(jnp.asarray, flown.pair), flown.sequence(8), jnp.asarray(flown.knots))
     return found[np.asarray(found.status) == Status.OK]
 
@@ -236,15 +238,15 @@ def rise_mp(d: float, near: tuple[float, float, float], kappa: Any) -> Any:
 
 def reference() -> None:
     """The small fast device, for P and for speed."""
-    settings: dict[str, Any] = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
-    best = optimise.optimise(small_and_fast(), **settings).optima[0]
+    settings: dict[str, Any] = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}, "motion": "periodic"}
+    best = optimise.optimise(small_and_fast(), **settings).orbits[0]
     say("reference: small fast device, kappa (4.00713)", f"{best.values['kappa']:.5f}")
     say("reference: P, microjoule (57.75761)", f"{1e6 * best.height:.5f}")
     say("reference: penetration, mm (6.026)", f"{1e3 * best.state.depth.max():.4f}")
     say("reference: largest multiplier (0.533)", f"{best.state.multiplier:.4f}")
     for d, kappa, speed in ((0.2, "4.0182", "-"), (0.16, "3.7820", "0.92524")):
         device = small_and_fast(d)
-        best = optimise.optimise(device, objective="speed", **settings).optima[0]
+        best = optimise.optimise(device, objective="speed", **settings).orbits[0]
         say(f"reference: speed, d {d}: kappa ({kappa})", f"{best.values['kappa']:.6f}")
         say(
             f"reference: speed, d {d}: in units of A pi/omega ({speed})",
@@ -337,19 +339,21 @@ def cases(draw: np.random.Generator, within: dict, count: int, points: int, free
             continue
         devices.append(device)
         bests.append(best)
-    designs = optimise.optimise_all(devices, tune=("kappa",), bounds={"kappa": KAPPA}) if devices else []
+    designs = (
+        optimise.optimise_all(devices, tune=("kappa",), bounds={"kappa": KAPPA}, motion="periodic") if devices else []
+    )
     return [Case(*case) for case in zip(devices, bests, designs, strict=True)], left_out
 
 
 def interior(case: Case) -> bool:
     """Whether nothing but the objective holds the optimum where it is."""
-    best = case.found.best
+    best = next(iter(case.found.orbits), None)
     return best is not None and not best.active and best.stopped == "maximum"
 
 
 def ratio(case: Case) -> float:
     """Of the optimum to the scan's best."""
-    return 0.0 if case.found.best is None else case.found.best.height / case.best.P
+    return 0.0 if not case.found.orbits else case.found.orbits[0].height / case.best.P
 
 
 def excess(optimum: Optimum) -> float:
@@ -377,7 +381,7 @@ def scan(devices: int, points: int) -> None:
 def report(every: list[Case]) -> None:
     """What came of the designs, and every miss."""
     ratios = np.array([ratio(case) for case in every])
-    bests = [case.found.best for case in every if case.found.best is not None]
+    bests = [case.found.orbits[0] for case in every if case.found.orbits]
     kinds = Counter("interior" if not one.active else one.active[0].split(" at")[0] for one in bests)
     say(
         "scan: best points of the scans clear of constraints",
@@ -421,10 +425,10 @@ def speed(designs: int) -> None:
     seconds = []
     for _ in range(2):
         begun = time.perf_counter()
-        found = optimise.optimise_all(devices)
+        found = optimise.optimise_all(devices, motion="periodic")
         seconds.append(time.perf_counter() - begun)
     starts = sum(one.starts for one in found)
-    looks = [optimum.looks for one in found for optimum in one.optima]
+    looks = [optimum.looks for one in found for optimum in one.orbits]
     say("speed: parameters; starts", f"{len(devices)}; {starts}")
     say("speed: seconds, first (with compilation or its cache); again", f"{seconds[0]:.1f}; {seconds[1]:.1f}")
     say(
@@ -469,9 +473,9 @@ BESIDE = 0.02  # relative, of kappa's bounds about it
 def cliffs() -> None:
     """Designs in small ranges about the fold at kappa 3.69 and about grazing."""
     for low, high in FOLDS:
-        found = optimise.optimise(small_and_fast(), tune=("kappa",), bounds={"kappa": (low, high)})
+        found = optimise.optimise(small_and_fast(), tune=("kappa",), bounds={"kappa": (low, high)}, motion="periodic")
         told(f"cliffs: small fast device, kappa {low} to {high}", [found])
-        for one in found.optima:
+        for one in found.orbits:
             print(
                 f"    {one.values['kappa']:.6f} {1e6 * one.height:.5f} {one.label} {one.stopped} {one.active}",
                 flush=True,
@@ -482,13 +486,13 @@ def cliffs() -> None:
     designs = []
     for i in np.flatnonzero((clear < GRAZES) & (gamma == 0)):
         bounds = {"kappa": (kappa[i] * (1 - BESIDE), kappa[i] * (1 + BESIDE))}
-        designs.append(optimise.optimise(Harvester(s=d[i], r=r[i]), tune=("kappa",), bounds=bounds))
+        designs.append(optimise.optimise(Harvester(s=d[i], r=r[i]), tune=("kappa",), bounds=bounds, motion="periodic"))
     told(f"cliffs: beside {len(designs)} orbits that nearly graze", designs)
 
 
 def told(what: str, designs: list[Design]) -> None:
     """How many optima are reported, and how many of them should not be."""
-    every = [one for found in designs for one in found.optima]
+    every = [one for found in designs for one in found.orbits]
     numbers = [np.array([*one.values.values(), one.height, *one.gradient.values(), *one.heights]) for one in every]
     nans = sum(not np.isfinite(x).all() for x in numbers)
     lost = sum(int(one.orbit.status[0]) != Status.OK or not one.state.multiplier < 1 for one in every)

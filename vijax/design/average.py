@@ -24,6 +24,7 @@ from vijax.model.energy import capacitance
 from vijax.model.pair import ImpactPair
 from vijax.planes.basins import SPEED
 from vijax.runtime import checks, tiles
+from vijax.runtime.arrays import present
 from vijax.runtime.context import door
 
 _LEAST_BALLS = 32
@@ -230,7 +231,7 @@ def _fly(at: _Inputs, design: _Design, periods: int, width: float) -> _Flown:
 def _spread(at: _Inputs, width: Float[Array, ""], offsets: Float[Array, "ball 4"]):
     """Offsets and pairs of the balls; units of length, electrical constants and the steps between them [variant]."""
     pair, moved = at.pair, width * offsets
-    d, kappa = pair.d * jnp.exp(moved[:, 0]), pair.kappa * jnp.exp(moved[:, 1])
+    d, kappa = pair.d * jnp.exp(moved[:, 0]), present(pair.kappa) * jnp.exp(moved[:, 1])
     r = jnp.minimum(pair.r * jnp.exp(moved[:, 2]), 1.0)
     gamma = pair.gamma + jnp.where(pair.gamma == 0, 0.0, moved[:, 3])
     x = jnp.stack([moved[:, 0], moved[:, 1], jnp.log(r / pair.r), gamma - pair.gamma], axis=1) / width
@@ -254,10 +255,11 @@ def _electrical_and_mass(device: Harvester) -> list[Any]:
 @jax.jit
 def _gathered(width, x, ended: Summary, steps, count) -> _Flown:
     there = jnp.arange(x.shape[0], dtype=count.dtype) < count
-    real = there & jnp.isfinite(ended.P[:, 0])
+    found, errors = present(ended.P), present(ended.P_stderr)
+    real = there & jnp.isfinite(found[:, 0])
     # A ball without an average weighs nothing, and so does the other of its pair.
     real = jnp.repeat(real.reshape(-1, 2).all(axis=1), 2)
-    P, P_stderr = (jnp.where(real[:, None], y, 0.0) for y in (ended.P, ended.P_stderr))
+    P, P_stderr = (jnp.where(real[:, None], y, 0.0) for y in (found, errors))
     fixed = (P[:, 1:] - P[:, :1]) / steps
     return _Flown(width, x, real, (there & ~real).any(), P[:, 0], P_stderr[:, 0], fixed, real & (ended.period > 0))
 
@@ -312,7 +314,7 @@ def _concluded(device: Harvester, at: _Inputs, flown: _Flown, second: bool) -> A
 
     def slopes(coefficients: Float[Array, "term column"]) -> _Inputs:
         """Derivatives of P from coefficients of the fit."""
-        pair = coefficients[1:5, 0] / flown.width / jnp.stack([at.pair.d, at.pair.kappa, at.pair.r, 1.0])
+        pair = coefficients[1:5, 0] / flown.width / jnp.stack([at.pair.d, present(at.pair.kappa), at.pair.r, 1.0])
         blank = jax.tree.map(jnp.zeros_like, at.device)
         constants = [coefficients[0, 2 + i] for i in range(len(_ELECTRICAL))]
         electric = eqx.tree_at(_electrical_and_mass, blank, [*constants, blank.m_b])

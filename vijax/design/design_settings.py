@@ -87,13 +87,16 @@ class DesignSettings:
         places_apart: They are so many radii of the first ensemble apart, 2.
         limit_price: A place beyond a limit is worth less by this power of what it exceeds the limit by, 2.5. An energy
             grows about so with the depth.
-        ensemble_balls, ensemble_periods: Balls about a place, and the forcing periods that each is flown, 64 and 400;
-            the first quarter is left out. Noise falls with the square root of both.
+        ensemble_balls: Balls of an ensemble about a place, 64. Noise falls with their square root.
+        ensemble_periods: Forcing periods that each is flown, 400, of which the first quarter is left out. With fewer,
+            the largest depths are not met.
         ensemble_radius: How far the first balls are spread about a place, 0.02; a step leads as far.
         last_radius: How far the last ones are, 0.002. A wider one averages over more than the design.
         max_ensembles: Ensembles about a place, at most, 10.
         least_gain: A place has arrived where a step promises less, as a logarithm, or less than the noise, 2e-4.
-        confirm_balls, confirm_periods: The long flight at the end, 64 balls for 5,000 periods.
+        confirm_balls: Balls of the long flight at the end, 64.
+        confirm_periods: Forcing periods that each of them is flown, 5,000. Together they meet what happens once in
+            320,000.
         expected_balls: Balls of an ensemble for the objective "expected", which starts and tolerances scatter, 1024;
             four times as many are flown at the end, for `ensemble_periods`.
         limit_room: How far below a limit the fitted extremes are kept, as a logarithm, 2e-4.

@@ -22,6 +22,8 @@ _RUNGS = 13  # values on either side, from a thousandth of that on, evenly space
 _PERIODS = 400  # forcing periods that a ball is given to show what becomes of it
 _ARRIVING = 256, 2000  # balls that start anywhere, and the periods in which they may arrive
 _DEVICES = 256  # random devices that tolerances make
+# The logarithm of P changes by at most so many times the quantity's part, and by this; more is a jump.
+_STEEPEST, _LEAST_JUMP = 10.0, 0.02
 _SAME = 1e-6  # relative difference of P within which a motion is the design's own orbit
 
 
@@ -80,7 +82,7 @@ def extents(optimum: Optimum | AperiodicOptimum) -> tuple[Extent, ...]:
     rungs = np.geomspace(1e-3 * _FARTHEST, _FARTHEST, _RUNGS)
     ways = [(index, sign) for index in range(len(names)) for sign in (-1, 1)]
     found = _flown_off(optimum, names, ways, np.tile(rungs, (len(ways), 1)))
-    last = [_lasts(optimum, one) for one in found]
+    last = [_lasts(optimum, one, np.append(0.0, rungs), optimum.P) for one in found]
     # Once more between the last value that is fine and the first that is not.
     edges = np.concatenate([[0.0], rungs, [_FARTHEST]])
     finer = np.array([np.linspace(edges[k], edges[k + 1], _RUNGS + 2)[1:-1] for k in last])
@@ -90,7 +92,8 @@ def extents(optimum: Optimum | AperiodicOptimum) -> tuple[Extent, ...]:
         if k == _RUNGS:
             sides.append(_side(one, _RUNGS - 1, _FARTHEST, True))
             continue
-        j = _lasts(optimum, near)
+        before = optimum.P if k == 0 else float(one[0].P[k - 1])
+        j = _lasts(optimum, near, np.append(edges[k], some), before)
         far = edges[k] if j == 0 else some[j - 1]
         sides.append(_side(one, k, far, False) if j == _RUNGS else _side(near, j, far, False))
     return tuple(Extent(name, *sides[2 * i : 2 * i + 2]) for i, name in enumerate(names))
@@ -175,9 +178,22 @@ def _own(optimum: Optimum | AperiodicOptimum, found: Averages) -> np.ndarray:
     return (names == optimum.label) | (turned == optimum.label)
 
 
-def _lasts(optimum: Optimum | AperiodicOptimum, one: tuple[Averages, np.ndarray]) -> int:
-    """How many values in a row still have the motion."""
-    own = _own(optimum, one[0])
+def _lasts(
+    optimum: Optimum | AperiodicOptimum, one: tuple[Averages, np.ndarray], off: np.ndarray, before: float
+) -> int:
+    """How many values in a row still have the motion.
+
+    Beyond a fold another orbit may have the label; its P is another one.
+
+    Args:
+        optimum: The design.
+        one: What balls did.
+        off: How far off the value before the first is, and each of theirs.
+        before: P at the value before the first.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jump = np.abs(np.diff(np.log(np.append(before, one[0].P))))
+    own = _own(optimum, one[0]) & (jump < _STEEPEST * np.diff(off) + _LEAST_JUMP)
     return int(np.argmin(own)) if not own.all() else own.size
 
 

@@ -69,6 +69,11 @@ class Design:
         """The highest optimum."""
         return self.optima[0] if self.optima else None
 
+    @property
+    def orbits(self) -> tuple[Optimum, ...]:
+        """Those whose motion is an orbit that was climbed, the best first."""
+        return tuple(one for one in self.optima if isinstance(one, Optimum))
+
 
 @door
 def optimise(

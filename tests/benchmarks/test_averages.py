@@ -1,0 +1,42 @@
+"""What `benchmarks/averages.py` keeps and says of its rows."""
+
+import averages
+import charts
+import numpy as np
+import pytest
+
+ROWS = [
+    averages.Row("cells", "0", "ensemble", "kappa", 4096, -2.01, 0.02, -2.0, 0.01, "smooth"),
+    averages.Row("cells", "1", "ensemble", "kappa", 4096, -2.10, 0.02, -2.0, 0.01, "window"),
+    averages.Row("growth", "orbit", "automatic differentiation", "kappa", 1, -2.5, 0.0, -2.0, 0.0, ""),
+    averages.Row("growth", "orbit", "automatic differentiation", "kappa", 2, -2.25, 0.0, -2.0, 0.0, ""),
+    averages.Row("growth", "orbit", "ensemble", "kappa", 16, -2.1, 0.1, -2.0, 0.0, "smooth"),
+    averages.Row("edge", "chaos to orbits", "ensemble", "kappa", 27.0, -2.6, 0.1, -2.5, 0.0, "smooth"),
+    averages.Row("missed", "99.5 % of the starts", "ensemble", "P", 32, 1.01, 1e-6, 1.0, 0.0, "smooth"),
+]
+
+
+def test_rows_are_read_as_they_were_written(tmp_path):
+    averages.write(tmp_path / "averages.csv", ROWS)
+    assert averages.read(tmp_path / "averages.csv") == ROWS
+    assert averages.read(tmp_path / "none.csv") == []
+
+
+def test_cells_are_counted_with_both_errors_and_by_verdict(capsys):
+    averages.printed(ROWS)
+    said = dict(line.rsplit("  ", 1) for line in capsys.readouterr().out.splitlines())
+    said = {what.strip(): value.strip() for what, value in said.items()}
+    assert said["dP/dkappa, 1 chaotic cells, smooth: within 2 standard errors"] == "100.0%"
+    assert said["dP/dkappa, 2 chaotic cells, all: within 2 standard errors"] == "50.0%"
+    assert said["dP/dkappa, 2 chaotic cells, all: relative error above 1 % in"] == "50.0%"
+
+
+def test_every_part_has_its_panel(tmp_path):
+    figure = charts.averages(ROWS, tmp_path / "chart.png")
+    growth, cells, edge, missed = figure.axes
+    np.testing.assert_allclose(growth.lines[0].get_xydata(), [[1, 0.5], [2, 0.25]])
+    np.testing.assert_allclose(cells.lines[0].get_xydata(), [[np.hypot(0.02, 0.01) / 2, 0.005]])
+    np.testing.assert_allclose(edge.lines[0].get_xydata(), [[27.0, -2.5]])
+    np.testing.assert_allclose(missed.lines[0].get_xydata(), [[32, 0.01]])
+    with pytest.raises(ValueError, match="txt"):
+        charts.averages(ROWS, tmp_path / "chart.txt")
