@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import reference_rows
+from yardstick import reference_rows
 
 from vijax.batch import lanes, perturbed, rows, simulate, summary
 from vijax.design.average import Smoothness, average
@@ -44,7 +44,7 @@ def surface(monkeypatch, change=lambda pair: jnp.ones_like(pair.d), period=lambd
         every = period(pair).astype(jnp.int32)
         return Ended(P, noise * P, every)
 
-    monkeypatch.setattr(ensemble, "averages", flown)
+    monkeypatch.setattr(perturbed, "averages", flown)
 
 
 def test_an_orbit_has_the_derivative_of_50_digits():

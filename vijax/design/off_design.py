@@ -1,5 +1,6 @@
 """What a design does when it is a little off: how far its motion lasts, what comes after it, how balls arrive at it."""
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -18,7 +19,8 @@ from vijax.runtime import checks
 from vijax.runtime.context import door
 
 _FARTHEST = 0.1  # a quantity is looked at as far as this part of it; an inclination as far as this angle [rad]
-_RUNGS = 13  # values on either side, from a thousandth of that on, evenly spaced as logarithms
+_FINEST = 1e-4 * _FARTHEST  # the first step, and how closely an end is found that is nearer than a hundredth
+_LONGER = 2.0  # a step that was fine is followed by one so much longer
 _PERIODS = 400  # forcing periods that a ball is given to show what becomes of it
 _ARRIVING = 256, 2000  # balls that start anywhere, and the periods in which they may arrive
 _DEVICES = 256  # random devices that tolerances make
@@ -41,6 +43,9 @@ class Side(NamedTuple):
     label: str
     P: float
     admissible: bool
+
+
+_NOWHERE = Side(0.0, False, "", 0.0, False)
 
 
 class Extent(NamedTuple):
@@ -75,28 +80,64 @@ class Arrival(NamedTuple):
 def extents(optimum: Optimum | AperiodicOptimum) -> tuple[Extent, ...]:
     """Find how far off each tuned quantity may be before the motion of a design is another one, and which then.
 
-    A ball on the motion is put into devices that are more and more off, all else as it is.
+    A ball on the motion follows it through devices that are more and more off, all else as it is.
     """
     checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     names = tuple(optimum.values)
-    rungs = np.geomspace(1e-3 * _FARTHEST, _FARTHEST, _RUNGS)
-    ways = [(index, sign) for index in range(len(names)) for sign in (-1, 1)]
-    found = _flown_off(optimum, names, ways, np.tile(rungs, (len(ways), 1)))
-    last = [_lasts(optimum, one, np.append(0.0, rungs), optimum.P) for one in found]
-    # Once more between the last value that is fine and the first that is not.
-    edges = np.concatenate([[0.0], rungs, [_FARTHEST]])
-    finer = np.array([np.linspace(edges[k], edges[k + 1], _RUNGS + 2)[1:-1] for k in last])
-    closer = _flown_off(optimum, names, ways, finer)
-    sides = []
-    for one, near, k, some in zip(found, closer, last, finer, strict=True):
-        if k == _RUNGS:
-            sides.append(_side(one, _RUNGS - 1, _FARTHEST, True))
-            continue
-        before = optimum.P if k == 0 else float(one[0].P[k - 1])
-        j = _lasts(optimum, near, np.append(edges[k], some), before)
-        far = edges[k] if j == 0 else some[j - 1]
-        sides.append(_side(one, k, far, False) if j == _RUNGS else _side(near, j, far, False))
+    ways = [_Way(index, sign, _start(optimum), optimum.P) for index in range(len(names)) for sign in (-1, 1)]
+    while going := [way for way in ways if way.going]:
+        _go_on(optimum, names, going)
+    sides = [way.side for way in ways]
     return tuple(Extent(name, *sides[2 * i : 2 * i + 2]) for i, name in enumerate(names))
+
+
+@dataclasses.dataclass
+class _Way:
+    """A ball that follows the motion of a design to one side.
+
+    Attributes:
+        index, sign: Which tuned quantity, and whether it falls or rises.
+        starts: Where the ball is.
+        P: What it gives there [J].
+        off: How far it has come, in parts of the quantity.
+        step: How much further it goes.
+        side: What is there, or just beyond.
+    """
+
+    index: int
+    sign: int
+    starts: Starts
+    P: float
+    off: float = 0.0
+    step: float = _FINEST
+    side: Side = _NOWHERE
+
+    @property
+    def going(self) -> bool:
+        """Whether its end is not known yet to a thousandth of it."""
+        return self.off < _FARTHEST and self.step > max(0.1 * _FINEST, 1e-3 * self.off)
+
+
+def _go_on(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...], going: list[_Way]) -> None:
+    """Take every ball a step further; a shorter one next time where its motion was not there any more."""
+    z = np.repeat(_z(optimum, names)[None], len(going), axis=0)
+    ahead = [min(way.off + way.step, _FARTHEST) for way in going]
+    for row, (way, off) in enumerate(zip(going, ahead, strict=True)):
+        z[row, way.index] += way.sign * off if names[way.index] in LINEAR else np.log1p(way.sign * off)
+    none = np.zeros(len(going))
+    flown = fly(_task(optimum, "P"), none.astype(int), z, none, [way.starts for way in going], _PERIODS, 1)
+    for way, off, one in zip(going, ahead, flown, strict=True):
+        P, kept = float(one.found.P[0]), bool(one.found.margins(one.device).min() >= 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Beyond a fold another orbit may have the label; its P is another one.
+            smooth = abs(np.log(P / way.P)) < _STEEPEST * (off - way.off) + _LEAST_JUMP
+        name = str(label(one.found.period, one.found.left, one.found.right, one.found.status)[0])
+        if bool(_own(optimum, one.found)[0]) and smooth:
+            way.off, way.P, way.starts, way.step = off, P, one.found.end, _LONGER * way.step
+            way.side = Side(100 * off, off >= _FARTHEST, name, P, kept)
+        else:
+            way.step = 0.25 * way.step
+            way.side = Side(100 * way.off, False, name, P, kept)
 
 
 @door
@@ -142,22 +183,6 @@ def _z(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...]) -> np.ndarra
     return variables(names, [optimum.values[name] for name in names])
 
 
-def _flown_off(
-    optimum: Optimum | AperiodicOptimum, names: tuple[str, ...], ways: list[tuple[int, int]], off: np.ndarray
-) -> list[tuple[Averages, np.ndarray]]:
-    """What balls of the motion do at values [way, rung] that are off, and whether each keeps the limits."""
-    z = np.repeat(_z(optimum, names)[None], off.size, axis=0)
-    for way, (index, sign) in enumerate(ways):
-        some = slice(way * off.shape[1], (way + 1) * off.shape[1])
-        z[some, index] += sign * off[way] if names[index] in LINEAR else np.log1p(sign * off[way])
-    count, start = off.size, _start(optimum)
-    flown = fly(_task(optimum, "P"), np.zeros(count, int), z, np.zeros(count), [start] * count, _PERIODS, 1)
-    found = jax.tree.map(lambda *x: np.concatenate(x), *(one.found for one in flown))
-    good = np.array([x.found.margins(x.device).min() >= 0 for x in flown])
-    parts = [np.arange(way * off.shape[1], (way + 1) * off.shape[1]) for way in range(len(ways))]
-    return [(found.some(part), good[part]) for part in parts]
-
-
 def _start(optimum: Optimum | AperiodicOptimum) -> Starts:
     """A ball on the motion: at an impact of an orbit; where the long flight left one."""
     if isinstance(optimum, AperiodicOptimum):
@@ -176,28 +201,3 @@ def _own(optimum: Optimum | AperiodicOptimum, found: Averages) -> np.ndarray:
     turned = label(found.period, found.right, found.left, found.status)
     names = np.where(names == "undecided", "aperiodic", names)
     return (names == optimum.label) | (turned == optimum.label)
-
-
-def _lasts(
-    optimum: Optimum | AperiodicOptimum, one: tuple[Averages, np.ndarray], off: np.ndarray, before: float
-) -> int:
-    """How many values in a row still have the motion.
-
-    Beyond a fold another orbit may have the label; its P is another one.
-
-    Args:
-        optimum: The design.
-        one: What balls did.
-        off: How far off the value before the first is, and each of theirs.
-        before: P at the value before the first.
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        jump = np.abs(np.diff(np.log(np.append(before, one[0].P))))
-    own = _own(optimum, one[0]) & (jump < _STEEPEST * np.diff(off) + _LEAST_JUMP)
-    return int(np.argmin(own)) if not own.all() else own.size
-
-
-def _side(one: tuple[Averages, np.ndarray], index: int, far: float, lasts: bool) -> Side:
-    found, good = one
-    names = label(found.period, found.left, found.right, found.status)
-    return Side(100 * far, lasts, str(names[index]), float(found.P[index]), bool(good[index]))
