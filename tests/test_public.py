@@ -29,6 +29,7 @@ CHOICES = {
     "direction": {continuation.Direction, choices.Direction},
     "dtype": {choices.Precision},
     "method": {choices.MethodName},
+    "motion": {choices.Motion},
     "objective": {objective.Objective},
     "solver": {choices.SolverName},
     "until": {choices.Until},

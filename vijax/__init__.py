@@ -21,9 +21,10 @@ has its Floquet `multipliers`, and `orbit_impacts`, `orbit_labels`, `orbit_power
 
 The best device: `steady` is the steady state of an orbit, a `Steady` with derivatives; `average` is that of any motion,
 chaos too, an `Average` with derivatives, their errors and their `Smoothness`; `optimise` finds the `Design` that
-harvests most; `under_tolerances` says what becomes of an `Optimum` when constants scatter as a `Tolerance` says,
-`surroundings` what lies around it (`Surroundings`), `weigh_basins` which is best if its basin counts; `DesignSettings`
-decide where ascents begin and how they climb.
+harvests most, an `Optimum` on an orbit or an `AperiodicOptimum` in chaos; `under_tolerances` says what becomes of it
+when constants scatter as a `Tolerance` says, `surroundings` what lies around it (`Surroundings`), `design_extents` how
+far off it may be, `design_arrival` how balls arrive at it, `weigh_basins` which is best if its basin counts;
+`DesignSettings` decide where ascents begin and how they climb.
 
 Pictures: `plots`, which is loaded, and matplotlib with it, when it is first asked for.
 """

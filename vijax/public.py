@@ -6,9 +6,11 @@ from vijax.batch.run_records import Trajectory
 from vijax.batch.trajectory import trajectory
 from vijax.design.average import Average, Smoothness, average
 from vijax.design.design_settings import DesignSettings
+from vijax.design.off_design import arrival as design_arrival
+from vijax.design.off_design import extents as design_extents
 from vijax.design.optimise import Design, optimise
 from vijax.design.optimise import under as under_tolerances
-from vijax.design.optimum import Optimum
+from vijax.design.optimum import AperiodicOptimum, Optimum
 from vijax.design.robustness import Surroundings, surroundings
 from vijax.design.robustness import weighted as weigh_basins
 from vijax.design.tolerance import Tolerance
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from vijax import plots  # loaded, and matplotlib with it, by `vijax.__getattr__`
 
 __all__ = [
+    "AperiodicOptimum",
     "Average",
     "Branch",
     "ContinuationSettings",
@@ -65,6 +68,8 @@ __all__ = [
     "branch_dataset",
     "cheapest_model",
     "compare",
+    "design_arrival",
+    "design_extents",
     "find_orbits",
     "follow_families",
     "follow_orbits",

@@ -5,6 +5,7 @@ What is fitted to them, and what is made of it, is elsewhere (`response_surface`
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -125,8 +126,7 @@ def fly(
 
 
 def _changed(device: Harvester, constants: dict[str, np.ndarray]) -> Harvester:
-    import equinox as eqx
-
+    """Put arrays in the place of some constants; not by `replace`, which would check every one of them."""
     return eqx.tree_at(lambda one: [getattr(one, name) for name in constants], device, list(constants.values()))
 
 
