@@ -72,7 +72,9 @@ def a_design() -> optimise.Design:
 def an_optimum() -> optimum.Optimum:
     """An optimum of which no more than the orbit is known."""
     path = np.zeros((1, 1))
-    return optimum.Optimum({}, vijax.Harvester(), an_orbit(), "1:1", 0.0, None, {}, (), "maximum", 0, path, path[0])
+    told: dict[str, Any] = {"values": {}, "gradient": {}, "active": (), "path": path, "heights": path[0]}
+    told |= {"device": vijax.Harvester(), "label": "1:1", "height": 0.0, "P": 0.0, "P_stderr": 0.0}
+    return optimum.Optimum(**told, stopped="maximum", orbit=an_orbit(), state=None, looks=0)
 
 
 def a_map() -> xr.Dataset:

@@ -265,7 +265,7 @@ def completed(monkeypatch, capsys):
         ("vijax compare --compar", []),
         ("vijax orbit-diagram --direction d", ["down"]),
         ("vijax branch --quantity m", ["multiplier"]),
-        ("vijax design --objective ", ["P", "power", "speed", "mean", "worst"]),
+        ("vijax design --objective ", ["P", "power", "speed", "mean", "worst", "expected"]),
         ("vijax sweep --show l", ["lyapunov", "label"]),
         ("vijax sweep --outputs P,peri", ["P,period", "P,periods_run"]),
     ],

@@ -465,9 +465,9 @@ MIXED = {"d": np.linspace(0.02, 0.6, 12), "kappa": np.geomspace(2, 3000, 41)[[2,
 def optimised(monkeypatch):
     """Programs compiled as users have them: without optimisation no multiplication is fused with an addition."""
     monkeypatch.setenv("XLA_FLAGS", "")
-    simulate._compiled.cache_clear()
+    simulate.compiled.cache_clear()
     yield
-    simulate._compiled.cache_clear()
+    simulate.compiled.cache_clear()
 
 
 def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):

@@ -38,6 +38,7 @@ def report(**changed):
     edges = {"below": {"kind": "fold", "omega0": 45.0}, "above": {"kind": "none", "omega0": 75.0}}
     highest = {"along": "omega0", "value": 35.0, "P": 9e-6, "admissible": False, "max_penetration": 0.02}
     whole = {"best": best, "tune": ["omega0"], "objective": "P", "surroundings": edges, "highest": highest}
+    whole["extents"] = []
     return whole | {"tolerances": [{"name": "omega0", "spread": 0.05, "kind": "uniform"}], "spread": None} | changed
 
 
@@ -65,6 +66,20 @@ def test_the_optimum_its_band_its_edge_and_the_ascent_are_where_the_report_says(
         assert set(line(axes, "fold").get_xdata()) == {45.0}
         assert span(axes, "tolerance") == (47.5, 52.5)
     assert figure.axes[1].get_xlim() == pytest.approx(designs.close_view("omega0", 50.0))
+
+
+def test_how_far_the_motion_lasts_and_averages_of_chaos_are_shown():
+    side = {"percent": 4.0, "lasts": False, "label": "aperiodic", "P": 1e-6, "admissible": True}
+    extents = [{"name": "omega0", "below": side, "above": side | {"percent": 10.0, "lasts": True}}]
+    chaos = diagram()
+    chaos["P_stderr"] = 0.01 * chaos["P"]
+    # Kinds of motion: chaos at the sixth point and, falling alone, at the last, which is inadmissible.
+    chaos["period"] = chaos["P"].astype(int) * 0 + 1
+    chaos["period"][:, 5], chaos["period"][0, 8] = 0, 0
+    upper, _ = designs.design(chaos, report(extents=extents)).axes
+    assert span(upper, "as far as this motion lasts") == (48.0, 55.0)
+    np.testing.assert_allclose(line(upper, "average of chaos").get_xdata(), [45.0, 45.0])
+    assert "as far as this motion lasts" not in words(designs.design(diagram(), report()))
 
 
 def test_what_an_optimiser_without_constraints_would_report_is_marked_and_its_range_veiled():
