@@ -91,6 +91,8 @@ def test_chaos_goes_on_beside_the_design_and_every_ball_arrives(found):
 def test_tolerances_break_the_limits_of_a_design_that_sits_on_one(found):
     spread = optimise.under(found.best, [Tolerance("omega0", 0.02)])
     assert spread.lost == 0
+    with pytest.raises(ValueError, match="samples must be a whole number of at least 1; got 0"):
+        optimise.under(found.best, [Tolerance("omega0", 0.02)], 0)
     assert 0.3 < spread.inadmissible < 0.6
     assert spread.worst < spread.mean / (1 - spread.inadmissible) < 1.02 * found.best.P
 

@@ -175,6 +175,7 @@ def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
         ({"bounds": {"r": (0.1, 0.2)}}, "bounds must be those of a tuned quantity"),
         ({"motion": "chaotic"}, 'motion must be "any" or "periodic"; got'),
         ({"objective": "expected", "motion": "periodic"}, 'motion must be "any" with objective expected'),
+        ({"objective": "expected", "samples": 9}, "samples must be left out with objective expected"),
         ({"reliability": 0.9}, "reliability must be 1 unless the objective is expected"),
         ({"objective": "expected", "reliability": 0.1}, "reliability must be a number from 0.5 to 1"),
         ({"looks": 1}, "looks must be a whole number of at least 2"),

@@ -89,8 +89,8 @@ class Entry(eqx.Module):
 class Harvest(eqx.Module):
     """What the variants of a cell have harvested."""
 
-    batch: Float[AnyArray, "lane variant"]  # in the running batch so far
-    past: Float[AnyArray, "lane variant"]  # in all full batches
+    batch: Float[AnyArray, "lane variant"]  # what the running batch has given so far
+    past: Float[AnyArray, "lane variant"]  # what all full batches have given
     square: Float[AnyArray, "lane variant"]  # the squares of what each full batch has given, added up
     ratio: Float[AnyArray, "lane variant"]  # largest of harvested energy over what an impact gave
 

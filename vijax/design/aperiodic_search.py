@@ -41,7 +41,6 @@ class Place:
         radius: How far its balls are spread, and how far the next step may lead.
         starts: Balls on the motion.
         best, surface: Where the best ensemble was, and what was fitted to it.
-        gain: What the next step promises of the objective, as a logarithm.
         ahead: The logarithm of the objective that it promises to reach, less a price where limits stay broken.
         path: Centres and fitted objectives of the ensembles that were taken.
         ensembles: How many were flown.
@@ -54,7 +53,6 @@ class Place:
     starts: Starts
     best: np.ndarray
     surface: Surface
-    gain: float = np.inf
     ahead: float = -np.inf
     path: list[tuple[np.ndarray, float]] = dataclasses.field(default_factory=list)
     ensembles: int = 0
@@ -178,11 +176,11 @@ def _step(task: Task, place: Place, ahead: np.ndarray, best: float) -> None:
     """Take a place's next step, look closer where it is short, and stop where nothing is left to gain or to win."""
     settings, surface, step = task.settings, place.surface, ahead - place.best
     place.z, place.ahead = ahead, surface.worth(step, settings.limit_price)
-    place.gain = surface.worth(step, 0.0) - float(surface.value)
     short = (np.abs(step) < 0.5 * place.radius * task.unit(place.owner)).all()
     if surface.margins.min() >= -settings.limit_room and short:
         noise = max(2 * float(surface.value_error), settings.least_gain)
-        place.going &= place.gain >= noise or place.radius > settings.last_radius
+        gain = surface.worth(step, 0.0) - float(surface.value)
+        place.going &= gain >= noise or place.radius > settings.last_radius
         place.radius = min(place.radius, settings.last_radius)
     place.going &= place.ahead + _SURE * float(surface.value_error) > best - settings.least_gain
 

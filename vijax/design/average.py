@@ -26,6 +26,7 @@ from vijax.planes.basins import SPEED
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import present
 from vijax.runtime.context import door
+from vijax.runtime.lattice import lattice
 
 _LEAST_BALLS = 32
 _MOST_BALLS = 2**20
@@ -198,18 +199,12 @@ class _Design(NamedTuple):
     start: np.ndarray
 
 
-# Roots of x^3 = x + 1 and x^5 = x + 1: their lattices are as even in 2 and 4 dimensions as that of the golden ratio is
-# on a line.
-_ROOTS = {2: 1.324717957244746, 4: 1.1673039782614187}
-
-
 @lru_cache(maxsize=8)
 def _design(balls: int, seed: int | None) -> _Design:
     """Where so many balls are: on lattices, or drawn at random by a seed."""
     half = balls // 2
     if seed is None:
-        number = np.arange(1, half + 1)[:, None]
-        start, some = ((0.5 + number / root ** np.arange(1, size + 1)) % 1 for size, root in _ROOTS.items())
+        start, some = lattice(half, 2).T, lattice(half, 4).T
     else:
         start, some = np.split(np.random.default_rng(seed).random((half, 6)), [2], axis=1)
     some = 2 * some - 1

@@ -7,6 +7,7 @@ import numpy as np
 
 from vijax.batch.simulate import Starts
 from vijax.model.device import Harvester
+from vijax.model.label import label
 
 LIMITS = "penetration limit", "energy given to the membrane"
 _MOST = 20.0  # logarithms of margins end here: no contact, no voltage
@@ -16,7 +17,7 @@ class Averages(NamedTuple):
     """What balls gave and met, [ball], each in a device of its own.
 
     Attributes:
-        P, P_stderr: Energy harvested per half forcing period, and its standard error by batch means [J].
+        P: Energy harvested per half forcing period [J].
         speed: Largest speed into a wall [m/s].
         depth: Largest penetration [m].
         ratio: Largest ratio of harvested energy to energy given to the membrane.
@@ -27,7 +28,6 @@ class Averages(NamedTuple):
     """
 
     P: np.ndarray
-    P_stderr: np.ndarray
     speed: np.ndarray
     depth: np.ndarray
     ratio: np.ndarray
@@ -42,6 +42,11 @@ class Averages(NamedTuple):
     def some(self, index: Any) -> "Averages":
         """Those with the given indices."""
         return jax.tree.map(lambda x: x[index], self)
+
+    def labels(self) -> np.ndarray:
+        """Names of their motions; what is undecided counts as aperiodic, as its average does."""
+        names = label(self.period, self.left, self.right, self.status)
+        return np.where(names == "undecided", "aperiodic", names)
 
     def value(self, objective: str, device: Harvester) -> np.ndarray:
         """Give an objective of `OBJECTIVES` for each ball; those over tolerances are P here."""
@@ -66,7 +71,6 @@ def averages(device: Harvester, ended: Any) -> Averages:
     length, speed = np.asarray(device.length_unit), np.asarray(device.speed_unit)
     return Averages(
         P=ended.P[:, 0],
-        P_stderr=ended.P_stderr[:, 0],
         speed=ended.fastest * speed,
         depth=ended.deepest * length,
         ratio=ended.energy_ratio[:, 0],

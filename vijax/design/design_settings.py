@@ -66,8 +66,8 @@ class DesignSettings:
             looked at closer, 0.8. A smaller one spends time on what cannot win.
         min_rival: Share of the best that an orbit has to promise to be climbed from at all, where any motion may win,
             0.5.
-        max_excess: Nor is one climbed there that exceeds a limit by more, as a logarithm, 0.3. Of 200 random devices
-            none lost its best orbit by these two; four fifths of the ascents are saved.
+        max_excess: Nor is one climbed there that exceeds a limit by more, as a logarithm, 0.3. Of 60 random devices
+            none lost its best motion by these two; four fifths of the ascents are saved.
         closer_cells: Times as many cells as before about a step that is looked at closer, 8. With fewer, narrow windows
             of periodic motion in chaos are missed.
         max_step: Longest step of an ascent, 0.2. Longer ones leave the branch of their orbit, and are halved until they

@@ -16,15 +16,15 @@ from vijax.design.survey import survey
 from vijax.design.tolerance import Tolerance, drawn
 from vijax.design.variables import LINEAR, cells
 from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
-from vijax.planes.basins import spread
+from vijax.planes.basins import SPEED, spread
 from vijax.runtime import tiles
 
 AVERAGED = Status.OK, Status.STICKING, Status.SLOW  # a ball that ended so has averages
 _TILES = (512, 4096, 32768)  # cells of one compiled call
 _FIRST = 10  # a first flight of so much fewer periods refutes most of what a long one would
 _MORE = 4  # so many times the balls of an ensemble prove a design whose balls start anywhere
-_SPEED = 0.6  # a ball that starts anywhere has at most this velocity
 
 
 class Task(NamedTuple):
@@ -59,14 +59,13 @@ class Task(NamedTuple):
         return self.settings.expected_balls if self.expected else self.settings.ensemble_balls
 
     @property
-    def last_flights(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Balls and forcing periods of the flights that refute a design, and that prove it."""
+    def last_flights(self) -> list[tuple[int, int]]:
+        """Balls and forcing periods of the flights that a design has to pass in turn; the last one proves it."""
         settings = self.settings
         if self.expected:
-            balls = _MORE * settings.expected_balls
-            return (balls, settings.ensemble_periods), (balls, settings.ensemble_periods)
+            return [(_MORE * settings.expected_balls, settings.ensemble_periods)]
         balls, periods = settings.confirm_balls, settings.confirm_periods
-        return (balls, max(periods // _FIRST, 1)), (balls, periods)
+        return [(balls, max(periods // _FIRST, 1)), (balls, periods)]
 
     def unit(self, owner: int) -> np.ndarray:
         """What a radius of 1 is in every variable: a factor of e; of an inclination the width of its bounds."""
@@ -111,18 +110,22 @@ def fly(
     z = np.clip(centre[:, None] + offsets, task.box[owner, 0][:, None], task.box[owner, 1][:, None])
     each = np.repeat(owner, balls)
     given = jax.tree.map(lambda *x: np.array(x, float)[each], *task.devices)
-    device, _ = tiles.map_tiles(lambda rows: cells(*rows, task.tune), (given, z.reshape(-1, len(task.tune))), _TILES)
+    device, pair = _cells(given, z.reshape(-1, len(task.tune)), task.tune)
     if task.tolerances:
         names, factors = drawn(task.tolerances, balls)
         off = {name: getattr(device, name) * np.tile(x, len(owner)) for name, x in zip(names, factors.T, strict=True)}
-        device = _changed(device, off)
-    # Tuned already: what is left to do is the nondimensional form.
-    device, pair = tiles.map_tiles(lambda rows: cells(*rows, ()), (device, np.zeros((each.size, 0))), _TILES)
-    device, pair = jax.tree.map(np.asarray, (device, pair))
+        # Tuned already: what is left to do is the nondimensional form of what is off.
+        device, pair = _cells(_changed(device, off), np.zeros((each.size, 0)), ())
     begun = _anywhere(pair.d, len(owner), balls) if task.expected else _on(starts, balls)
     found = averages(device, survey(pair, device, begun, longest=1, periods=periods).ended)
     whole = Ensemble((z - centre[:, None]).reshape(-1, len(task.tune)), found, device)
     return [whole.some(np.arange(i * balls, (i + 1) * balls)) for i in range(len(owner))]
+
+
+def _cells(device: Harvester, z: np.ndarray, names: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
+    """Devices with tuned quantities, and their pairs, as NumPy's arrays."""
+    found = tiles.map_tiles(lambda rows: cells(*rows, names), (device, z), _TILES)
+    return jax.tree.map(np.asarray, found)
 
 
 def _changed(device: Harvester, constants: dict[str, np.ndarray]) -> Harvester:
@@ -133,6 +136,7 @@ def _changed(device: Harvester, constants: dict[str, np.ndarray]) -> Harvester:
 def pairs(balls: int, size: int) -> np.ndarray:
     """Offsets in [-1, 1] [ball, variable], evenly spread in every variable, in pairs of opposite ones."""
     half = (balls + 1) // 2
+    # Not a lattice: of few balls it would leave the ends of each variable out, where a surface is fixed best.
     order = np.random.default_rng(size).permuted(np.tile(np.arange(half), (size, 1)), axis=1).T
     some = (2 * order + 1) / half - 1
     return np.concatenate([some, -some])[:balls]
@@ -144,10 +148,10 @@ def _on(starts: list[Starts], balls: int) -> Starts:
     return jax.tree.map(lambda *x: np.concatenate(x), *turn)
 
 
-def _anywhere(d: np.ndarray, centres: int, balls: int) -> Starts:
+def _anywhere(d: Any, centres: int, balls: int) -> Starts:
     """Balls anywhere in the gap, in every ensemble the same ones."""
     u, v = (np.tile(x.values, centres) for x in spread(balls, None))
-    begun: Any = u * d, 2 * _SPEED * v, np.zeros_like(d)
+    begun: Any = u * d, 2 * SPEED * v, np.zeros_like(d)
     return Starts(*begun)
 
 

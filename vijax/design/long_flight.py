@@ -14,7 +14,6 @@ from vijax.design.averages import LIMITS
 from vijax.design.ensemble import AVERAGED, Ensemble, Task, fly
 from vijax.design.optimum import AperiodicOptimum
 from vijax.design.variables import tuned, values
-from vijax.model.label import label
 
 _NEAR = 10  # a limit is told as active within so many times the room that is kept below it
 
@@ -28,14 +27,19 @@ class _Proof:
         room: Kept below the limits of the fitted surface, as a logarithm.
         shift: How far beside the surface's maximum the design is.
         flights: Flights about the last place that failed.
-        passed: What a first flight, of a tenth of the periods, did not refute; None before it.
+        passed: What those flights showed, each the next of `Task.last_flights`, that did not refute it.
     """
 
     places: list[Place]
     room: float
     shift: float = 0.0
     flights: int = 0
-    passed: "_Told | None" = None
+    passed: "list[_Told]" = dataclasses.field(default_factory=list)
+
+    @property
+    def stage(self) -> int:
+        """Which flight is the next one."""
+        return len(self.passed)
 
 
 def prove(task: Task, places: list[Place], known: np.ndarray) -> list[AperiodicOptimum | None]:
@@ -54,35 +58,35 @@ def prove(task: Task, places: list[Place], known: np.ndarray) -> list[AperiodicO
             one.radius = max(one.radius, settings.last_radius)
             proofs.setdefault(one.owner, _Proof([], settings.limit_room)).places.append(one)
     while proofs:
-        for long in (False, True):
-            some = {owner: proof for owner, proof in proofs.items() if (proof.passed is not None) == long}
-            for owner, told in _flown(task, some, long).items():
+        for stage in range(len(task.last_flights)):
+            some = {owner: proof for owner, proof in proofs.items() if proof.stage == stage}
+            for owner, told in _flown(task, some, stage).items():
                 proof = some[owner]
                 if told is None or told.lacks < 0:
                     _move(task, proof, told is None, 0.0 if told is None else told.lacks)
-                elif not long:
-                    proof.passed = told
-                else:
+                    continue
+                proof.passed.append(told)
+                if proof.stage == len(task.last_flights):
                     found[owner] = told.optimum if np.log(told.optimum.height) > known[owner] else None
                     proof.places.clear()
         proofs = {owner: proof for owner, proof in proofs.items() if proof.places}
     return found
 
 
-def _flown(task: Task, some: dict[int, _Proof], long: bool) -> "dict[int, _Told | None]":
-    """What flights show of the last places of some proofs, by their owners."""
+def _flown(task: Task, some: dict[int, _Proof], stage: int) -> "dict[int, _Told | None]":
+    """What the flights of a stage show of the last places of some proofs, by their owners."""
     if not some:
         return {}
     owner, proofs = np.array(list(some)), list(some.values())
     places = [proof.places[-1] for proof in proofs]
-    if long:
-        passed = [proof.passed for proof in proofs if proof.passed is not None]
+    if stage:
+        passed = [proof.passed[-1] for proof in proofs]
         z, starts = np.array([one.z for one in passed]), [one.optimum.starts for one in passed]
     else:
         shift = np.array([proof.shift for proof in proofs])[:, None]
         z = climbed(task, places, np.array([proof.room for proof in proofs])) + shift
         z, starts = np.clip(z, task.box[owner, 0], task.box[owner, 1]), [one.starts for one in places]
-    balls, periods = task.last_flights[long]
+    balls, periods = task.last_flights[stage]
     flown = fly(task, owner, z, np.zeros(len(z)), starts, periods, balls)
     return {one.owner: _told(task, one, at, whole) for one, at, whole in zip(places, z, flown, strict=True)}
 
@@ -91,7 +95,7 @@ def _move(task: Task, proof: _Proof, mixed: bool, lacks: float) -> None:
     """Where the next long flight goes: further within the limits, beside a window, or to the next best place."""
     settings = task.settings
     proof.flights += 1
-    proof.passed = None
+    proof.passed.clear()
     if mixed:
         # Beside a window chaos goes on: first above, then below, each time further.
         proof.shift = settings.last_radius * (-1) ** proof.flights * (1 + proof.flights // 2)
@@ -114,8 +118,7 @@ class _Told:
 def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble) -> _Told | None:
     """The design that a long flight showed; None where its balls ended on different motions, or on none."""
     found, device = ensemble.found, ensemble.device
-    names = label(found.period, found.left, found.right, found.status)
-    shares = Counter(np.where(names == "undecided", "aperiodic", names).tolist())
+    shares = Counter(found.labels().tolist())
     if not task.expected and (len(shares) > 1 or not np.isin(found.status, AVERAGED).all()):
         return None
     room = np.quantile(found.margins(device), 1 - task.reliability, axis=0, method="lower")
@@ -142,7 +145,7 @@ def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble) -> _Told 
         active=_active(task, z - low, high - z, room),
         stopped="maximum" if not place.going else "ensembles",
         ensembles=place.ensembles,
-        flown=(found.P.size, task.last_flights[1][1]),
+        flown=(found.P.size, task.last_flights[-1][1]),
         starts=found.end,
         path=np.asarray(values(task.tune, np.array([at for at, _ in place.path]))),
         heights=np.array([height for _, height in place.path]),

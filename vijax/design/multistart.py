@@ -119,7 +119,6 @@ def find(
     effort: Effort,
     *,
     orbits_alone: bool = True,
-    all_starts: bool = False,
 ) -> tuple[Begun, Met, list[Looked]]:
     """The attractors to climb from, all motion that is no orbit to climb from, and what was met of every device.
 
@@ -130,39 +129,43 @@ def find(
         objective: Of `OBJECTIVES`; starts for tolerances are those for P.
         effort: How far to look.
         orbits_alone: Whether chaos is no answer, but a place where narrow windows may hide an orbit.
-        all_starts: Whether what every start came to is the answer: then nothing is looked at closer, and all that was
-            met is given in place of what is no orbit.
     """
-    first, levels = _first(tune), _levels(tune, effort)
-    steps = 1 if first is None else effort.steps
-    owner, level, step, _ = (x.ravel() for x in np.indices((len(devices), len(levels), steps, effort.balls)))
     scene = _Scene(devices, tune, box, effort)
-    count = owner.size // len(devices)  # every device has as many
-    # The same for every device, whatever the others are: designs of one do not depend on them.
-    draws = np.random.default_rng(0).uniform(-1, 1, (2, count)), np.random.default_rng(1).uniform(-1, 1, (2, count))
-    places = _Places(owner, level, step / max(steps - 1, 1), np.arange(owner.size) % count)
-    seen = _look(scene, places, draws[0])
+    seen = _first_look(scene)
     met, unrest = seen.orbits(effort.impacts), seen.restless(effort.impacts)
-    if all_starts:
-        looked = [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
-        none = met.some(np.arange(0))
-        nothing = flown(none.pair, none.ended, effort.impacts)
-        return Begun(nothing, none.device, none.z, none.owner), seen.every(), looked
-    if first is not None:
+    if _first(tune) is not None:
         most = _most(promise(met, objective), met.owner, len(devices))
         if not orbits_alone:
             most = np.maximum(most, _most(promise(unrest, objective), unrest.owner, len(devices)))
-        again = _closer(unrest, most, objective, effort, count)
+        again = _closer(unrest, most, objective, effort, scene.cells)
         if again.owner.size:
-            closer = _look(scene, again, draws[1])
+            closer = _look(scene, again, 1)
             more = closer.orbits(effort.impacts), closer.restless(effort.impacts)
             met, unrest = jax.tree.map(lambda *x: np.concatenate(x), (met, unrest), more)
     looked = [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
-    chosen = met.some(_promising(met, objective, len(devices), steps, effort.settings))
+    chosen = met.some(_promising(met, objective, len(devices), scene.steps, effort.settings))
     if not orbits_alone:
         chosen = chosen.some(_rivals(chosen, unrest, objective, len(devices), effort.settings))
     flights = flown(chosen.pair, chosen.ended, effort.impacts)
     return Begun(flights, chosen.device, chosen.z, chosen.owner), unrest, looked
+
+
+def every_start(
+    devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: Effort
+) -> tuple[Met, list[Looked]]:
+    """What every start came to, where that is the answer, and what was met of every device; arguments as in `find`."""
+    seen = _first_look(_Scene(devices, tune, box, effort))
+    met, unrest = seen.orbits(effort.impacts), seen.restless(effort.impacts)
+    return seen.every(), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
+
+
+def _first_look(scene: "_Scene") -> "_Seen":
+    """The coarse survey: as many balls at every value."""
+    levels = len(_levels(scene.tune, scene.effort))
+    shape = len(scene.devices), levels, scene.steps, scene.effort.balls
+    owner, level, step, _ = (x.ravel() for x in np.indices(shape))
+    number = np.arange(owner.size) % scene.cells
+    return _look(scene, _Places(owner, level, step / max(scene.steps - 1, 1), number), 0)
 
 
 def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
@@ -196,6 +199,16 @@ class _Scene(NamedTuple):
     tune: tuple[str, ...]
     box: np.ndarray
     effort: Effort
+
+    @property
+    def steps(self) -> int:
+        """Values of the first quantity at which is looked."""
+        return 1 if _first(self.tune) is None else self.effort.steps
+
+    @property
+    def cells(self) -> int:
+        """Balls of a device that are flown in a look, at most."""
+        return len(_levels(self.tune, self.effort)) * self.steps * self.effort.balls
 
 
 def _first(tune: tuple[str, ...]) -> int | None:
@@ -238,8 +251,11 @@ class _Seen(NamedTuple):
         return Met(averages(device, ended), pair, ended, device, z, places.owner, places.level, step)
 
 
-def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
-    """Survey some places, the ball of each starting where its number's draw says."""
+def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
+    """Survey some places, the ball of each starting where the draw of its number says.
+
+    Draws are the same for every device, whatever the others are: designs of one do not depend on them.
+    """
     devices, tune, box, effort = scene
     first, parts = _first(tune), _levels(tune, effort)[places.level]
     if first is not None:
@@ -248,6 +264,7 @@ def _look(scene: _Scene, places: _Places, draw: np.ndarray) -> _Seen:
     z = low + parts * (high - low)
     given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
     every, pair = tiles.map_tiles(lambda rows: cells(*rows, tune), (given, z), _TILES)
+    draw = np.random.default_rng(seed).uniform(-1, 1, (2, scene.cells))
     u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
     starts = Starts(u0 * pair.d, v0, np.zeros_like(v0))
     found = survey(pair, every, starts, longest=effort.settings.max_period, periods=effort.periods)

@@ -14,7 +14,6 @@ from vijax.design.ensemble import AVERAGED, Task, fly
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.tolerance import Spread, Tolerance
 from vijax.design.variables import LINEAR, variables
-from vijax.model.label import label
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -131,7 +130,7 @@ def _go_on(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...], going: l
         with np.errstate(divide="ignore", invalid="ignore"):
             # Beyond a fold another orbit may have the label; its P is another one.
             smooth = abs(np.log(P / way.P)) < _STEEPEST * (off - way.off) + _LEAST_JUMP
-        name = str(label(one.found.period, one.found.left, one.found.right, one.found.status)[0])
+        name = str(one.found.labels()[0])
         if bool(_own(optimum, one.found)[0]) and smooth:
             way.off, way.P, way.starts, way.step = off, P, one.found.end, _LONGER * way.step
             way.side = Side(100 * off, off >= _FARTHEST, name, P, kept)
@@ -197,7 +196,5 @@ def _start(optimum: Optimum | AperiodicOptimum) -> Starts:
 
 def _own(optimum: Optimum | AperiodicOptimum, found: Averages) -> np.ndarray:
     """Which balls are on a motion of the design's label, mirror images alike."""
-    names = label(found.period, found.left, found.right, found.status)
-    turned = label(found.period, found.right, found.left, found.status)
-    names = np.where(names == "undecided", "aperiodic", names)
-    return (names == optimum.label) | (turned == optimum.label)
+    turned = found._replace(left=found.right, right=found.left)
+    return (found.labels() == optimum.label) | (turned.labels() == optimum.label)

@@ -21,10 +21,10 @@ from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
 from vijax.design.design_settings import DEFAULT, DesignSettings, check_settings
 from vijax.design.ensemble import Task
-from vijax.design.multistart import Begun, Effort, Looked, find
+from vijax.design.multistart import Begun, Effort, Looked, Met, every_start, find
 from vijax.design.objective import OBJECTIVES, Batch, Scene
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, End, Optimum, verified
-from vijax.design.tolerance import Spread, Tolerance, check_tolerances, nodes
+from vijax.design.tolerance import Nodes, Spread, Tolerance, check_samples, check_tolerances, nodes
 from vijax.design.variables import NAMES, check_names, limits, values, variables
 from vijax.model.choices import Motion, Objective
 from vijax.model.device import Harvester, one_device
@@ -156,7 +156,7 @@ def optimise_all(
             "periodic" the best orbit. Over tolerances orbits alone are followed.
         tolerances: How constants scatter, for "mean", "worst" and "expected".
         reliability: Share of the balls of "expected" that have to keep the limits in all that is flown.
-        samples: Random devices for these, in place of a quadrature.
+        samples: Random devices for the first two, in place of a quadrature.
         looks: Evaluations of objective with gradient that a start may take.
         steps: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself, where
             chaos promises more than the best orbit so far: there the best orbit may live in a narrow window.
@@ -175,6 +175,11 @@ def optimise_all(
     tune, bounds = checks.words("tune", tune, NAMES), {} if bounds is None else bounds
     scatter = check_tolerances(tolerances)
     reliability = check_motion(motion, objective, reliability)
+    if objective == "expected" and samples is not None:
+        raise ValueError(
+            f"samples must be left out with objective expected, whose balls have random devices; got {samples!r}; "
+            "settings=DesignSettings(expected_balls=...) says how many"
+        )
     looks, far = (
         checks.whole("looks", looks, 2, _MOST_LOOKS),
         effort(steps, balls, impacts, periods)._replace(settings=check_settings(settings)),
@@ -182,35 +187,43 @@ def optimise_all(
     box = check(devices, tune, bounds, objective, scatter)
     if (asked := expected(len(devices), far)).long:
         _LOG.warning("a long run begins: %s", asked)
+    alone = motion == "periodic" or objective in OVER_TOLERANCES
+    task = Task(devices, tune, box, objective, scatter if objective == "expected" else (), reliability, settings)
     cloud = nodes(scatter, samples)
-    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), tune, cloud.names, objective)
-    any_motion = motion == "any" and objective not in OVER_TOLERANCES
-    expected_value = objective == "expected"
-    starts, unrest, looked = find(
-        devices, tune, box, objective, far, orbits_alone=not any_motion, all_starts=expected_value
-    )
-    ends = _climbed(scene, starts, box, looks, settings)
-    climbed = verified(scene, starts, ends, devices, looks, settings)
-    optima: list[list[Optimum | AperiodicOptimum]] = [list(some) for some in climbed]
-    if any_motion:
-        known = np.array([math.log(some[0].height) if some else -math.inf for some in optima])
-        weighed = scatter if expected_value else ()
-        task = Task(devices, tune, box, objective, weighed, reliability, settings)
-        places = aperiodic_search.search(task, unrest, known)
-        for some, beyond in zip(optima, long_flight.prove(task, places, known), strict=True):
-            some[:0] = [beyond] if beyond is not None else []
+    if objective == "expected":
+        met, looked = every_start(devices, tune, box, far)
+        optima: list[list[Optimum]] = [[] for _ in devices]
+        climbed = [0] * len(devices)
+    else:
+        starts, met, looked = find(devices, tune, box, objective, far, orbits_alone=alone)
+        climbed = np.bincount(starts.owner, minlength=len(devices)).tolist()
+        optima = _on_orbits(task, starts, cloud, looks)
+    beyond = [None] * len(devices) if alone else _beyond(task, met, optima)
     return [
         Design(
-            optima=tuple(optima[owner]),
+            optima=tuple(one for one in (beyond[owner], *optima[owner]) if one is not None),
             tune=tune,
             bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, box[owner])).T.tolist()), strict=True)),
             objective=objective,
             tolerances=scatter,
             looked=looked[owner],
-            starts=int((starts.owner == owner).sum()),
+            starts=climbed[owner],
         )
         for owner in range(len(devices))
     ]
+
+
+def _on_orbits(task: Task, starts: Begun, cloud: Nodes, looks: int) -> list[list[Optimum]]:
+    """The optima of every device to which its orbits climb, the best first."""
+    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), task.tune, cloud.names, task.objective)
+    ends = _climbed(scene, starts, task.box, looks, task.settings)
+    return verified(scene, starts, ends, task.devices, looks, task.settings)
+
+
+def _beyond(task: Task, met: Met, orbits: list[list[Optimum]]) -> list[AperiodicOptimum | None]:
+    """The best design of every device whose motion is no orbit, where it gives more than the best orbit does."""
+    known = np.array([math.log(some[0].height) if some else -math.inf for some in orbits])
+    return long_flight.prove(task, aperiodic_search.search(task, met, known), known)
 
 
 @door
@@ -230,7 +243,7 @@ def under(optimum: Optimum | AperiodicOptimum, tolerances: Iterable[Tolerance], 
     checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     scatter = check_tolerances(tolerances)
     if isinstance(optimum, AperiodicOptimum):
-        return off_design.scattered(optimum, scatter, samples)
+        return off_design.scattered(optimum, scatter, None if samples is None else check_samples(samples))
     cloud, none = nodes(scatter, samples), jnp.zeros((1, 0))
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), (), cloud.names, "P")
     device = jax.tree.map(lambda x: jnp.array([x], float), optimum.device)

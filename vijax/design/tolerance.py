@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +52,11 @@ def check_tolerances(tolerances: Iterable[Tolerance], bounded: bool = False) -> 
     return found
 
 
+def check_samples(samples: Any) -> int:
+    """How many random devices there are, if there may be so many."""
+    return checks.whole("samples", samples, 1, _MOST_SAMPLES)
+
+
 class Nodes(NamedTuple):
     """Devices about a nominal one: factors [node, constant] and weights [node]; the first node is the nominal one."""
 
@@ -78,7 +83,7 @@ def nodes(tolerances: tuple[Tolerance, ...], samples: int | None = None, seed: i
     if not tolerances:
         return Nodes(names, np.ones((1, 0)), np.ones(1))
     if samples is not None:
-        samples = checks.whole("samples", samples, 1, _MOST_SAMPLES)
+        samples = check_samples(samples)
         factors, weights = drawn(tolerances, samples, seed)[1], np.full(samples, 1 / samples)
     else:
         rules = [_rule(one, _NODES.get(len(tolerances), 3)) for one in tolerances]

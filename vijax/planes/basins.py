@@ -22,6 +22,7 @@ from vijax.planes.dataset import DEFAULT, Plan
 from vijax.planes.sweep_settings import SPEED, START_POINTS, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
+from vijax.runtime.lattice import lattice
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -211,12 +212,7 @@ def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
     """Spread points evenly over the unit square around 0, along the dimension `start`; a seed draws them at random."""
     import xarray as xr  # here, as importing vijax must not load it
 
-    if seed is None:
-        # The lattice of the root of x^3 = x + 1, as even in the plane as that of the golden ratio is on a line.
-        root = 1.324717957244746
-        points = (0.5 + np.arange(1, count + 1) * np.array([[1 / root], [1 / root**2]])) % 1
-    else:
-        points = np.random.default_rng(seed).random((2, count))
+    points = lattice(count, 2) if seed is None else np.random.default_rng(seed).random((2, count))
     first, second = points - 0.5
     return xr.Variable("start", first), xr.Variable("start", second)
 

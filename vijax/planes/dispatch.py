@@ -102,7 +102,8 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
         fill()
         while running:
             done = wait(running, return_when=FIRST_COMPLETED).done
-            for future in [future for future in running if future in done]:  # in the order in which they began
+            # Calls are given in the order in which they began, whichever of them ended first.
+            for future in [future for future in running if future in done]:
                 call = running.pop(future)
                 fill()
                 yield call, *future.result()
