@@ -1,20 +1,29 @@
 """Settings every test runs under: strict dtype promotion, and property tests that CI draws the same way each time."""
 
+import gc
 import os
 from pathlib import Path
 
 # Before JAX starts, here and in the scripts that tests start: most of the time is spent on compiling, and so compiled a
 # program takes a third of it. What XLA_FLAGS says comes last and wins.
 os.environ["XLA_FLAGS"] = " ".join(
-    ("--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false", os.environ.get("XLA_FLAGS", ""))
+    (
+        "--xla_backend_optimization_level=0",
+        "--xla_cpu_use_fusion_emitters=false",
+        # The first as always (`runtime.xla`); the others walk all loops of a program again and again, and mend little.
+        "--xla_disable_hlo_passes=cpu-parallel-task-assigner,simplify-while-loops,while-loop-invariant-code-motion",
+        os.environ.get("XLA_FLAGS", ""),
+    )
 )
 
 import jax
 from hypothesis import settings
 
 import vijax  # noqa: F401  switches x64 on before a test makes its first array
+from vijax.runtime.garbage import SELDOM
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+gc.set_threshold(*SELDOM)  # tests trace outside of public functions, too
 # Workers, and the scripts that tests start, compile many of the same programs: one of them does it for all.
 CACHE = str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
 os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE

@@ -14,6 +14,7 @@ import jax
 from jax.extend import backend
 
 from vijax.runtime import forks
+from vijax.runtime.garbage import seldom_collected
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -36,7 +37,7 @@ def door(function: Callable[P, T]) -> Callable[P, T]:
                 "vijax must not be called in a process that was forked after JAX had started, where it would hang; "
                 'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep'
             )
-        with _held(args, kwargs):
+        with _held(args, kwargs), seldom_collected():
             try:
                 return function(*args, **kwargs)
             except (AssertionError, RuntimeError):
