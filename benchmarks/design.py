@@ -395,7 +395,7 @@ def report(every: list[Case]) -> None:
     say("scan: largest excess over a constraint, relative", f"{max(map(excess, bests)):.1e}")
     say(
         "scan: most evaluations of a start that won; median",
-        f"{max(b.looks for b in bests)}; {np.median([b.looks for b in bests]):.0f}",
+        f"{max(b.evaluations for b in bests)}; {np.median([b.evaluations for b in bests]):.0f}",
     )
     say(
         "scan: optimum over the scan's best: least, median, largest",
@@ -427,15 +427,18 @@ def speed(designs: int) -> None:
         begun = time.perf_counter()
         found = optimise.optimise_all(devices, motion="periodic")
         seconds.append(time.perf_counter() - begun)
-    starts = sum(one.starts for one in found)
-    looks = [optimum.looks for one in found for optimum in one.orbits]
+    starts = sum(one.ascents for one in found)
+    evaluations = [optimum.evaluations for one in found for optimum in one.orbits]
     say("speed: parameters; starts", f"{len(devices)}; {starts}")
     say("speed: seconds, first (with compilation or its cache); again", f"{seconds[0]:.1f}; {seconds[1]:.1f}")
     say(
         "speed: seconds a 1,000 parameters; a 1,000 starts",
         f"{1e3 * seconds[1] / designs:.1f}; {1e3 * seconds[1] / starts:.1f}",
     )
-    say("speed: evaluations of the starts that became optima: median, most", f"{np.median(looks):.0f}, {max(looks)}")
+    say(
+        "speed: evaluations of the starts that became optima: median, most",
+        f"{np.median(evaluations):.0f}, {max(evaluations)}",
+    )
     row = random_cells()
     row = row[np.flatnonzero(np.asarray(row.count) <= 2)]
     row = jax.tree.map(lambda leaf: leaf[:, :2] if leaf.ndim > 1 and leaf.shape[1] > 2 else leaf, row)

@@ -74,8 +74,13 @@ JUDGES = {"calls": called, "lines": told}
 def _unclear(case: Case, said: str) -> str:
     if "\n" in said or len(said) > _LONGEST:
         return f"{said.count(chr(10)) + 1} lines of {len(said)} characters: {said}"
-    missing = [name for name in case.names if not re.search(rf"(?<!\w){re.escape(name)}(?!\w)", said)]
+    missing = [name for name in case.names if not re.search(rf"(?<!\w)({_either(name)})(?!\w)", said)]
     return f"{', '.join(missing)} not named: {said}" if missing else ""
+
+
+def _either(name: str) -> str:
+    """Match a name as an argument has it or as an option, with hyphens."""
+    return "|".join(map(re.escape, (name, name.replace("_", "-"))))
 
 
 def _serve(table: str, ours: Connection) -> None:

@@ -74,7 +74,7 @@ def an_optimum() -> optimum.Optimum:
     path = np.zeros((1, 1))
     told: dict[str, Any] = {"values": {}, "gradient": {}, "active": (), "path": path, "heights": path[0]}
     told |= {"device": vijax.Harvester(), "label": "1:1", "height": 0.0, "P": 0.0, "P_stderr": 0.0}
-    return optimum.Optimum(**told, stopped="maximum", orbit=an_orbit(), state=None, looks=0)
+    return optimum.Optimum(**told, stopped="maximum", orbit=an_orbit(), state=None, evaluations=0)
 
 
 def a_map() -> xr.Dataset:
@@ -234,11 +234,11 @@ CALLS: Table = {
             "bounds": (3, {"r": (0.1, 0.2)}, {"omega0": 3}, {"omega0": (3,)}, {"omega0": ("a", "b")}, [("omega0",)]),
             "objective": CHOICE,
             "tolerances": (3, "omega0=5%", [3], [("omega0", 0.05)], [Tolerance("omega0", 0.05)]),
-            "looks": (*COUNT, 1),
-            "steps": (*COUNT, 1),
-            "balls": COUNT,
-            "impacts": COUNT,
-            "periods": COUNT,
+            "max_evaluations": (*COUNT, 1),
+            "survey_points": (*COUNT, 1),
+            "starts": COUNT,
+            "max_impacts": COUNT,
+            "survey_periods": COUNT,
         },
     ),
     "optimise over tolerances": (
@@ -587,11 +587,11 @@ LARGE: dict[str, Callable[[], Any]] = {
     "samples of 10^9": lambda: orbit_properties.path(an_orbit(), 10**9),
     "guesses of 5005 sequences": lambda: orbit_search.search(pair(), "6:9", guesses=10**7),
     "points of 10^9": lambda: continuation.follow(an_orbit(), "d", (0.1, 0.3), points=10**9),
-    "steps and balls of 10^12": lambda: vijax.optimise(steps=10**6, balls=10**6),
+    "survey_points and starts of 10^12": lambda: vijax.optimise(survey_points=10**6, starts=10**6),
     "samples of optimise": lambda: vijax.optimise(
         objective="mean", tolerances=[Tolerance("omega0", 0.05)], samples=10**12
     ),
-    "devices of many": lambda: optimise.optimise_all([vijax.Harvester()] * 10**4, steps=1000, balls=1000),
+    "devices of many": lambda: optimise.optimise_all([vijax.Harvester()] * 10**4, survey_points=1000, starts=1000),
 }
 
 

@@ -146,7 +146,7 @@ LINES: Lines = {
         },
     ),
     "design": (
-        ("--d", "0.2", "--steps", "8"),
+        ("--d", "0.2", "--survey-points", "8"),
         {
             "tune": ("", ",", "mass", "omega0,k", "omega0;r"),
             "bounds": (
@@ -172,9 +172,9 @@ LINES: Lines = {
                 "=5%",
             ),
             "objective": (*WORDS, "mean", "worst"),
-            "steps": (*COUNTS, "1", "10000000000"),
-            "balls": (*COUNTS, "10000000000"),
-            "impacts": (*COUNTS, "10000000000"),
+            "survey-points survey_points": (*COUNTS, "1", "10000000000"),
+            "starts": (*COUNTS, "10000000000"),
+            "max-impacts max_impacts": (*COUNTS, "10000000000"),
             "over": ("", "d", "r", "r=", "r=x", "r=0", "=1", "omega0=20:40:3", "mass=1", "u0=0.1", "d=0.1:0.2:3"),
             "d": ("0", "0.1,0.2", "x"),
             "set": ("=1", "V=x"),
@@ -216,8 +216,8 @@ SHAPES = (
     ("orbit_diagram", ("--along", "d=0.1:0.3:1000000", "--kappa", "3:40:10", "--keep", "400"), "keep"),
     ("branch", ("--wall", "rigid", "--along", "kappa=3:40"), "along"),
     ("branch", ("--impacts", "6:9", "--guesses", "10000000"), "guesses"),
-    ("design", ("--steps", "100000", "--balls", "1000"), "balls"),
-    ("design", ("--steps", "10000", "--balls", "400"), "yes"),
+    ("design", ("--survey-points", "100000", "--starts", "1000"), "starts"),
+    ("design", ("--survey-points", "10000", "--starts", "400"), "yes"),
     ("design", ("--over", "d=0.1:0.3:10000", "--s", "0.2"), "s"),
     ("paper", (), "figure"),
     ("paper", ("--figure",), "figure"),

@@ -118,7 +118,7 @@ _C = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1, 1])
 _E = np.array([71 / 57600, 0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
 
 _LOOKS = 4  # places of a step at which its cubic is compared with the wall
-_ROOT_TRIPS = 40  # Newton or bisection, each a repeated step
+_ROOT_ITERATIONS = 40  # Newton or bisection, each a repeated step
 _CLOSED = 4e-16  # distance to the wall that is none
 _STEPS_PER_PERIOD = 1_000_000  # a run that needs more has failed
 
@@ -221,7 +221,7 @@ def _chain(half_gap, stiffness, damping, r, gamma, end, rtol, u_inout, v_inout):
                 u, v = u_new, v_new
                 continue
             low, s = high - h / _LOOKS, high - 0.5 * h / _LOOKS
-            for _ in range(_ROOT_TRIPS):
+            for _ in range(_ROOT_ITERATIONS):
                 step = _dormand_prince_step(t, u, v, s, side, half, stiffness, damping, gamma, speeds, pushes)
                 past = _beyond(step[0], side, half)
                 if abs(past) < _CLOSED:

@@ -339,9 +339,9 @@ def mp_contact(kappa, r, gamma, side, t, z0, s, w0=0):
     return w, z, side * (mp.cospi(t + s) - gamma) - mu * z - kappa**2 * w
 
 
-def newton(function, x, trips: int = 8):
+def newton(function, x, iterations: int = 8):
     """Root of a function that returns value and slope, from a guess good to a few digits."""
-    for _ in range(trips):
+    for _ in range(iterations):
         value, slope = function(x)
         x = x - value / slope
     return x

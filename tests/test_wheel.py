@@ -45,7 +45,7 @@ vijax.sweep(depth=0.2)
 vijax.swep(d=0.2)
 vijax.load(3)
 vijax.sweep(d=0.2, wall="hard")
-vijax.optimise(trips=3)
+vijax.optimise(steps=3)
 """
 
 

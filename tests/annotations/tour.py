@@ -68,7 +68,7 @@ def orbits(vijax, np, jax):
 def designs(vijax, np, jax):
     """A design, and what tolerances make of it."""
     device = vijax.Harvester(omega=10 * np.pi, s=0.006, A=3.0, V=1700.0)
-    best = vijax.optimise(device, steps=128, balls=1, impacts=2).best
+    best = vijax.optimise(device, survey_points=128, starts=1, max_impacts=2).best
     vijax.under_tolerances(best, [vijax.Tolerance("omega0", 0.05)])
 
 

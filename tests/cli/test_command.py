@@ -140,9 +140,9 @@ LEAST = {
     "basins --speed 0": lambda: vijax.basin_fractions(**CELL, starts=4, speed=0.0),
     "branch --guesses 0": lambda: orbit_search.search(vijax.impact_pair(0.2, 3.0, 0.5), "1:1", guesses=0),
     "branch --generations=-1": lambda: switching.family(None, "d", (0.1, 0.2), generations=-1),
-    "design --steps 1": lambda: vijax.optimise(steps=1),
-    "design --balls 0": lambda: vijax.optimise(balls=0),
-    "design --impacts 0": lambda: vijax.optimise(impacts=0),
+    "design --survey-points 1": lambda: vijax.optimise(survey_points=1),
+    "design --starts 0": lambda: vijax.optimise(starts=0),
+    "design --max-impacts 0": lambda: vijax.optimise(max_impacts=0),
 }
 
 

@@ -33,10 +33,10 @@ def sought(objective="P", **settings):
         tune=("kappa",),
         bounds={"kappa": (20.0, 30.0)},
         objective=objective,
-        steps=8,
-        balls=4,
-        impacts=1,
-        periods=100,
+        survey_points=8,
+        starts=4,
+        max_impacts=1,
+        survey_periods=100,
         **{key: settings.pop(key) for key in ("tolerances", "reliability") if key in settings},
         settings=DesignSettings(**(FEW | settings)),
     )
@@ -121,7 +121,7 @@ CLIMBING = {
     "ensemble_radius": 0.01,
     "last_radius": 0.005,
     "max_ensembles": 1,
-    "least_gain": 0.5,
+    "min_gain": 0.5,
 }
 PROVING = {"confirm_balls": 16, "confirm_periods": 300, "limit_room": 0.01, "max_confirmations": 1}
 

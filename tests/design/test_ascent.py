@@ -41,7 +41,7 @@ def in_disc():
 def test_a_curved_constraint_holds_the_maximum(in_disc):
     # By SLSQP of SciPy, tolerance 1e-12.
     np.testing.assert_allclose(in_disc.z, np.broadcast_to([0.78874049, 0.61472631], (12, 2)), atol=1e-5)
-    assert (in_disc.looks <= LOOKS).all()
+    assert (in_disc.evaluations <= LOOKS).all()
 
 
 def test_every_point_from_the_first_admissible_one_on_is(in_disc):
@@ -79,7 +79,7 @@ def test_an_edge_beyond_which_there_is_no_point_stops_it_there():
 def test_a_start_that_is_no_point_goes_nowhere():
     end = climb(lambda z: z[0], lambda z: jnp.ones(1), [[0.5, 0.0]], exists=lambda z: z[0] < 0.25)
     assert end.lost[0]
-    assert end.looks[0] == 1
+    assert end.evaluations[0] == 1
     np.testing.assert_array_equal(end.z, [[0.5, 0.0]])
 
 

@@ -15,11 +15,11 @@ from vijax.design.design_settings import DesignSettings
 # Of each setting another value, and what else is set so that it matters.
 SURVEYED = {
     "max_period": (2, {}),
-    "other_levels": ((0.5,), {}),
-    "min_steps_apart": (1, {"tune": ("kappa",), "steps": 128}),
+    "survey_levels": ((0.5,), {}),
+    "max_hills": (1, {"tune": ("kappa",), "points": 128}),
     "max_sure_impacts": (1, {"min_promise": 1.0}),
     "min_promise": (1e-6, {"max_sure_impacts": 1}),
-    "closer_cells": (1, {}),
+    "survey_refinement": (1, {}),
 }
 CLIMBED = {
     "max_step": (0.05, {}),
@@ -43,7 +43,7 @@ ELSEWHERE = (
     "ensemble_radius",
     "last_radius",
     "max_ensembles",
-    "least_gain",
+    "min_gain",
     "confirm_balls",
     "confirm_periods",
     "expected_balls",
@@ -55,10 +55,10 @@ UNIT = vijax.Harvester(A=2.460536, omega=9.218106, r=0.854762)
 DEVICE = dataclasses.replace(UNIT, s=0.073195 * UNIT.length_unit)
 
 
-def surveyed(tune=("kappa", "r"), steps=64, orbits_alone=True, **settings):
+def surveyed(tune=("kappa", "r"), points=64, orbits_alone=True, **settings):
     """Where ascents begin."""
     box = optimise.check([DEVICE], tune, {"kappa": (3.0, 400.0)}, "P", ())
-    far = optimise.effort(steps, 1, 16)._replace(settings=DesignSettings(**settings))
+    far = optimise.effort(points, 1, 16)._replace(settings=DesignSettings(**settings))
     met, _, looked = multistart.find([DEVICE], tune, box, "P", far, orbits_alone=orbits_alone)
     return met.z.tolist(), looked[0].orbits
 
@@ -90,7 +90,12 @@ def designed(**settings):
     """How many optima there are, and what is said to hold them."""
     # Such ascents other tests compile as well.
     found = vijax.optimise(
-        vijax.Harvester(s=0.2), steps=16, balls=2, impacts=2, motion="periodic", settings=DesignSettings(**settings)
+        vijax.Harvester(s=0.2),
+        survey_points=16,
+        starts=2,
+        max_impacts=2,
+        motion="periodic",
+        settings=DesignSettings(**settings),
     )
     return [one.active for one in found.optima]
 
@@ -122,8 +127,8 @@ def test_every_value_is_checked():
     for field in dataclasses.fields(DesignSettings):
         with pytest.raises(ValueError, match=f"{field.name} must "):
             DesignSettings(**{field.name: "many"})
-    with pytest.raises(ValueError, match="other_levels must be numbers from 0 to 1; got 1"):
-        DesignSettings(other_levels=(0.5, 1.5))
+    with pytest.raises(ValueError, match="survey_levels must be numbers from 0 to 1; got 1"):
+        DesignSettings(survey_levels=(0.5, 1.5))
     with pytest.raises(ValueError, match="settings must be of the kind DesignSettings"):
         vijax.optimise(vijax.Harvester(), settings={"max_step": 0.1})  # type: ignore[arg-type]
     with pytest.raises(dataclasses.FrozenInstanceError):

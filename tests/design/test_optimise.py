@@ -38,8 +38,8 @@ def kappa(optimum):
 
 @pytest.fixture(scope="module")
 def found():
-    """Both devices in one call; with `impacts` as low as here little is compiled."""
-    return optimise.optimise_all([FAST, PAPER], steps=128, balls=2, impacts=2, motion="periodic")
+    """Both devices in one call; with `max_impacts` as low as here little is compiled."""
+    return optimise.optimise_all([FAST, PAPER], survey_points=128, starts=2, max_impacts=2, motion="periodic")
 
 
 def test_the_small_fast_device(found):
@@ -89,7 +89,7 @@ def test_every_optimum_is_admissible_attracting_and_what_a_simulation_says(found
         assert (state.depth <= one.device.depth_limit).all()
         assert state.multiplier < 1
         assert int(one.orbit.status[0]) == Status.OK
-        assert one.looks <= 60
+        assert one.evaluations <= 60
         assert all(math.isfinite(x) for x in (*one.values.values(), *one.gradient.values(), one.height))
         low, high = found[0].bounds["omega0"] if one.device.omega > 20 else found[1].bounds["omega0"]
         assert low <= one.values["omega0"] <= high
@@ -102,11 +102,11 @@ def test_every_optimum_is_admissible_attracting_and_what_a_simulation_says(found
 
 
 def test_where_any_motion_may_win_the_best_orbit_is_the_same(found):
-    any_motion = optimise.optimise(FAST, steps=128, balls=2, impacts=2)
+    any_motion = optimise.optimise(FAST, survey_points=128, starts=2, max_impacts=2)
     assert any_motion.best.values["omega0"] == pytest.approx(found[0].best.values["omega0"], rel=1e-9)
     assert (any_motion.best.label, any_motion.best.P_stderr) == ("1:1", 0.0)
     # What cannot win is not climbed.
-    assert 0 < any_motion.starts < found[0].starts
+    assert 0 < any_motion.ascents < found[0].ascents
 
 
 def test_an_orbit_lasts_to_its_fold_and_most_balls_arrive_there(found):
@@ -155,7 +155,13 @@ def test_tolerances_of_a_design(found):
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = optimise.optimise(
-        FAST, objective="worst", tolerances=tolerance, bounds={"omega0": (38.0, 45.0)}, steps=128, balls=1, impacts=2
+        FAST,
+        objective="worst",
+        tolerances=tolerance,
+        bounds={"omega0": (38.0, 45.0)},
+        survey_points=128,
+        starts=1,
+        max_impacts=2,
     ).best
     nominal = found[0].best
     assert robust.height > optimise.under(nominal, tolerance).worst
@@ -178,10 +184,10 @@ def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
         ({"objective": "expected", "samples": 9}, "samples must be left out with objective expected"),
         ({"reliability": 0.9}, "reliability must be 1 unless the objective is expected"),
         ({"objective": "expected", "reliability": 0.1}, "reliability must be a number from 0.5 to 1"),
-        ({"looks": 1}, "looks must be a whole number of at least 2"),
-        ({"balls": 0}, "balls must be a whole number of at least 1"),
-        ({"steps": 1}, "steps must be a whole number of at least 2"),
-        ({"impacts": 0.5}, "impacts must be a whole number of at least 1"),
+        ({"max_evaluations": 1}, "max_evaluations must be a whole number of at least 2"),
+        ({"starts": 0}, "starts must be a whole number of at least 1"),
+        ({"survey_points": 1}, "survey_points must be a whole number of at least 2"),
+        ({"max_impacts": 0.5}, "max_impacts must be a whole number of at least 1"),
     ],
 )
 def test_bad_input_is_told(settings, words):
@@ -212,7 +218,7 @@ def test_weighing_basins_moves_away_from_where_few_starts_lead(found, monkeypatc
 
 # --- the script ------------------------------------------------------------------------------------------------------
 
-FEW = ["--steps", "128", "--balls", "1", "--impacts", "2"]
+FEW = ["--survey-points", "128", "--starts", "1", "--max-impacts", "2"]
 SMALL = ["--r", "0.5", "--A", "3", "--omega", "10pi", "--set", "V=1700"]
 
 BAD = [
@@ -230,9 +236,9 @@ BAD = [
     (["--objective", "most"], "objective must be among"),
     (["--objective", "worst"], "tolerances must be given with objective mean or worst"),
     (["--objective", "worst", "--tolerance", "s=1%:lognormal"], "tolerances of a worst case must be uniform"),
-    (["--balls", "0"], "balls must be a whole number of at least 1; got 0"),
-    (["--steps", "1"], "steps must be a whole number of at least 2; got 1"),
-    (["--impacts", "0"], "impacts must be a whole number of at least 1; got 0"),
+    (["--starts", "0"], "starts must be a whole number of at least 1; got 0"),
+    (["--survey-points", "1"], "survey_points must be a whole number of at least 2; got 1"),
+    (["--max-impacts", "0"], "max_impacts must be a whole number of at least 1; got 0"),
     (["--over", "d"], "over must be NAME=VALUES"),
     (["--over", "u0=0:0.1:3"], "over must be NAME=VALUES"),
     (["--over", "d=0.1:0.2:3", "--d", "0.2"], "over must name an axis that is not given besides"),
@@ -355,8 +361,8 @@ def test_chaos_is_a_design_with_its_standard_error(folder, capsys, monkeypatch):
     monkeypatch.setattr(page, "_POINTS", 8)
     monkeypatch.setattr(page, "_NEAR", 8)
     monkeypatch.setattr(page, "_BASINS", 100)
-    chaos = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--steps", "4", "--balls", "2"]
-    assert script.main([*chaos, "--impacts", "2"]) == 0
+    chaos = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--survey-points", "4", "--starts", "2"]
+    assert script.main([*chaos, "--max-impacts", "2"]) == 0
     said, report = capsys.readouterr().out, strict(folder / "design.json")
     best = report["best"]
     assert (best["label"], best["active"]) == ("aperiodic", ["lower bound of kappa"])
@@ -375,8 +381,8 @@ def test_chaos_is_a_design_with_its_standard_error(folder, capsys, monkeypatch):
 
 def test_where_no_motion_keeps_the_limits_the_report_says_which_stands(folder, capsys, monkeypatch):
     monkeypatch.setattr(page, "_POINTS", 8)
-    shallow = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--steps", "4", "--balls", "2"]
-    assert script.main([*shallow, "--impacts", "2", "--set", "penetration_limit=1e-6", "--out", "none.json"]) == 0
+    shallow = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--survey-points", "4", "--starts", "2"]
+    assert script.main([*shallow, "--max-impacts", "2", "--set", "penetration_limit=1e-6", "--out", "none.json"]) == 0
     said, met = capsys.readouterr().out, strict(folder / "none.json")["survey"]
     assert strict(folder / "none.json")["best"] is None
     assert met["limit"] == "penetration limit"

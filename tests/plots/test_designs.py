@@ -123,7 +123,7 @@ def test_a_map_of_designs_colours_them_by_what_holds_them(tmp_path):
     upper, lower = figure.axes
     assert words(figure) == [
         "penetration limit",
-        "a kink, or looks spent",
+        "a kink, or all evaluations spent",
         "nothing: interior",
         "worst within the tolerances",
     ]

@@ -210,7 +210,7 @@ def two_orbits() -> periodic.Orbit:
 
 @cache
 def designed() -> vijax.design.optimise.Design:
-    return vijax.optimise(vijax.Harvester(s=0.2), steps=8, balls=2, impacts=2, looks=6)
+    return vijax.optimise(vijax.Harvester(s=0.2), survey_points=8, starts=2, max_impacts=2, max_evaluations=6)
 
 
 def plain_numbers(told: Any) -> list[Any]:

@@ -105,7 +105,9 @@ CALLS = {
     "orbit_diagram": lambda i, known: vijax.orbit_diagram(
         along="d", values=np.linspace(0.2, 0.15, 5 + i), kappa=40.0, r=0.5, periods=30, keep=5
     ),
-    "optimise": lambda i, known: vijax.optimise(tuned(omega0(i)), steps=8, balls=2, impacts=2, looks=6),
+    "optimise": lambda i, known: vijax.optimise(
+        tuned(omega0(i)), survey_points=8, starts=2, max_impacts=2, max_evaluations=6
+    ),
 }
 
 

@@ -82,9 +82,9 @@ def _asked(
     reliability: str,
     over: str | None,
     constants: tuple[str, ...],
-    steps: int,
-    balls: int,
-    impacts: int,
+    survey_points: int,
+    starts: int,
+    max_impacts: int,
     **given: Any,
 ) -> Asked:
     from vijax.design import optimise
@@ -98,13 +98,15 @@ def _asked(
     share = optimise.check_motion(motion, objective, part("reliability", reliability))
     search: dict[str, Any] = {"tune": names, "bounds": within, "objective": objective, "tolerances": weighed}
     search |= {"motion": motion, "reliability": share}
-    return Asked(devices, along, scatter, search | {"steps": steps, "balls": balls, "impacts": impacts})
+    return Asked(
+        devices, along, scatter, search | {"survey_points": survey_points, "starts": starts, "max_impacts": max_impacts}
+    )
 
 
 def _agree(asked: Asked, yes: bool) -> None:
     from vijax.design import optimise
 
-    effort = optimise.effort(*(asked.search[name] for name in ("steps", "balls", "impacts")))
+    effort = optimise.effort(*(asked.search[name] for name in ("survey_points", "starts", "max_impacts")))
     process.agree(optimise.expected(len(asked.devices), effort), yes)
 
 
@@ -127,7 +129,7 @@ def _run(asked: Asked) -> "tuple[dict[str, Any], xr.Dataset | None, str]":
         waiting("surroundings and tolerances")
         told = [report.describe(one, diagram=diagram, **_judged(one, asked.tolerances, alone)) for one in found]
         show(stages, stages)
-    climbed = f"{sum(one.starts for one in found):,} ascents in {seconds:.1f} s"
+    climbed = f"{sum(one.ascents for one in found):,} ascents in {seconds:.1f} s"
     if asked.over is None:
         return told[0], diagram, climbed
     return {"over": {"name": asked.over[0], "values": asked.over[1]}, "designs": told}, None, climbed
@@ -264,9 +266,11 @@ def _sections() -> Sections:
     return {
         "Goal": _goal_options(),
         "Survey": [
-            click.Option(["--steps"], type=Whole(2), default=256, help="values at which the survey looks", **shown),
-            click.Option(["--balls"], type=Whole(1), default=8, help="starts of the survey at each of them", **shown),
-            click.Option(["--impacts"], type=Whole(1), default=16, help="most impacts of an orbit", **shown),
+            click.Option(
+                ["--survey-points"], type=Whole(2), default=256, help="values at which the survey looks", **shown
+            ),
+            click.Option(["--starts"], type=Whole(1), default=8, help="starts of the survey at each of them", **shown),
+            click.Option(["--max-impacts"], type=Whole(1), default=16, help="most impacts of an orbit", **shown),
         ],
         "Device": [*options.axis_options(PARAMETERS), *options.device_options()],
         "Files": options.file_options(".json", "report"),

@@ -161,7 +161,7 @@ def _judge(task: Task, place: Place, ensemble: Ensemble) -> None:
     enough = good.sum() >= max(_FEWEST, 0.5 * good.size) and value.any()
     if enough:
         surface = fit(some.offsets, value, some.found.margins(some.device), share=task.reliability)
-        noise = _SURE * float(surface.value_error + place.surface.value_error) + settings.least_gain
+        noise = _SURE * float(surface.value_error + place.surface.value_error) + settings.min_gain
         here = np.zeros_like(place.z)
         enough = surface.worth(here, settings.limit_price) > place.surface.worth(here, settings.limit_price) - noise
     if not enough:
@@ -178,11 +178,11 @@ def _step(task: Task, place: Place, ahead: np.ndarray, best: float) -> None:
     place.z, place.ahead = ahead, surface.worth(step, settings.limit_price)
     short = (np.abs(step) < 0.5 * place.radius * task.unit(place.owner)).all()
     if surface.margins.min() >= -settings.limit_room and short:
-        noise = max(2 * float(surface.value_error), settings.least_gain)
+        noise = max(2 * float(surface.value_error), settings.min_gain)
         gain = surface.worth(step, 0.0) - float(surface.value)
         place.going &= gain >= noise or place.radius > settings.last_radius
         place.radius = min(place.radius, settings.last_radius)
-    place.going &= place.ahead + _SURE * float(surface.value_error) > best - settings.least_gain
+    place.going &= place.ahead + _SURE * float(surface.value_error) > best - settings.min_gain
 
 
 def _windows(
@@ -197,7 +197,7 @@ def _windows(
             continue
         value = np.where(good, found.value(task.objective, device), 0.0)
         ball = int(value.argmax())
-        if np.log(value[ball]) > best[place.owner] + settings.least_gain:
+        if np.log(value[ball]) > best[place.owner] + settings.min_gain:
             start = found.some(np.array([ball])).end
             new.setdefault(place.owner, _place(place.owner, at + offsets[ball], _NARROW * settings.last_radius, start))
     return list(new.values())

@@ -59,9 +59,9 @@ class Climb(eqx.Module):
         step, pace: The full step to try from there, the share of it to try.
         going: Which are on the way.
         lost: Which had their last trial refused as it was no point, not for its height or the constraints.
-        looks: Evaluations of each start.
+        evaluations: Of each start.
         path, heights: Variables and values after every evaluation; NaN where the trial was refused.
-        trip: Evaluations of the batch.
+        iteration: Evaluations of the batch.
         state: Of optax.
     """
 
@@ -72,19 +72,19 @@ class Climb(eqx.Module):
     pace: Float[Array, "start"]
     going: Bool[Array, "start"]
     lost: Bool[Array, "start"]
-    looks: Int[Array, "start"]
-    path: Float[Array, "look start variable"]
-    heights: Float[Array, "look start"]
-    trip: Int[Array, ""]
+    evaluations: Int[Array, "start"]
+    path: Float[Array, "evaluation start variable"]
+    heights: Float[Array, "evaluation start"]
+    iteration: Int[Array, ""]
     state: Any
 
 
 class _Task(NamedTuple):
-    """What stays the same on every way: what is looked at, bounds, most looks, optax's memory, settings."""
+    """What stays the same on every way: what is looked at, bounds, most evaluations, optax's memory, settings."""
 
     look: Callable[..., Look]
     box: Box
-    looks: int
+    max_evaluations: int
     lbfgs: Any
     settings: DesignSettings
 
@@ -94,7 +94,7 @@ def ascend(
     z: Float[Array, "start variable"],
     memory: Any,
     box: Box,
-    looks: int,
+    max_evaluations: int,
     settings: DesignSettings = DEFAULT,
 ) -> Climb:
     """Climb from every start, under jit.
@@ -104,14 +104,14 @@ def ascend(
         z: Starts, within the bounds.
         memory: Of the starts.
         box: Their bounds.
-        looks: Evaluations that a start may take, the first one included.
+        max_evaluations: That a start may take, the first one included.
         settings: Of the barrier, how near a step may come to a constraint, and how much curvature is kept.
     """
     import optax  # here, as importing vijax must not load it
 
-    task = _Task(look, box, looks, optax.scale_by_lbfgs(settings.curvature_pairs), settings)
+    task = _Task(look, box, max_evaluations, optax.scale_by_lbfgs(settings.curvature_pairs), settings)
     start = _begun(task, z, memory)
-    return lax.while_loop(lambda c: c.going.any() & (c.trip < looks), partial(_advance, task), start)
+    return lax.while_loop(lambda c: c.going.any() & (c.iteration < max_evaluations), partial(_advance, task), start)
 
 
 def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb:
@@ -119,7 +119,7 @@ def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb
     starts = z.shape[0]
     shapes = jax.eval_shape(partial(_view, task), z, z, memory)
     blank: Look = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    path = jnp.full((task.looks, *z.shape), jnp.nan, z.dtype)
+    path = jnp.full((task.max_evaluations, *z.shape), jnp.nan, z.dtype)
     return Climb(
         z=z,
         seen=blank._replace(memory=memory),
@@ -128,10 +128,10 @@ def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb
         pace=jnp.ones(starts, z.dtype),
         going=jnp.ones(starts, bool),
         lost=jnp.zeros(starts, bool),
-        looks=jnp.zeros(starts, jnp.int32),
+        evaluations=jnp.zeros(starts, jnp.int32),
         path=path,
         heights=path[..., 0],
-        trip=jnp.int32(0),
+        iteration=jnp.int32(0),
         state=_forgotten(task, z),
     )
 
@@ -141,7 +141,7 @@ def _advance(task: _Task, c: Climb) -> Climb:
     # Who has ended looks where it is, which is soon seen: what its last trial lost would be sought in vain again.
     trial = c.z + jnp.where(c.going, c.pace, 0.0)[:, None] * c.step
     seen = _view(task, trial, c.z, c.seen.memory)
-    better = c.going & seen.there & (_higher(c, seen) | (c.trip == 0))
+    better = c.going & seen.there & (_higher(c, seen) | (c.iteration == 0))
     turns = _turns(task, c, seen)
     falls = turns | (better & (c.pace == 1) & _little(c))
     weight = jnp.where(falls, _lighter(task.settings, c.weight), c.weight)
@@ -156,19 +156,19 @@ def _advance(task: _Task, c: Climb) -> Climb:
     settled = better & (length <= _ARRIVED) & (weight <= task.settings.last_barrier)
     refused = 0.5 * c.pace * jnp.abs(c.step).max(axis=1) / jnp.maximum(length, _STUCK)
     pace = jnp.minimum(jnp.where(better, 2 * c.pace, refused), 1.0)
-    count = c.looks + c.going.astype(jnp.int32)
+    count = c.evaluations + c.going.astype(jnp.int32)
     return Climb(
         z=z,
         seen=now,
         weight=weight,
         step=step,
         pace=jnp.where(c.going, pace, c.pace),
-        going=c.going & ~settled & (pace * length > _STUCK) & (count < task.looks),
+        going=c.going & ~settled & (pace * length > _STUCK) & (count < task.max_evaluations),
         lost=jnp.where(c.going, ~seen.there, c.lost),
-        looks=count,
-        path=c.path.at[c.trip].set(jnp.where(better[:, None], trial, jnp.nan)),
-        heights=c.heights.at[c.trip].set(jnp.where(better, seen.value, jnp.nan)),
-        trip=c.trip + 1,
+        evaluations=count,
+        path=c.path.at[c.iteration].set(jnp.where(better[:, None], trial, jnp.nan)),
+        heights=c.heights.at[c.iteration].set(jnp.where(better, seen.value, jnp.nan)),
+        iteration=c.iteration + 1,
         state=state,
     )
 

@@ -27,14 +27,14 @@ _NUMBERS: dict[str, Rule] = {
     "places_apart": ("a positive number of at most 1000", lambda x: 0 < x <= 1000),
     "ensemble_radius": ("a positive number of at most 1", lambda x: 0 < x <= 1),
     "last_radius": ("a positive number of at most 1", lambda x: 0 < x <= 1),
-    "least_gain": _SHARE,
+    "min_gain": _SHARE,
     "limit_price": ("a positive number of at most 100", lambda x: 0 < x <= 100),
     "limit_room": _SHARE,
 }
 _COUNTS = (
-    "min_steps_apart",
+    "max_hills",
     "max_sure_impacts",
-    "closer_cells",
+    "survey_refinement",
     "curvature_pairs",
     "max_places",
     "ensemble_balls",
@@ -56,10 +56,11 @@ class DesignSettings:
     Attributes:
         max_period: Forcing periods of an orbit, at most, 8. Longer ones live in windows that few starts meet; each
             period more is recorded of every chaotic motion.
-        other_levels: Values of all tuned quantities but the first at which a survey looks, in parts of their bounds,
+        survey_levels: Values of all tuned quantities but the first at which a survey looks, in parts of their bounds,
             0.2, 0.5 and 0.8. Their number, to the power of the other quantities, multiplies the cells of a survey.
-        min_steps_apart: Of this many parts of the first quantity's bounds, 256, the best attractor of a kind climbs as
-            far as one part away. With fewer, kinds that have two hills may lose one; with more, many climb one hill.
+        max_hills: Of a kind along the first quantity's bounds, about, that are climbed, 256: the best attractor of a
+            kind climbs as far as one part of so many away. With fewer, kinds that have two hills may lose one; with
+            more, many climb one hill.
         max_sure_impacts: Impacts of an orbit up to which it climbs whatever it promises, 8. Orbits of more live in
             narrow windows, where no climb leads far.
         min_promise: Share of the best that an orbit of more impacts has to promise to be climbed from, and chaos to be
@@ -68,8 +69,8 @@ class DesignSettings:
             0.5.
         max_excess: Nor is one climbed there that exceeds a limit by more, as a logarithm, 0.3. Of 60 random devices
             none lost its best motion by these two; four fifths of the ascents are saved.
-        closer_cells: Times as many cells as before about a step that is looked at closer, 8. With fewer, narrow windows
-            of periodic motion in chaos are missed.
+        survey_refinement: Times as many cells as before about a step that is looked at closer, 8. With fewer, narrow
+            windows of periodic motion in chaos are missed.
         max_step: Longest step of an ascent, 0.2. Longer ones leave the branch of their orbit, and are halved until they
             do not.
         max_approach: Share of the way to a constraint that one step may go, 0.95.
@@ -93,7 +94,7 @@ class DesignSettings:
         ensemble_radius: How far the first balls are spread about a place, 0.02; a step leads as far.
         last_radius: How far the last ones are, 0.002. A wider one averages over more than the design.
         max_ensembles: Ensembles about a place, at most, 10.
-        least_gain: A place has arrived where a step promises less, as a logarithm, or less than the noise, 2e-4.
+        min_gain: A place has arrived where a step promises less, as a logarithm, or less than the noise, 2e-4.
         confirm_balls: Balls of the long flight at the end, 64.
         confirm_periods: Forcing periods that each of them is flown, 5,000. Together they meet what happens once in
             320,000.
@@ -107,13 +108,13 @@ class DesignSettings:
     """
 
     max_period: int = 8
-    other_levels: tuple[float, ...] = (0.2, 0.5, 0.8)
-    min_steps_apart: int = 256
+    survey_levels: tuple[float, ...] = (0.2, 0.5, 0.8)
+    max_hills: int = 256
     max_sure_impacts: int = 8
     min_promise: float = 0.8
     min_rival: float = 0.5
     max_excess: float = 0.3
-    closer_cells: int = 8
+    survey_refinement: int = 8
     max_step: float = 0.2
     max_approach: float = 0.95
     curvature_pairs: int = 8
@@ -132,7 +133,7 @@ class DesignSettings:
     ensemble_radius: float = 0.02
     last_radius: float = 0.002
     max_ensembles: int = 10
-    least_gain: float = 2e-4
+    min_gain: float = 2e-4
     confirm_balls: int = 64
     confirm_periods: int = 5000
     expected_balls: int = 1024
@@ -141,7 +142,9 @@ class DesignSettings:
 
     def __post_init__(self) -> None:
         self._set("max_period", checks.whole("max_period", self.max_period, 1, _MOST_PERIOD))
-        self._set("other_levels", tuple(_level(one) for one in checks.numbers("other_levels", self.other_levels).flat))
+        self._set(
+            "survey_levels", tuple(_level(one) for one in checks.numbers("survey_levels", self.survey_levels).flat)
+        )
         for name, (must, holds) in _NUMBERS.items():
             self._set(name, checks.real(name, getattr(self, name), must, holds))
         for name in _COUNTS:
@@ -153,7 +156,7 @@ class DesignSettings:
 
 
 def _level(value: Any) -> float:
-    return checks.real("other_levels", float(value), "numbers from 0 to 1", lambda x: 0 <= x <= 1)
+    return checks.real("survey_levels", float(value), "numbers from 0 to 1", lambda x: 0 <= x <= 1)
 
 
 DEFAULT = DesignSettings()

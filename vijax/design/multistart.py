@@ -27,11 +27,19 @@ _HOPELESS = -1e3  # score of what breaks a constraint, before what it lacks
 
 
 class Effort(NamedTuple):
-    """Of a survey: values of the first quantity, starts at each, most impacts, periods of a start, settings."""
+    """How far a survey looks.
 
-    steps: int
-    balls: int
-    impacts: int
+    Attributes:
+        points: Values of the first quantity.
+        starts: At each of them.
+        max_impacts: Of an orbit that is wanted.
+        periods: Forcing periods that a start may take.
+        settings: See there.
+    """
+
+    points: int
+    starts: int
+    max_impacts: int
     periods: int
     settings: DesignSettings = DEFAULT
 
@@ -132,7 +140,7 @@ def find(
     """
     scene = _Scene(devices, tune, box, effort)
     seen = _first_look(scene)
-    met, unrest = seen.orbits(effort.impacts), seen.restless(effort.impacts)
+    met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
     if _first(tune) is not None:
         most = _most(promise(met, objective), met.owner, len(devices))
         if not orbits_alone:
@@ -140,13 +148,13 @@ def find(
         again = _closer(unrest, most, objective, effort, scene.cells)
         if again.owner.size:
             closer = _look(scene, again, 1)
-            more = closer.orbits(effort.impacts), closer.restless(effort.impacts)
+            more = closer.orbits(effort.max_impacts), closer.restless(effort.max_impacts)
             met, unrest = jax.tree.map(lambda *x: np.concatenate(x), (met, unrest), more)
     looked = [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
-    chosen = met.some(_promising(met, objective, len(devices), scene.steps, effort.settings))
+    chosen = met.some(_promising(met, objective, len(devices), scene.points, effort.settings))
     if not orbits_alone:
         chosen = chosen.some(_rivals(chosen, unrest, objective, len(devices), effort.settings))
-    flights = flown(chosen.pair, chosen.ended, effort.impacts)
+    flights = flown(chosen.pair, chosen.ended, effort.max_impacts)
     return Begun(flights, chosen.device, chosen.z, chosen.owner), unrest, looked
 
 
@@ -155,17 +163,17 @@ def every_start(
 ) -> tuple[Met, list[Looked]]:
     """What every start came to, where that is the answer, and what was met of every device; arguments as in `find`."""
     seen = _first_look(_Scene(devices, tune, box, effort))
-    met, unrest = seen.orbits(effort.impacts), seen.restless(effort.impacts)
+    met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
     return seen.every(), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
 
 
 def _first_look(scene: "_Scene") -> "_Seen":
     """The coarse survey: as many balls at every value."""
     levels = len(_levels(scene.tune, scene.effort))
-    shape = len(scene.devices), levels, scene.steps, scene.effort.balls
+    shape = len(scene.devices), levels, scene.points, scene.effort.starts
     owner, level, step, _ = (x.ravel() for x in np.indices(shape))
     number = np.arange(owner.size) % scene.cells
-    return _look(scene, _Places(owner, level, step / max(scene.steps - 1, 1), number), 0)
+    return _look(scene, _Places(owner, level, step / max(scene.points - 1, 1), number), 0)
 
 
 def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
@@ -201,14 +209,14 @@ class _Scene(NamedTuple):
     effort: Effort
 
     @property
-    def steps(self) -> int:
+    def points(self) -> int:
         """Values of the first quantity at which is looked."""
-        return 1 if _first(self.tune) is None else self.effort.steps
+        return 1 if _first(self.tune) is None else self.effort.points
 
     @property
     def cells(self) -> int:
         """Balls of a device that are flown in a look, at most."""
-        return len(_levels(self.tune, self.effort)) * self.steps * self.effort.balls
+        return len(_levels(self.tune, self.effort)) * self.points * self.effort.starts
 
 
 def _first(tune: tuple[str, ...]) -> int | None:
@@ -218,7 +226,7 @@ def _first(tune: tuple[str, ...]) -> int | None:
 
 def _levels(tune: tuple[str, ...], effort: Effort) -> np.ndarray:
     """Values [level, quantity] of the others, in parts of their bounds."""
-    first, levels = _first(tune), effort.settings.other_levels
+    first, levels = _first(tune), effort.settings.survey_levels
     return np.array(
         list(itertools.product(*((0.5,) if i == first or not moving(x) else levels for i, x in enumerate(tune))))
     )
@@ -268,7 +276,7 @@ def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
     u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
     starts = Starts(u0 * pair.d, v0, np.zeros_like(v0))
     found = survey(pair, every, starts, longest=effort.settings.max_period, periods=effort.periods)
-    step = np.round(places.part * (effort.steps - 1)).astype(int)
+    step = np.round(places.part * (effort.points - 1)).astype(int)
     return _Seen(found, every, z, places, step)
 
 
@@ -282,14 +290,14 @@ def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, most_
     places = [_Places(*np.zeros((4, 0), int))]
     for one in np.unique(owner):
         here = np.flatnonzero(owner == one)
-        number = np.arange(min(here.size * effort.settings.closer_cells * effort.balls, most_cells))
+        number = np.arange(min(here.size * effort.settings.survey_refinement * effort.starts, most_cells))
         index, turn = here[number % here.size], number // here.size
-        part = (step[index] + (turn + 0.5) / (turn.max() + 1) - 0.5) / (effort.steps - 1)
+        part = (step[index] + (turn + 0.5) / (turn.max() + 1) - 0.5) / (effort.points - 1)
         places.append(_Places(owner[index], level[index], np.clip(part, 0.0, 1.0), number))
     return jax.tree.map(lambda *x: np.concatenate(x), *places)
 
 
-def _promising(met: Met, objective: str, devices: int, steps: int, settings: DesignSettings) -> np.ndarray:
+def _promising(met: Met, objective: str, devices: int, points: int, settings: DesignSettings) -> np.ndarray:
     """Indices of the attractors to climb from: the best of their kind as far as so many steps away.
 
     A kind is given by span and impacts; the walls may change places where the tube is level.
@@ -298,7 +306,7 @@ def _promising(met: Met, objective: str, devices: int, steps: int, settings: Des
     score = np.where(hope.lacks < 0, _HOPELESS + hope.lacks, hope.value)
     left, right = _impacts(met)
     kind = np.column_stack([met.owner, met.level, met.ended.period, left, right])
-    found = highest(kind, met.step, score, max(1, steps // settings.min_steps_apart))
+    found = highest(kind, met.step, score, max(1, points // settings.max_hills))
     enough = hope.total > _most(hope, met.owner, devices)[met.owner] + math.log(settings.min_promise)
     return found[(enough | (left + right <= settings.max_sure_impacts))[found]]
 

@@ -26,7 +26,7 @@ OBJECTIVES: dict[Objective, str] = {
     "expected": "mean of P over all starts, each attractor by its share of them, and over the tolerances [J]",
 }
 _STEPS = 4  # so many lead from the nominal orbit to that of a device off by its tolerance
-_TRIPS = 16  # Newton's search near a known orbit gives up after so many: lost ones take them all
+_MOST_ITERATIONS = 16  # Newton's search near a known orbit gives up after so many: lost ones take them all
 _SHARP = 300.0  # how nearly the soft minimum, whose gradient stands for the worst case's, is the minimum
 _MOST = 20.0  # logarithms of margins end here: no contact, no voltage
 
@@ -94,7 +94,7 @@ def _settled(scene: Scene, batch: Batch, z, factors, guess):
     starts, count = guess.shape[:2]
     sequence = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), batch.sequence)
     flat = jax.tree.map(lambda x: x.reshape(starts * count, *x.shape[2:]), (pair, guess))
-    found = shooting.newton(flat[0], sequence, flat[1], _TRIPS)
+    found = shooting.newton(flat[0], sequence, flat[1], _MOST_ITERATIONS)
     return jax.tree.map(lambda x: x.reshape(starts, count, *x.shape[1:]), found)
 
 

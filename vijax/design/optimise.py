@@ -37,7 +37,7 @@ OVER_TOLERANCES = ("mean", "worst")
 _LOG = logging.getLogger(__name__)
 _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
 _TILE = 16  # starts of one compiled call: those that end soon wait for the others
-_MOST_LOOKS, _MOST_STEPS, _MOST_IMPACTS = 10**5, 10**7, 256
+_MOST_EVALUATIONS, _MOST_POINTS, _MOST_IMPACTS = 10**5, 10**7, 256
 _BALL = 1000  # bytes that a survey keeps of a ball
 
 
@@ -53,7 +53,7 @@ class Design:
         objective: Of `OBJECTIVES`.
         tolerances: Of the objective.
         looked: What the survey met, periodic and not.
-        starts: How many of them climbed.
+        ascents: How many there were, one from each attractor chosen.
     """
 
     optima: tuple[Optimum | AperiodicOptimum, ...]
@@ -62,7 +62,7 @@ class Design:
     objective: Objective
     tolerances: tuple[Tolerance, ...]
     looked: Looked
-    starts: int
+    ascents: int
 
     @property
     def best(self) -> Optimum | AperiodicOptimum | None:
@@ -86,11 +86,11 @@ def optimise(
     tolerances: Iterable[Tolerance] = (),
     reliability: float = 1.0,
     samples: int | None = None,
-    looks: int = 60,
-    steps: int = 256,
-    balls: int = 8,
-    impacts: int = 16,
-    periods: int = 200,
+    survey_points: int = 256,
+    starts: int = 8,
+    survey_periods: int = 200,
+    max_impacts: int = 16,
+    max_evaluations: int = 60,
     settings: DesignSettings = DEFAULT,
 ) -> Design:
     """Find the admissible designs of one device that harvest most, the best first.
@@ -99,7 +99,7 @@ def optimise(
         device: Where quantities that are not tuned are taken from; Tables I and II unless given.
         tune, bounds, objective, motion, tolerances, reliability, samples: What is sought: as in
             `vijax.design.optimise.optimise_all`, which takes many devices at once.
-        looks, steps, balls, impacts, periods, settings: How far to look: likewise.
+        survey_points, starts, survey_periods, max_impacts, max_evaluations, settings: How far to look: likewise.
 
     Raises:
         ValueError: Which argument, what must hold, what came.
@@ -113,11 +113,11 @@ def optimise(
         tolerances=tolerances,
         reliability=reliability,
         samples=samples,
-        looks=looks,
-        steps=steps,
-        balls=balls,
-        impacts=impacts,
-        periods=periods,
+        survey_points=survey_points,
+        starts=starts,
+        survey_periods=survey_periods,
+        max_impacts=max_impacts,
+        max_evaluations=max_evaluations,
         settings=settings,
     )[0]
 
@@ -133,11 +133,11 @@ def optimise_all(
     tolerances: Iterable[Tolerance] = (),
     reliability: float = 1.0,
     samples: int | None = None,
-    looks: int = 60,
-    steps: int = 256,
-    balls: int = 8,
-    impacts: int = 16,
-    periods: int = 200,
+    survey_points: int = 256,
+    starts: int = 8,
+    survey_periods: int = 200,
+    max_impacts: int = 16,
+    max_evaluations: int = 60,
     settings: DesignSettings = DEFAULT,
 ) -> list[Design]:
     """The admissible designs that harvest most, each device's tuned quantities between bounds.
@@ -157,12 +157,12 @@ def optimise_all(
         tolerances: How constants scatter, for "mean", "worst" and "expected".
         reliability: Share of the balls of "expected" that have to keep the limits in all that is flown.
         samples: Random devices for the first two, in place of a quadrature.
-        looks: Evaluations of objective with gradient that a start may take.
-        steps: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself, where
-            chaos promises more than the best orbit so far: there the best orbit may live in a narrow window.
-        balls: Starts from which it looks at each of them; more meet attractors with small basins.
-        impacts: Of an orbit, at most: longer ones are not looked for. Fewer are compiled and climb faster.
-        periods: Forcing periods that each of them may take.
+        survey_points: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself,
+            where chaos promises more than the best orbit so far: there the best orbit may live in a narrow window.
+        starts: Of the ball, from which it looks at each of them; more meet attractors with small basins.
+        survey_periods: Forcing periods that each of them may take.
+        max_impacts: Of an orbit: longer ones are not looked for. Fewer are compiled and climb faster.
+        max_evaluations: Of objective and gradient, in one ascent.
         settings: Of survey, ascent and verification; see `DesignSettings`.
 
     Returns:
@@ -180,10 +180,8 @@ def optimise_all(
             f"samples must be left out with objective expected, whose balls have random devices; got {samples!r}; "
             "settings=DesignSettings(expected_balls=...) says how many"
         )
-    looks, far = (
-        checks.whole("looks", looks, 2, _MOST_LOOKS),
-        effort(steps, balls, impacts, periods)._replace(settings=check_settings(settings)),
-    )
+    max_evaluations = checks.whole("max_evaluations", max_evaluations, 2, _MOST_EVALUATIONS)
+    far = effort(survey_points, starts, max_impacts, survey_periods)._replace(settings=check_settings(settings))
     box = check(devices, tune, bounds, objective, scatter)
     if (asked := expected(len(devices), far)).long:
         _LOG.warning("a long run begins: %s", asked)
@@ -195,9 +193,9 @@ def optimise_all(
         optima: list[list[Optimum]] = [[] for _ in devices]
         climbed = [0] * len(devices)
     else:
-        starts, met, looked = find(devices, tune, box, objective, far, orbits_alone=alone)
-        climbed = np.bincount(starts.owner, minlength=len(devices)).tolist()
-        optima = _on_orbits(task, starts, cloud, looks)
+        begun, met, looked = find(devices, tune, box, objective, far, orbits_alone=alone)
+        climbed = np.bincount(begun.owner, minlength=len(devices)).tolist()
+        optima = _on_orbits(task, begun, cloud, max_evaluations)
     beyond = [None] * len(devices) if alone else _beyond(task, met, optima)
     return [
         Design(
@@ -207,17 +205,17 @@ def optimise_all(
             objective=objective,
             tolerances=scatter,
             looked=looked[owner],
-            starts=climbed[owner],
+            ascents=climbed[owner],
         )
         for owner in range(len(devices))
     ]
 
 
-def _on_orbits(task: Task, starts: Begun, cloud: Nodes, looks: int) -> list[list[Optimum]]:
+def _on_orbits(task: Task, starts: Begun, cloud: Nodes, max_evaluations: int) -> list[list[Optimum]]:
     """The optima of every device to which its orbits climb, the best first."""
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), task.tune, cloud.names, task.objective)
-    ends = _climbed(scene, starts, task.box, looks, task.settings)
-    return verified(scene, starts, ends, task.devices, looks, task.settings)
+    ends = _climbed(scene, starts, task.box, max_evaluations, task.settings)
+    return verified(scene, starts, ends, task.devices, max_evaluations, task.settings)
 
 
 def _beyond(task: Task, met: Met, orbits: list[list[Optimum]]) -> list[AperiodicOptimum | None]:
@@ -252,11 +250,14 @@ def under(optimum: Optimum | AperiodicOptimum, tolerances: Iterable[Tolerance], 
     return Spread(*(float(x[0]) for x in aims.spread(scene, batch)))
 
 
-def effort(steps: int, balls: int, impacts: int, periods: int = 200) -> Effort:
+def effort(survey_points: int, starts: int, max_impacts: int, survey_periods: int = 200) -> Effort:
     """How far a survey looks; raises ValueError as `optimise_all` does."""
-    steps, balls = checks.whole("steps", steps, 2, _MOST_STEPS), checks.whole("balls", balls, 1, _MOST_STEPS)
-    longest = checks.whole("impacts", impacts, 1, _MOST_IMPACTS)
-    return Effort(steps, balls, longest, checks.whole("periods", periods, 1))
+    return Effort(
+        checks.whole("survey_points", survey_points, 2, _MOST_POINTS),
+        checks.whole("starts", starts, 1, _MOST_POINTS),
+        checks.whole("max_impacts", max_impacts, 1, _MOST_IMPACTS),
+        checks.whole("survey_periods", survey_periods, 1),
+    )
 
 
 def expected(devices: int, far: Effort) -> Estimate:
@@ -265,8 +266,8 @@ def expected(devices: int, far: Effort) -> Estimate:
     Raises:
         ValueError: If its balls do not fit in memory.
     """
-    count = devices * far.steps * far.balls
-    checks.fits(("devices", "steps", "balls"), count * _BALL, f"{count:,} balls")
+    count = devices * far.points * far.starts
+    checks.fits(("devices", "survey_points", "starts"), count * _BALL, f"{count:,} balls")
     return estimate.of_recorded(count, far.periods, count * _BALL)
 
 
@@ -306,17 +307,18 @@ def check_motion(motion: str, objective: str, reliability: float) -> float:
 
 
 @lru_cache(maxsize=8)
-def _compiled(looks: int, settings: DesignSettings):
+def _compiled(max_evaluations: int, settings: DesignSettings):
     def climb(scene: Scene, batch: Batch) -> Climb:
         box = Box(batch.low, batch.high, settings.max_step)
-        return ascend(partial(aims.look, scene, batch), batch.z, aims.begin(scene, batch), box, looks, settings)
+        look = partial(aims.look, scene, batch)
+        return ascend(look, batch.z, aims.begin(scene, batch), box, max_evaluations, settings)
 
     return jax.jit(climb, compiler_options=xla.compiler_options())
 
 
-def _climbed(scene: Scene, starts: Begun, box: np.ndarray, looks: int, settings: DesignSettings) -> list[End]:
+def _climbed(scene: Scene, starts: Begun, box: np.ndarray, max_evaluations: int, settings: DesignSettings) -> list[End]:
     """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
-    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(looks, settings)
+    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(max_evaluations, settings)
     ends: list[End | None] = [None] * count.size
 
     def part(some: np.ndarray, width: int, tile: tiles.Tile) -> None:
@@ -325,7 +327,7 @@ def _climbed(scene: Scene, starts: Begun, box: np.ndarray, looks: int, settings:
         begun = (jnp.asarray(x) for x in (own.flown.knots[:, :width], own.z, *bounds))
         end = work(scene, Batch(jax.tree.map(jnp.asarray, own.device), own.flown.sequence(width), *begun))
         seen, lost, settled, taken = (
-            jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, converged(end), end.looks)
+            jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, converged(end), end.evaluations)
         )
         path, heights, z = np.asarray(end.path), np.asarray(end.heights), np.asarray(end.z)
         for row, index in enumerate(rows[: tile.real]):

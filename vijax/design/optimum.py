@@ -67,17 +67,17 @@ class Optimum(AnyOptimum):
     Attributes:
         orbit: Its orbit, along a leading axis of one; multipliers are its own.
         state: Energies, depths, margins' parts, condition and clearance of the nominal device; see `Steady`.
-        looks: Evaluations of objective with gradient that it took.
+        evaluations: Of objective and gradient that it took.
 
     What holds it there names impacts. `stopped` is "maximum"; "supremum", where the objective rises up to the end of
-    the orbit, which no orbit attains; "looks", when these were spent; "stalled", where no step is higher though the
-    gradient is not zero: at a kink, such as a worst case has where two devices are alike; "weighted", of
+    the orbit, which no orbit attains; "evaluations", when these were spent; "stalled", where no step is higher though
+    the gradient is not zero: at a kink, such as a worst case has where two devices are alike; "weighted", of
     `robustness.weighted`.
     """
 
     orbit: Orbit
     state: Steady
-    looks: int
+    evaluations: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ class End(NamedTuple):
     knots: np.ndarray
     lost: bool
     settled: bool
-    looks: int
+    evaluations: int
     path: np.ndarray
     heights: np.ndarray
 
@@ -133,7 +133,7 @@ def verified(
     starts: Begun,
     ends: list[End],
     devices: list[Harvester],
-    looks: int,
+    max_evaluations: int,
     settings: DesignSettings,
 ) -> list[list[Optimum]]:
     """What was reached for every device: admissible, verified, each optimum once, the best first."""
@@ -167,8 +167,8 @@ def verified(
                 state=seen[row],
                 gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
                 active=_active(scene, end, found.sequence.side[row], settings.active_margin),
-                stopped=_reason(end, looks),
-                looks=end.looks,
+                stopped=_reason(end, max_evaluations),
+                evaluations=end.evaluations,
                 path=np.asarray(values(scene.names, end.path[there])),
                 heights=np.exp(end.heights[there]),
             )
@@ -176,12 +176,12 @@ def verified(
     return optima
 
 
-def _reason(end: End, looks: int) -> str:
+def _reason(end: End, max_evaluations: int) -> str:
     if end.lost:
         return "supremum"
     if end.settled:
         return "maximum"
-    return "looks" if end.looks >= looks else "stalled"
+    return "evaluations" if end.evaluations >= max_evaluations else "stalled"
 
 
 def apart(good: list[int], ends: list[End], owner: np.ndarray, same: float) -> Iterator[list[int]]:

@@ -65,7 +65,7 @@ def describe(
         "objective": design.objective,
         "objective_means": OBJECTIVES[design.objective],
         "survey": design.looked._asdict(),
-        "starts": design.starts,
+        "ascents": design.ascents,
         "best": optimum(design.best) if design.best else None,
         "others": [optimum(one) for one in design.optima[1:]],
         "surroundings": _surroundings(surroundings) if surroundings else None,
@@ -118,7 +118,7 @@ def _averaged(one: AperiodicOptimum) -> dict[str, Any]:
         "gradient_stderr": one.gradient_stderr,
         "balls": one.flown[0],
         "periods": one.flown[1],
-        "looks": one.ensembles,
+        "ensembles": one.ensembles,
     }
 
 
@@ -138,7 +138,7 @@ def _orbit(one: Optimum) -> dict[str, Any]:
         "condition": float(state.condition),
         "clearance": {name: float(x) for name, x in state.clearance._asdict().items()},
         "residual": float(state.residual),
-        "looks": one.looks,
+        "evaluations": one.evaluations,
     }
 
 
@@ -195,7 +195,7 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
     checks.record("report", report, ("bounds", "objective", "best"), "vijax.design.report.describe")
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in report["bounds"].items())
     yield f"tuned: {ranges}; objective {report['objective']}, {report['objective_means']}"
-    yield f"survey: {report['survey']['orbits']:,} periodic attractors met, {report['starts']:,} climbed"
+    yield f"survey: {report['survey']['orbits']:,} periodic attractors met, {report['ascents']:,} climbed"
     best = report["best"]
     if best is None:
         yield "no admissible motion was found; what the survey met instead:"
@@ -270,10 +270,11 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
     why = {
         "supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains",
         "ensembles": "all of them spent",
+        "evaluations": "all of them spent",
         "stalled": "no step is higher though the gradient is not zero: a kink",
     }
     counted = "ensembles" if "balls" in best else "evaluations"
-    yield f"  stopped after {best['looks']} {counted}: {why.get(best['stopped'], best['stopped'])}"
+    yield f"  stopped after {best[counted]} {counted}: {why.get(best['stopped'], best['stopped'])}"
     yield f"  held by: {held}"
     smooth = ", of a smoothed minimum" if objective == "worst" else ""
     yield f"  log-gradient at the end{smooth}: {gradient}"

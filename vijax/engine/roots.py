@@ -79,6 +79,6 @@ def householder(f: Values, f1: Values, f2: Values, f3: Values) -> Values:
 def single(tree: Any) -> Any:
     """Floating leaves in single precision.
 
-    An iteration of fourth order needs double precision in its last trip alone: the others cost a quarter as much.
+    An iteration of fourth order needs double precision in the last one alone: the others cost a quarter as much.
     """
     return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != jnp.bool_ else x, tree)

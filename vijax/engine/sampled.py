@@ -231,8 +231,8 @@ def _step(c: _Contact, s: Zeros, w: Zeros, z: Zeros) -> tuple[Zeros, tuple[Zeros
 def _polish(c: _Contact, s: Zeros) -> tuple[Zeros, Zeros, tuple[Zeros, ...]]:
     """The exit, a zero of w, near the first row of s, and the crest, a zero of w', near its second, if it has one.
 
-    With the last step towards each, and the derivatives of w before that step. The second trip's closed form is the
-    careful one, which loses nothing in short contacts and at resonance.
+    With the last step towards each, and the derivatives of w before that step. The second iteration's closed form is
+    the careful one, which loses nothing in short contacts and at resonance.
     """
     w, z = _state(c, _turned(c, s))
     s = share(s + _step(c, s, w, z)[0])

@@ -22,7 +22,7 @@ from vijax.runtime.arrays import AnyArray
 Knots = Float[Array, "impact 3"]
 """Onset time, speed into the wall (> 0) and contact time of each impact."""
 
-_TRIPS = 80  # evaluations that a damped search may take; a neighbour's orbit needs 4 or 5
+_MOST_ITERATIONS = 80  # of a damped search; a neighbour's orbit needs 4 or 5
 _LAST_STEP = 1e-9  # a Newton step this small is the last: the next one would be its square
 _FLOOR = 1e-12  # residual at which rounding may keep a search from improving
 _LEAST_PACE = 1e-4  # share of Newton's step below which the search has stalled
@@ -207,16 +207,16 @@ class _Descent(eqx.Module):
     missing: Float[Array, "orbit"]
     pace: Float[Array, "orbit"]
     going: Bool[Array, "orbit"]
-    trip: Int[Array, ""]
+    iteration: Int[Array, ""]
 
 
 def newton(
-    pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"], trips: int = _TRIPS
+    pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"], max_iterations: int = _MOST_ITERATIONS
 ) -> tuple[Float[Array, "orbit impact 3"], Float[Array, "orbit"]]:
     """Damped Newton on a batch of orbits: a step that does not shorten what is missing is halved.
 
     Args:
-        trips: Evaluations that a search may take; the batch takes as many as its slowest search.
+        max_iterations: That a search may take, one evaluation each; the batch takes as many as its slowest search.
 
     Returns:
         The knots, and the largest residual at each; inf where the search stalled, or left what is possible.
@@ -245,13 +245,13 @@ def newton(
             missing=jnp.where(better, missing, d.missing),
             pace=jnp.where(d.going, pace, d.pace),
             going=d.going & (pace > _LEAST_PACE) & ~(better & (size(step) <= _LAST_STEP)),
-            trip=d.trip + 1,
+            iteration=d.iteration + 1,
         )
 
     # The first trial is the guess itself.
     zero, far = jnp.zeros_like(knots), jnp.full(knots.shape[0], jnp.inf)
     start = _Descent(knots, zero, far, jnp.ones_like(far), far > 0, jnp.int32(0))
-    end = lax.while_loop(lambda d: d.going.any() & (d.trip < trips), advance, start)
+    end = lax.while_loop(lambda d: d.going.any() & (d.iteration < max_iterations), advance, start)
     arrived = (end.missing < jnp.inf) & ((size(end.step) <= _LAST_STEP) | (end.missing < _FLOOR))
     knots = jnp.where(arrived[:, None, None], end.knots - end.step, end.knots)
     residual = jnp.abs(jax.vmap(gap)(pair, sequence, knots)).max(axis=1)

@@ -192,7 +192,7 @@ _HELD = {  # what holds a design, by the words it begins with
     "lower": ("#8c564b", "a bound"),
     "upper": ("#8c564b", "a bound"),
     "supremum": ("#d62728", "end of the orbit"),
-    "unsettled": ("#7f7f7f", "a kink, or looks spent"),
+    "unsettled": ("#7f7f7f", "a kink, or all evaluations spent"),
     "": ("#2ca02c", "nothing: interior"),
 }
 
