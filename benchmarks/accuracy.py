@@ -59,7 +59,7 @@ def say(what: str, value: float, limit: float, note: str = "") -> None:
 
 
 def reference() -> None:
-    """Impact sequences of 50 digits."""
+    """Compare impact sequences with those of 50 digits."""
     first, all_of = 0.0, 0.0
     for cases in (yardstick.SOFT, yardstick.RIGID):
         for case, errors in yardstick.compare(cases):
@@ -71,7 +71,7 @@ def reference() -> None:
 
 
 def plane(periods: int) -> None:
-    """Reference cells of the (d, kappa) plane."""
+    """Compare reference cells of the (d, kappa) plane."""
     cells = json.loads((yardstick.DATA / "plane_cells.json").read_text())["cells"]
     count = len(cells)
     pair = ImpactPair(*(jnp.asarray([c[k] for c in cells], float) for k in ("d", "kappa", "r", "gamma")))
@@ -104,7 +104,7 @@ def plane(periods: int) -> None:
 
 
 def audit(share: float) -> None:
-    """Drawn flights and contacts against a dense scan in long double, and constructed extrema."""
+    """Audit drawn flights and contacts by a dense scan in long double, and constructed extrema."""
     flights, contacts, bad_flight, bad_contact, determinant, undecided = 0, 0, 0, 0, 0.0, 0
     for soft, seed, count in ((True, 101, int(2600 * share)), (False, 102, int(1300 * share))):
         pair, state = yardstick.random_cells(np.random.default_rng(seed), count, soft)
@@ -133,7 +133,7 @@ def audit(share: float) -> None:
 
 
 def gradients() -> None:
-    """Derivatives of impacts against differences in 50 digits."""
+    """Compare derivatives of impacts with differences in 50 digits."""
     worst = [0.0, 0.0]
     for rigid in (False, True):
         cases, directions, first, second, _ = derivatives.derivatives(rigid)
@@ -151,7 +151,7 @@ WIDTH = 16  # impacts of an orbit at most
 
 
 def steady_states(count: int) -> None:
-    """Steady states beside the impact map's flight of the same orbits, from attractors of drawn cells, d moved."""
+    """Compare steady states with the impact map's flight of the same orbits, from drawn cells' attractors, d moved."""
     draw = np.random.default_rng(105)
     d = np.exp(draw.uniform(np.log(0.005), np.log(0.6), count))
     kappa = np.exp(draw.uniform(np.log(5), np.log(5e3), count))
@@ -180,7 +180,7 @@ def steady_states(count: int) -> None:
 
 
 def _steadily(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> Steady:
-    """Steady states of many orbits, in tiles."""
+    """Compute steady states of many orbits, in tiles."""
 
     def one_of(pair: ImpactPair, sequence: Sequence, knots: Any) -> Steady:
         return response(device, pair, sequence, *find(pair, sequence, knots))
@@ -194,7 +194,7 @@ FLOWN = 20_000  # forcing periods that a label must outlast
 
 
 def long_periods(count: int) -> None:
-    """Labels of long periods beside the motion that the same starts have come to after many periods more."""
+    """Compare labels of long periods with the motion that the same starts have come to after many periods more."""
     draw, cells = np.random.default_rng(106), 0
     met: list[list[Any]] = []
     while sum(d.size for d, *_ in met) < count:
@@ -217,7 +217,7 @@ def long_periods(count: int) -> None:
 
 
 def _labelled(d: np.ndarray, kappa: np.ndarray, r: np.ndarray, **settings: Any) -> simulate.Summary:
-    """Summaries of level cells at the default start, in a padded tile."""
+    """Summarise level cells at the default start, in a padded tile."""
     rows = np.resize(np.arange(d.size), max(1 << (d.size - 1).bit_length(), 512))
     pair = ImpactPair(*(jnp.asarray(x[rows]) for x in (d, kappa, r, np.zeros_like(d))))
     u0, v0, one = jnp.minimum(0.05853, 0.49 * pair.d), jnp.full(rows.size, -0.47898), jnp.ones(rows.size)
@@ -230,7 +230,7 @@ PARTS = "reference", "plane", "audit", "gradients", "steady", "labels"
 
 
 def _parts(quick: bool) -> tuple[Callable[[], None], ...]:
-    """What is run, in the order of `PARTS`."""
+    """List what is run, in the order of `PARTS`."""
     return (
         reference,
         lambda: plane(200 if quick else 2000),

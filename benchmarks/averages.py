@@ -78,18 +78,18 @@ class Row(NamedTuple):
 
 
 def device(kappa: float, **constants: float) -> Harvester:
-    """A device with the given stiffness."""
+    """Make a device with the given stiffness."""
     return tuned(Harvester(**constants), ("kappa",), jnp.log(jnp.asarray([kappa])))
 
 
 def elasticity(found: vijax.Average, of: Harvester, name: str) -> tuple[float, float]:
-    """Derivative dlnP/dln of d, kappa or r, and its standard error."""
+    """Compute the derivative dlnP/dln of d, kappa or r, and its standard error."""
     scale = float(value_of(of, name) / found.P)
     return float(getattr(found.by_pair, name)) * scale, float(getattr(found.by_pair_stderr, name)) * abs(scale)
 
 
 def verdict(found: vijax.Average) -> str:
-    """In a word."""
+    """Say in a word."""
     return vijax.Smoothness(int(found.verdict)).name.lower()
 
 
@@ -97,7 +97,7 @@ def verdict(found: vijax.Average) -> str:
 
 
 def population(seed: int) -> list[Harvester]:
-    """Devices drawn at random."""
+    """Draw devices at random."""
     draw = np.random.default_rng(seed)
 
     def even(low: float, high: float) -> np.ndarray:
@@ -117,7 +117,7 @@ def population(seed: int) -> list[Harvester]:
 
 
 def chaotic(devices: list[Harvester]) -> np.ndarray:
-    """Which are certainly chaotic from every start."""
+    """Say which are certainly chaotic from every start."""
     row = np.repeat(np.arange(len(devices)), SCANNED)
     every = jax.tree.map(lambda *x: np.array(x, float)[row], *devices)
     pair = jax.tree.map(np.asarray, jax.vmap(Harvester.pair)(every))
@@ -128,7 +128,7 @@ def chaotic(devices: list[Harvester]) -> np.ndarray:
 
 
 def chaotic_cells(count: int) -> Iterator[Harvester]:
-    """So many of them."""
+    """Find so many of them."""
     seed = SEED
     while count > 0:
         drawn = population(seed)
@@ -138,7 +138,7 @@ def chaotic_cells(count: int) -> Iterator[Harvester]:
 
 
 def cells(count: int) -> Iterator[Row]:
-    """Derivatives against local fits of ten times as many balls."""
+    """Compare derivatives with local fits of ten times as many balls."""
 
     def one(numbered: tuple[int, Harvester]) -> list[Row]:
         index, of = numbered
@@ -208,7 +208,7 @@ def by_the_orbit(of: Harvester) -> float:
 
 
 def growth(_: int) -> Iterator[Row]:
-    """Error of dP/dln kappa against periods flown."""
+    """Measure the error of dP/dln kappa against periods flown."""
     for scene, (kappa, constants) in SCENES.items():
         of = device(kappa, **constants)
         fine = vijax.average(of, balls=TIMES * 4096, seed=SEED)
@@ -240,7 +240,7 @@ BALLS = 32, 64, 128, 256, 512, 1024, 4096
 
 
 def edge(_: int) -> Iterator[Row]:
-    """P and its slope through the end of chaos; the reference is the difference of the neighbours' P."""
+    """Measure P and its slope through the end of chaos; the reference is the difference of the neighbours' P."""
     found = [(of, vijax.average(of, balls=1024, spread=NEAR)) for of in (device(kappa, **FIRST) for kappa in EDGE)]
     P = np.array([float(one.P) for _, one in found])
     error = np.array([float(one.P_stderr) for _, one in found])
@@ -263,7 +263,7 @@ def edge(_: int) -> Iterator[Row]:
 
 
 def missed(_: int) -> Iterator[Row]:
-    """P beside two attractors, one of which few starts end on."""
+    """Measure P beside two attractors, one of which few starts end on."""
     of = device(4.00713, **SMALL)
     truth = vijax.average(of, balls=2**14, spread=NEAR, seed=SEED)
     for balls in BALLS:
@@ -278,7 +278,7 @@ PARTS: dict[str, Callable[[int], Iterator[Row]]] = {"cells": cells, "growth": gr
 
 
 def read(path: Path) -> list[Row]:
-    """Rows of a file; none if it is not there."""
+    """Read the rows of a file; none if it is not there."""
     if not path.exists():
         return []
     with path.open(newline="") as file:

@@ -47,7 +47,7 @@ def say(what: str, value: str) -> None:
 
 
 def device(number: int) -> Harvester:
-    """A device of the population: d 0.04 to 0.25 and A 1 to 5 log-uniform, r, omega and V at random."""
+    """Draw a device of the population: d 0.04 to 0.25 and A 1 to 5 log-uniform, r, omega and V at random."""
     draw = np.random.default_rng([SEED, number])
     d, A = (math.exp(draw.uniform(math.log(low), math.log(high))) for low, high in ((0.04, 0.25), (1.0, 5.0)))
     r, omega, V = draw.uniform(0.2, 0.85), draw.uniform(3, 8), float(draw.choice([1000, 1700, 2000]))
@@ -62,7 +62,7 @@ class Peak(NamedTuple):
 
 
 def swept(of: Harvester, kappa: np.ndarray, starts: int, periods: int) -> np.ndarray:
-    """The best admissible P at every kappa: of an orbit, or the mean of chaos whose every ball keeps the limits."""
+    """Find the best admissible P at every kappa: of an orbit, or the mean of chaos whose balls all keep the limits."""
     v0 = np.linspace(-0.5, 0.45, starts)
     found = vijax.sweep(kappa=kappa, v0=v0, device=of, periods=periods, outputs=WANTED).transpose("kappa", "v0")
     P, kept, period = found.P.values, found.admissible.values.astype(bool), found.period.values
@@ -79,7 +79,7 @@ def swept(of: Harvester, kappa: np.ndarray, starts: int, periods: int) -> np.nda
 
 
 def peaks(of: Harvester, kappa: np.ndarray, starts: int, periods: int, apart: int) -> list[Peak]:
-    """The three best values of a sweep, so many steps apart, the best first."""
+    """Find the three best values of a sweep, so many steps apart, the best first."""
     best = swept(of, kappa, starts, periods)
     chosen: list[int] = []
     for row in np.argsort(-best).tolist():
@@ -93,7 +93,7 @@ def _about(peak: Peak, width: float, count: int) -> np.ndarray:
 
 
 def scanned(of: Harvester) -> Peak:
-    """The best of a dense scan; P 0 where nothing is admissible."""
+    """Find the best of a dense scan; P 0 where nothing is admissible."""
     kappa = np.geomspace(*KAPPA, 1024)
     width = 1.2 * math.log(kappa[1] / kappa[0])
     near = (peaks(of, _about(one, width, 33), 8, 10_000, 0)[:1] for one in peaks(of, kappa, 8, 1000, 2))
@@ -101,7 +101,7 @@ def scanned(of: Harvester) -> Peak:
 
 
 def nested(of: Harvester) -> Peak:
-    """The best of three nested sweeps."""
+    """Find the best of three nested sweeps."""
     kappa = np.geomspace(*KAPPA, 256)
     width = math.log(kappa[1] / kappa[0])
     near = [peaks(of, _about(one, width, 64), 4, 2000, 0)[:1] for one in peaks(of, kappa, 4, 400, 0)]
@@ -110,7 +110,7 @@ def nested(of: Harvester) -> Peak:
 
 
 def two(_count: int) -> None:
-    """The two devices to start with."""
+    """Try the two devices to start with."""
     designs = optimise_all([of for of, *_ in TWO], **SEARCH)
     for (_, kappa, P), found in zip(TWO, designs, strict=True):
         best = found.best
@@ -124,7 +124,7 @@ def two(_count: int) -> None:
 
 
 def scan(count: int) -> None:
-    """Random devices against scans of their own, and their answers flown again."""
+    """Compare random devices with scans of their own, and fly their answers again."""
     devices = [device(number) for number in range(count)]
     designs = optimise_all(devices, **SEARCH)
     peaks_found = [scanned(of) for of in devices]
@@ -174,7 +174,7 @@ def _again(devices: list[Harvester], designs: list[Design]) -> None:
 
 
 def orbits(count: int) -> None:
-    """Devices whose best motion is an orbit: the same optimum as of orbits alone."""
+    """Try devices whose best motion is an orbit: the same optimum as of orbits alone."""
     devices = [device(number) for number in range(count)]
     every = zip(optimise_all(devices, **SEARCH), optimise_all(devices, motion="periodic", **SEARCH), strict=True)
     moved, worse, same = [], 0, 0
@@ -190,7 +190,7 @@ def orbits(count: int) -> None:
 
 
 def cost(count: int) -> None:
-    """Seconds a device of many in one call, beside the nested sweeps."""
+    """Measure the seconds a device of many in one call, beside the nested sweeps."""
     devices = [device(number) for number in range(count)]
     optimise_all(devices, **SEARCH)
     some = devices[: max(count // 10, 5)]

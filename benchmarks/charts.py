@@ -24,7 +24,7 @@ _OUTLINE: dict[str, Any] = {
 
 
 def stability_map(found: Any, path: str | Path | None = None) -> Figure:
-    """Where an explicit method stays bounded over stiffness and steps per period, under the boundary of theory.
+    """Draw where an explicit method stays bounded over stiffness and steps per period, under the boundary of theory.
 
     Args:
         found: A record with `kappa` [K] and `steps` [S], both ascending, `stable` [S, K], and `least_steps` [K], the
@@ -83,7 +83,7 @@ _LABEL_GAP = 0.052  # between labels, of the height of a panel
 
 
 def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
-    """Error against cost, a panel a scene: down and to the left is better, and the grey stairs are what can be had.
+    """Draw error against cost, a panel a scene: down and left is better, the grey stairs are what can be had.
 
     Args:
         rows: Records with scene, measure ("state", "power", "gradient"), method, us (microseconds per cell-period),
@@ -119,7 +119,7 @@ def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figur
 
 
 def _decades(values: list[float]) -> tuple[float, float]:
-    """Limits of a logarithmic axis, with room for labels to the right."""
+    """Set limits of a logarithmic axis, with room for labels to the right."""
     return min(values) / 2, max(values) * 20
 
 
@@ -160,7 +160,7 @@ def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
 
 
 def _stairs(points: list[tuple[float, float]], right: float, top: float) -> tuple[list[float], list[float]]:
-    """The least error that each cost buys."""
+    """Find the least error that each cost buys."""
     across, up, best_yet = [], [], top
     for x, y in sorted(points):
         if y < best_yet:
@@ -203,7 +203,7 @@ _BEST, _WORST = 1e-5, 1e7  # errors of derivatives: better ones are drawn at the
 
 
 def averages(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
-    """Four panels: errors by method and length, cells against larger fits, the edge of chaos, what errors miss.
+    """Draw four panels: errors by method and length, cells against larger fits, the edge of chaos, what errors miss.
 
     Args:
         rows: Those of `averages.Row`.

@@ -51,7 +51,7 @@ class Contender(NamedTuple):
 
 
 def contenders(side: int, periods: int) -> dict[str, Contender]:
-    """What is timed, by name."""
+    """Name what is timed."""
     d, kappa = axes(side)
     sweep = partial(vijax.sweep, d=d, r=R, u0=U0, until="window", periods=periods)
     plane = partial(sweep, kappa=kappa, v0=V0)
@@ -85,7 +85,7 @@ def timed(what: str, call: Callable[[], Any], side: int, periods: int, repeat: i
 
 
 def measure(side: int, periods: int, repeats: int) -> Iterator[Row]:
-    """Rounds over all contenders, so that a ratio compares calls of one moment; the first compiles and is dropped."""
+    """Time all in rounds, so that a ratio compares calls of one moment; the first compiles and is dropped."""
     entered = contenders(side, periods)
     rows: dict[str, list[Row]] = {what: [] for what in entered}
     for what, contender in entered.items():

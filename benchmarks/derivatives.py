@@ -21,7 +21,7 @@ RIGID = [(0.12, None, 0.5, 0.0, 0.02, 0.3), (0.25, None, 0.8, 0.1, 0.02, 0.3)]
 
 
 def events(rigid: bool):
-    """Impacts as one array [impact, name] of the parameters as one vector."""
+    """Make impacts, as one array [impact, name], a function of the parameters, as one vector."""
 
     def run(x):
         pair = ImpactPair(x[0], None if rigid else x[1], x[2], x[3])
@@ -35,12 +35,12 @@ def events(rigid: bool):
 
 @cache
 def marched(case):
-    """The impacts of a case in as many digits as are in force, and guesses for its neighbours."""
+    """Find the impacts of a case in as many digits as are in force, and guesses for its neighbours."""
     return mp_march(case, IMPACTS)
 
 
 def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
-    """First and second derivative along a direction by central differences in 50 digits, [impact, name]."""
+    """Compute first and second derivative along a direction by central differences in 50 digits, [impact, name]."""
     with mp.workdps(DIGITS):
         h = mp.mpf(H)
         middle, guesses = marched(case)
@@ -62,7 +62,7 @@ def differences(case, direction) -> tuple[np.ndarray, np.ndarray]:
 
 
 def derivatives(rigid: bool):
-    """Cases, directions, first and second derivatives along them by forward mode, and the parameters' points."""
+    """Compute cases, directions, first and second derivatives along them by forward mode, and where they are."""
     cases = RIGID if rigid else SOFT
     directions = np.delete(np.eye(6), 1, axis=0) if rigid else np.eye(6)
     mixed = np.random.default_rng(0).uniform(-1, 1, 6)
@@ -83,7 +83,7 @@ def derivatives(rigid: bool):
 
 
 def relative(got, want) -> tuple[float, float]:
-    """Largest errors of first and second derivatives, over the larger ones where one vanishes."""
+    """Find the largest errors of first and second derivatives, over the larger ones where one vanishes."""
 
     def worst(value, true):
         size = np.maximum(np.abs(true), 1e-3 * np.abs(true).max(axis=0, keepdims=True) + 1e-6)

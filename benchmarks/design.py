@@ -92,12 +92,12 @@ STEPS = (1e-3, 3e-4, 1e-4, 3e-5, 1e-5)  # relative, of differences; that with th
 
 
 def harvested(orbit: Orbit, gamma: Any, x: Any) -> Any:
-    """P of the paper's device as a function of d, kappa, r."""
+    """Compute P of the paper's device as a function of d, kappa, r."""
     return steady(Harvester(), orbit, pair=ImpactPair(x[0], x[1], x[2], gamma)).P
 
 
 def reference_orbits() -> list[tuple[dict, Orbit]]:
-    """The rows of 50 digits, and the orbit of each."""
+    """Read the rows of 50 digits, and the orbit of each."""
     rows = []
     for row in json.loads((DATA / "gradients.json").read_text())["orbits"]:
         t, v, stay = (np.array([float(x) for x in row[name]]) for name in ("t_in", "v_in", "contact"))
@@ -110,7 +110,7 @@ def reference_orbits() -> list[tuple[dict, Orbit]]:
 
 
 def random_cells() -> Orbit:
-    """Periodic attractors of random cells, half of them tilted."""
+    """Find periodic attractors of random cells, half of them tilted."""
     draw = np.random.default_rng(SEED)
     shape = (DRAWN,)
     tilt = np.where(np.arange(DRAWN) % 2 == 0, 0.0, draw.uniform(-0.05, 0.05, shape))
@@ -124,7 +124,7 @@ def random_cells() -> Orbit:
 
 
 def differences(function: Callable[[Any], Any], x: np.ndarray, axis: int) -> np.ndarray:
-    """Central differences of fourth order in a column of x, by each of the steps, [step, ...]."""
+    """Compute central differences of fourth order in a column of x, by each of the steps, [step, ...]."""
 
     def one(step: float) -> np.ndarray:
         length = step * x[:, axis]
@@ -140,12 +140,12 @@ def differences(function: Callable[[Any], Any], x: np.ndarray, axis: int) -> np.
 
 
 def error(exact: np.ndarray, by_difference: np.ndarray) -> np.ndarray:
-    """Relative error of each cell, for the best of the steps."""
+    """Compute the relative error of each cell, for the best of the steps."""
     return np.nanmin(np.abs(by_difference / exact - 1), axis=0)
 
 
 def gradients() -> None:
-    """Against 50 digits, and against differences."""
+    """Compare with 50 digits, and with differences."""
     worst = {"forward": 0.0, "reverse": 0.0}
     for row, orbit in reference_orbits():
         point, gamma = jnp.array([float(row[name]) for name in NAMES]), float(row["gamma"])
@@ -161,21 +161,21 @@ def gradients() -> None:
 
 
 def room(orbit: Orbit) -> tuple[np.ndarray, ...]:
-    """Status, condition, multiplier and least clearance of every orbit."""
+    """Compute status, condition, multiplier and least clearance of every orbit."""
     state = jax.jit(jax.vmap(lambda o: steady(Harvester(), o, pair=o.pair)))(orbit)
     parts = state.status, state.condition, state.multiplier, jnp.stack(state.clearance).min(axis=0)
     return tuple(map(np.asarray, parts))
 
 
 def regular(orbit: Orbit) -> np.ndarray:
-    """Which orbits are far from every bifurcation."""
+    """Say which orbits are far from every bifurcation."""
     status, condition, multiplier, clear = room(orbit)
     calm = (condition < MOST_CONDITION) & (multiplier < MOST_MULTIPLIER)
     return (status == Status.OK) & calm & (clear > LEAST_CLEARANCE)
 
 
 def by_differences(some: Orbit) -> None:
-    """First and second derivatives of every cell against differences of values and of first derivatives."""
+    """Compare first and second derivatives of every cell with differences of values and of first derivatives."""
     x = np.stack([np.asarray(getattr(some.pair, name)) for name in NAMES], axis=1)
     value = partial(jax.jit(jax.vmap(harvested)), some, some.pair.gamma)
     slope = partial(jax.jit(jax.vmap(jax.grad(harvested, argnums=2))), some, some.pair.gamma)
@@ -189,7 +189,7 @@ def by_differences(some: Orbit) -> None:
 
 
 def compared(name: str, exact: np.ndarray, by_difference: np.ndarray, asked: float) -> None:
-    """Errors of one derivative."""
+    """Print the errors of one derivative."""
     off = error(exact, by_difference)
     value = f"{np.median(off):.1e}, {off.max():.1e}; {(off > asked).sum()}"
     say(f"gradients: {name}: median, largest error against differences; above {asked:.0e}", value)
@@ -199,13 +199,13 @@ def compared(name: str, exact: np.ndarray, by_difference: np.ndarray, asked: flo
 
 
 def small_and_fast(d: float = 0.2) -> Harvester:
-    """The example whose optimum is interior, beside a cliff."""
+    """Make the example whose optimum is interior, beside a cliff."""
     A, omega = 3.0, 10 * math.pi
     return Harvester(s=d * A * (math.pi / omega) ** 2, r=0.5, A=A, omega=omega, V=1700.0)
 
 
 def speed_mp(d: float, kappa: Any, near: tuple[float, float, float]) -> Any:
-    """Speed of impacts of the symmetric 1:1 orbit at r = 1/2 in mpmath's precision, from (onset, speed, contact)."""
+    """Compute the speed of a symmetric 1:1 orbit at r = 1/2 in mpmath's precision, from (onset, speed, contact)."""
     half, square = mp.mpf(str(d)) / 2, mp.mpf(kappa) ** 2
     zeta = -mp.mpf(kappa) * mp.log(0.5) / mp.sqrt(mp.pi**2 + mp.log(0.5) ** 2)
     omega1 = mp.sqrt(square - zeta**2)
@@ -231,13 +231,13 @@ AROUND, APART = 1e-4, 1e-12  # in kappa: ends of the search for a maximum, and p
 
 
 def rise_mp(d: float, near: tuple[float, float, float], kappa: Any) -> Any:
-    """Slope of the speed in kappa, in mpmath's precision."""
+    """Compute the slope of the speed in kappa, in mpmath's precision."""
     ahead, behind = (speed_mp(d, kappa + step, near) for step in (APART, -APART))
     return (ahead - behind) / (2 * mp.mpf(APART))
 
 
 def reference() -> None:
-    """The small fast device, for P and for speed."""
+    """Design the small fast device, for P and for speed."""
     settings: dict[str, Any] = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}, "motion": "periodic"}
     best = optimise.optimise(small_and_fast(), **settings).orbits[0]
     say("reference: small fast device, kappa (4.00713)", f"{best.values['kappa']:.5f}")
@@ -288,7 +288,7 @@ class Best(NamedTuple):
 
 
 def drawn(draw: np.random.Generator, within: dict, count: int) -> list[Harvester]:
-    """Random devices: Tables I and II but for the gap, r, A and omega."""
+    """Draw random devices: Tables I and II but for the gap, r, A and omega."""
     rows = [{name: draw.uniform(*ends) for name, ends in within.items()} for _ in range(count)]
     return [
         Harvester(s=x["d"] * x["A"] * (math.pi / x["omega"]) ** 2, r=x["r"], A=x["A"], omega=x["omega"]) for x in rows
@@ -296,7 +296,7 @@ def drawn(draw: np.random.Generator, within: dict, count: int) -> list[Harvester
 
 
 def scanned(device: Harvester, points: int) -> Best | None:
-    """By the exact engine from several starts at each of many kappa; None where nothing is admissible."""
+    """Scan by the exact engine from several starts at each of many kappa; None where nothing is admissible."""
     d, (parts, speeds) = float(device.pair().d), STARTS
     found = vijax.sweep(
         kappa=np.geomspace(*KAPPA, points),
@@ -323,7 +323,7 @@ class Case(NamedTuple):
 
 
 def cases(draw: np.random.Generator, within: dict, count: int, points: int, free: bool) -> tuple[list[Case], int]:
-    """So many devices whose best admissible point in the scan is periodic, and how many others were left out.
+    """Draw devices whose best admissible point in the scan is periodic, and count the others that were left out.
 
     Args:
         free: Whether that point must be clear of the constraints, too.
@@ -346,18 +346,18 @@ def cases(draw: np.random.Generator, within: dict, count: int, points: int, free
 
 
 def interior(case: Case) -> bool:
-    """Whether nothing but the objective holds the optimum where it is."""
+    """Say whether nothing but the objective holds the optimum where it is."""
     best = next(iter(case.found.orbits), None)
     return best is not None and not best.active and best.stopped == "maximum"
 
 
 def ratio(case: Case) -> float:
-    """Of the optimum to the scan's best."""
+    """Compare the optimum to the scan's best, as a ratio."""
     return 0.0 if not case.found.orbits else case.found.orbits[0].height / case.best.P
 
 
 def excess(optimum: Optimum) -> float:
-    """How far the worst impact is beyond its constraint, relative, by the exact impact map."""
+    """Measure how far the worst impact is beyond its constraint, relative, by the exact impact map."""
     device, orbit = optimum.device, optimum.orbit
     deep: Any = np.asarray(orbit.depth) * float(device.length_unit)
     given = np.asarray(orbit.work) * float(device.m_b * device.speed_unit**2)
@@ -366,7 +366,7 @@ def excess(optimum: Optimum) -> float:
 
 
 def scan(devices: int, points: int) -> None:
-    """Random devices, then small and fast ones until half of the scans' best points are clear of the constraints."""
+    """Design random devices, then small fast ones until half of the scans' best points are clear of the constraints."""
     draw = np.random.default_rng(SEED)
     every, left_out = cases(draw, ANYWHERE, devices, points, free=False)
     say("scan: devices from the whole box; left out, their best being aperiodic", f"{len(every)}; {left_out}")
@@ -379,7 +379,7 @@ def scan(devices: int, points: int) -> None:
 
 
 def report(every: list[Case]) -> None:
-    """What came of the designs, and every miss."""
+    """Print what came of the designs, and every miss."""
     ratios = np.array([ratio(case) for case in every])
     bests = [case.found.orbits[0] for case in every if case.found.orbits]
     kinds = Counter("interior" if not one.active else one.active[0].split(" at")[0] for one in bests)
@@ -420,7 +420,7 @@ AWAY = 1.01  # of kappa: Newton sets out from the orbit of a neighbour
 
 
 def speed(designs: int) -> None:
-    """Seconds of many designs, and the price of a gradient."""
+    """Measure the seconds of many designs, and the price of a gradient."""
     devices = drawn(np.random.default_rng(SEED), ANYWHERE, designs)
     seconds = []
     for _ in range(2):
@@ -456,7 +456,7 @@ def speed(designs: int) -> None:
 
 
 def median_seconds(work: Callable[..., Any], *args: Any) -> float:
-    """Of some runs, compiled."""
+    """Measure the median of some runs, compiled."""
     jax.block_until_ready(work(*args))
     seconds = []
     for _ in range(RUNS):
@@ -474,7 +474,7 @@ BESIDE = 0.02  # relative, of kappa's bounds about it
 
 
 def cliffs() -> None:
-    """Designs in small ranges about the fold at kappa 3.69 and about grazing."""
+    """Design in small ranges about the fold at kappa 3.69 and about grazing."""
     for low, high in FOLDS:
         found = optimise.optimise(small_and_fast(), tune=("kappa",), bounds={"kappa": (low, high)}, motion="periodic")
         told(f"cliffs: small fast device, kappa {low} to {high}", [found])
@@ -494,7 +494,7 @@ def cliffs() -> None:
 
 
 def told(what: str, designs: list[Design]) -> None:
-    """How many optima are reported, and how many of them should not be."""
+    """Print how many optima are reported, and how many of them should not be."""
     every = [one for found in designs for one in found.orbits]
     numbers = [np.array([*one.values.values(), one.height, *one.gradient.values(), *one.heights]) for one in every]
     nans = sum(not np.isfinite(x).all() for x in numbers)

@@ -40,7 +40,7 @@ _REFUSALS = (ValueError, TypeError, OSError, ModuleNotFoundError)
 
 
 def called(case: Case) -> str:
-    """What is wrong with how a call was met; nothing if all is well."""
+    """Say what is wrong with how a call was met; nothing if all is well."""
     try:
         case.make()
     except _REFUSALS as error:
@@ -53,7 +53,7 @@ def called(case: Case) -> str:
 
 
 def told(case: Case) -> str:
-    """What is wrong with how a command line was met; nothing if all is well."""
+    """Say what is wrong with how a command line was met; nothing if all is well."""
     out, err = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -84,7 +84,7 @@ def _either(name: str) -> str:
 
 
 def _serve(table: str, ours: Connection) -> None:
-    """A process that tries the cases whose numbers it is sent."""
+    """Try the cases whose numbers come in, in a process of its own."""
     sys.path.insert(0, str(_SCRIPTS))  # before benchmarks, one of which is called as a script is
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY << 30, _MEMORY << 30))
     # What a door lets through writes here, and what XLA says of it is not asked for.
@@ -111,7 +111,7 @@ class Server:
         self._ours.recv()
 
     def verdict(self, number: int) -> str:
-        """What is wrong with how a case was met; nothing if all is well."""
+        """Say what is wrong with how a case was met; nothing if all is well."""
         self._ours.send(number)
         try:
             if self._ours.poll(self._limit):
@@ -130,7 +130,7 @@ class Server:
 
 
 def tried(table: str, limit: float) -> list[tuple[Case, str]]:
-    """Every case of a table with what is wrong with how it was met."""
+    """Try every case of a table; give each with what is wrong with how it was met."""
     server = Server(table, limit)
     try:
         return [(case, server.verdict(number)) for number, case in enumerate(TABLES[table]())]
@@ -139,7 +139,7 @@ def tried(table: str, limit: float) -> list[tuple[Case, str]]:
 
 
 def main() -> int:
-    """Exit code 0 if at most 1 % of each table are not met clearly, and none by silence."""
+    """Try all; exit with 0 if at most 1 % of each table are not met clearly, and none by silence."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", choices=TABLES, help="one table")
     parser.add_argument("--limit", type=float, default=15, help="seconds that a door may take to refuse [15]")

@@ -82,7 +82,7 @@ class Scene(NamedTuple):
 
 
 def run(d: Any, kappa: Any, u0: Any = U0, v0: Any = V0, dtype: str = "float64") -> Trajectory:
-    """The exact motion of N soft cells over `PERIODS` periods; leaves in numpy."""
+    """Find the exact motion of N soft cells over `PERIODS` periods; leaves in numpy."""
     given = [np.asarray(x, dtype) for x in np.broadcast_arrays(d, kappa, np.asarray(R), u0, v0)]
     count = given[0].size
     parts = []
@@ -95,7 +95,7 @@ def run(d: Any, kappa: Any, u0: Any = U0, v0: Any = V0, dtype: str = "float64") 
 
 
 def impacts_in(motion: Trajectory, first: int, last: int) -> np.ndarray:
-    """Impacts of each cell whose onset lies in periods first ... last - 1; -1 where the run did not get there."""
+    """Count impacts of each cell with onset in periods first ... last - 1; -1 where the run did not get there."""
     n, side = motion.impacts.n, motion.impacts.side
     counts = ((side != 0) & (n >= first) & (n < last)).sum(axis=1)
     return np.where(np.isfinite(motion.states.u[:, last - 1]), counts, -1)
@@ -109,7 +109,7 @@ class Label(NamedTuple):
 
 
 def label(motion: Trajectory, dtype: str = "float64") -> Label:
-    """The least recurrence of the last stroboscopic state, and the impacts in the periods that it spans."""
+    """Find the least recurrence of the last stroboscopic state, and the impacts in the periods that it spans."""
     u, v = motion.states.u, motion.states.v
     recurs = np.stack(
         [
@@ -125,7 +125,7 @@ def label(motion: Trajectory, dtype: str = "float64") -> Label:
 
 @jax.jit
 def derivative(pair: ImpactPair, u0: Any, v0: Any, t0: Any, along: tuple[Any, Any]) -> tuple[Any, Any]:
-    """A short exact run and its derivative along (d pair, d u0)."""
+    """Run exactly for a short while, with the derivative along (d pair, d u0)."""
 
     def motion(pair, u0):
         return vijax.trajectory(pair, u0, v0, SHORT, t0, max_impacts=SHORT_ROOM)
@@ -134,7 +134,7 @@ def derivative(pair: ImpactPair, u0: Any, v0: Any, t0: Any, along: tuple[Any, An
 
 
 def by_kappa(kappa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement after a short run of the regular cell, and its derivative by kappa, exact."""
+    """Compute displacement after a short run of the regular cell, and its derivative by kappa, exact."""
     pair = vijax.impact_pair(D_REGULAR, kappa, R)
     still = jnp.zeros(kappa.shape)
     along = ImpactPair(still, still + 1, still, still)
@@ -144,7 +144,7 @@ def by_kappa(kappa: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache
 def located(solver: str) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.ndarray]]:
-    """The same by constant steps of a solver with located events, as a function of kappa and steps per period."""
+    """Compute the same by steps of a solver with located events, as a function of kappa and steps per period."""
 
     @jax.jit
     def both(kappa, dt):
@@ -164,17 +164,17 @@ def located(solver: str) -> Callable[[np.ndarray, int], tuple[np.ndarray, np.nda
 
 
 def located_place(solver: str, kappa: np.ndarray, steps: int) -> np.ndarray:
-    """The displacement alone."""
+    """Compute the displacement alone."""
     return located(solver)(kappa, steps)[0]
 
 
 def slope(x: Any, y: Any) -> float:
-    """Exponent of a power law by least squares."""
+    """Fit the exponent of a power law by least squares."""
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
 def plane(side: int, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cells of the (d, kappa) plane of the benchmarks, up to a stiffness, [side^2] each."""
+    """Lay out cells of the (d, kappa) plane of the benchmarks, up to a stiffness, [side^2] each."""
     d, kappa = np.meshgrid(np.linspace(0.08, 0.3, side), np.geomspace(4, most, side), indexing="ij")
     return d.ravel(), kappa.ravel()
 
@@ -195,7 +195,7 @@ STABILITY_SIDES = {True: 24, False: 96}
 
 
 def stability_limit(r: float) -> float:
-    """Largest kappa h at which RK4 damps w'' + mu w' + kappa^2 w = 0."""
+    """Find the largest kappa h at which RK4 damps w'' + mu w' + kappa^2 w = 0."""
     ratio = float(damping_ratio(r))
     direction = complex(-ratio, np.sqrt(1 - ratio**2))
     z = np.linspace(0, 4, 40_001)[1:] * direction
@@ -204,7 +204,7 @@ def stability_limit(r: float) -> float:
 
 
 def stability_map(side: int) -> StabilityMap:
-    """RK4 runs of 50 periods; one that ever reaches 20 times the speed of the true motion has blown up."""
+    """Run RK4 for 50 periods; what ever reaches 20 times the speed of the true motion has blown up."""
     kappa, steps = np.geomspace(20, 4000, side), np.unique(np.geomspace(16, 4096, side).astype(int))
     stable = []
     for count in steps:
@@ -214,7 +214,7 @@ def stability_map(side: int) -> StabilityMap:
 
 
 def stability(quick: bool) -> Iterator[Figure]:
-    """Explicit steps on a stiff wall."""
+    """Take explicit steps on a stiff wall."""
     found = stability_map(STABILITY_SIDES[quick])
     short = found.steps[:, None] < 0.9 * found.least_steps
     ample = found.steps[:, None] > 1.1 * found.least_steps
@@ -239,7 +239,7 @@ _ORDER_STEPS = {
 
 
 def order(quick: bool) -> Iterator[Figure]:
-    """Convergence of the state after three periods, root of the mean square over kappa."""
+    """Measure convergence of the state after three periods, root of the mean square over kappa."""
     kappa = np.linspace(20, 40, 16)
     true, _ = by_kappa(kappa)
 
@@ -260,7 +260,7 @@ def order(quick: bool) -> Iterator[Figure]:
 
 
 def speeds(quick: bool) -> Iterator[Figure]:
-    """Entry speeds of the first impacts at kappa 400 by 1024 samples a period, over 64 starts."""
+    """Measure entry speeds of the first impacts at kappa 400 by 1024 samples a period, over 64 starts."""
     v0 = np.linspace(0.2, 0.6, LANES)
     true = run(D_REGULAR, 400.0, U0, v0).impacts
     formula = v0 + np.sin(np.pi * true.t[:, 0]) / np.pi
@@ -272,14 +272,14 @@ def speeds(quick: bool) -> Iterator[Figure]:
 
 
 def reference_cells(count: int | None = None) -> dict[str, np.ndarray]:
-    """Stored periodic cells with one attractor, wherever they start: d, kappa, period p, impacts left and right."""
+    """Read periodic cells with one attractor, wherever they start: d, kappa, period p, impacts left and right."""
     stored = json.loads(REFERENCE.read_text())["cells"]
     cells = [cell for cell in stored if cell["p"] and cell["attractors_found"] == 1][:count]
     return {name: np.array([cell[name] for cell in cells]) for name in ("d", "kappa", "p", "left", "right")}
 
 
 def labels(quick: bool) -> Iterator[Figure]:
-    """Periodic reference cells whose motion RK4 does not repeat, or repeats with another number of impacts."""
+    """Count periodic reference cells whose motion RK4 does not repeat, or repeats with another number of impacts."""
     cells = reference_cells(LANES if quick else None)
     d, kappa, period = cells["d"], cells["kappa"], cells["p"]
     impacts = cells["left"] + cells["right"]
@@ -300,7 +300,7 @@ def labels(quick: bool) -> Iterator[Figure]:
 
 
 def gradients(quick: bool) -> Iterator[Figure]:
-    """Derivative of the displacement after three periods by kappa, median relative error over kappa."""
+    """Measure the derivative of displacement after three periods by kappa, median relative error over kappa."""
     kappa = np.linspace(20, 40, 16)
     _, true = by_kappa(kappa)
     h = 1e-5
@@ -321,13 +321,13 @@ def gradients(quick: bool) -> Iterator[Figure]:
 @jax.jit
 @jax.vmap
 def one_impact(pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
-    """The first impact of each start, and its tangent map."""
+    """Find the first impact of each start, and its tangent map."""
     out = exact.step(pair, state, jnp.asarray(4.0), deep=False)
     return out, exact.tangent(pair, out)
 
 
 def first_impact(d: Any, kappa: float | None, u0: Any, v0: Any, t0: Any = 0.0) -> tuple[exact.Outcome, np.ndarray]:
-    """`one_impact` of starts in flight, leaves in numpy."""
+    """Find `one_impact` of starts in flight, leaves in numpy."""
     d, u0, v0, t0 = (jnp.asarray(x) for x in np.broadcast_arrays(d, u0, v0, t0))
     whole = jnp.zeros(d.shape, jnp.int32)
     pair = vijax.impact_pair(d, kappa, R)
@@ -335,12 +335,12 @@ def first_impact(d: Any, kappa: float | None, u0: Any, v0: Any, t0: Any = 0.0) -
 
 
 def flight(u0: Any, v0: Any, t: Any) -> Any:
-    """Displacement in flight at time t after a start at phase 0."""
+    """Compute displacement in flight at time t after a start at phase 0."""
     return u0 + v0 * t + (1 - np.cos(np.pi * t)) / np.pi**2
 
 
 def roots(quick: bool) -> Iterator[Figure]:
-    """First impacts: of drawn flights by an event solver; of flights that only just reach a wall, by samples too."""
+    """Find first impacts: of drawn flights by an event solver; of flights that just reach a wall, by samples too."""
     rng = np.random.default_rng(SEED)
     count = 1024 if quick else 16_384
     d = rng.uniform(0.05, 0.3, count)
@@ -370,7 +370,7 @@ def roots(quick: bool) -> Iterator[Figure]:
 
 
 def chatter_restarts(quick: bool) -> Iterator[Figure]:
-    """Rigid walls at d 0.0222 (omega pi/3, s 0.2): a chain of SciPy restarts over two periods."""
+    """Chain SciPy restarts over two periods between rigid walls at d 0.0222 (omega pi/3, s 0.2)."""
     restarts = 500 if quick else 5000
     chain = naive.restart_chain(D_SLOW, R, 0.0, 0.1, 2, restarts)
     motion = vijax.trajectory(vijax.impact_pair(D_SLOW, None, R), 0.0, 0.1, SHORT, max_impacts=SHORT_ROOM * 2)
@@ -383,7 +383,7 @@ def chatter_restarts(quick: bool) -> Iterator[Figure]:
 
 
 def grazing(quick: bool) -> Iterator[Figure]:
-    """Derivative of the velocity after one impact by the start, as the impact becomes slow."""
+    """Differentiate the velocity after one impact by the start, as the impact becomes slow."""
     speed, start, end = np.geomspace(1e-6, 1e-2, 9), 0.6, 2.0
     # Backwards from an impact at phase 1, where the ball is turned back by the forcing.
     turned, span = np.pi * start, 1 - start
@@ -413,7 +413,7 @@ def grazing(quick: bool) -> Iterator[Figure]:
 
 
 def chatter(quick: bool) -> Iterator[Figure]:
-    """Impacts per period at d 0.0222 against kappa, periods 20 to 50, by RK4 and exactly."""
+    """Count impacts per period at d 0.0222 against kappa, periods 20 to 50, by RK4 and exactly."""
     kappa = np.array([12.0, 40.0, 120.0, 400.0, 1200.0]) if quick else np.geomspace(6, 4000, 24)
     true = impacts_in(run(D_SLOW, kappa, 0.0, 0.1), *SLOW_WINDOW) / np.ptp(SLOW_WINDOW)
     for steps in (1000, 4000):
@@ -424,7 +424,7 @@ def chatter(quick: bool) -> Iterator[Figure]:
 
 
 def chaos(quick: bool) -> Iterator[Figure]:
-    """A perturbation of 2e-16 at d 0.12, kappa 400: when it matters, and what it leaves alone."""
+    """Follow a perturbation of 2e-16 at d 0.12, kappa 400: when it matters, and what it leaves alone."""
     v0 = np.linspace(0.3, 0.5, 32)
     motion = run(D_CHAOS, 400.0, np.repeat([U0, U0 + 2.2e-16], 32), np.tile(v0, 2))
     u, v = (x.reshape(2, 32, PERIODS) for x in (motion.states.u, motion.states.v))
@@ -438,7 +438,7 @@ def chaos(quick: bool) -> Iterator[Figure]:
 
 
 def windows(quick: bool) -> Iterator[Figure]:
-    """Cells called multistable from 8 starts: by P over the last 25 periods, and by P over whole periods."""
+    """Count cells called multistable from 8 starts: by P over the last 25 periods, and by P over whole periods."""
     rng = np.random.default_rng(SEED)
     starts = 8
     d, kappa = plane(16, 400)
@@ -467,7 +467,7 @@ def windows(quick: bool) -> Iterator[Figure]:
 
 
 def resonance(quick: bool) -> Iterator[Figure]:
-    """Penetration of an elastic wall at the resonance, kappa = pi (1 + e), r = 1 - e, against 50 digits."""
+    """Compare penetration of an elastic wall at the resonance, kappa = pi (1 + e), r = 1 - e, with 50 digits."""
     for power in (4, 8, 12):
         kappa, r, speed, s = np.pi * (1 + 10.0**-power), 1 - 10.0**-power, 0.3, 0.7
         with mpmath.workdps(50):
@@ -481,7 +481,7 @@ def resonance(quick: bool) -> Iterator[Figure]:
 
 
 def single_precision(quick: bool) -> Iterator[Figure]:
-    """float32 beside float64 on a plane: entry speeds of the first impacts, and labels."""
+    """Compare float32 with float64 on a plane: entry speeds of the first impacts, and labels."""
     cells = reference_cells(LANES)
     d, kappa = (cells["d"], cells["kappa"]) if quick else plane(24, 400)
     double, single = (run(d, kappa, dtype=dtype) for dtype in RECURRENCE)

@@ -61,16 +61,16 @@ class Scene:
     each: float
 
     def store(self, name: str) -> Path:
-        """A path for a new store."""
+        """Give a path for a new store."""
         return self.folder / f"{name}.zarr"
 
     def moment(self) -> float:
-        """Seconds from the start of a process, drawn at random."""
+        """Draw seconds from the start of a process at random."""
         return random.uniform(0, self.first + _REACH * self.each)
 
 
 def start(side: int, out: Path, *more: str, **options) -> subprocess.Popen:
-    """The script on its way."""
+    """Start the script."""
     plane = ["--d", f"0.05:0.3:{side}", "--kappa", f"3:400:{side}:log", "--out", str(out), *more]
     command = [sys.executable, "-c", WRAPPER, str(SCRIPT), *plane]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, **options)
@@ -86,7 +86,7 @@ class End:
 
 
 def ended(process: subprocess.Popen) -> End:
-    """The end of a run."""
+    """Wait for the end of a run."""
     _, told = process.communicate()
     lines = [line for line in re.split(r"[\r\n]+", told) if line.strip()]
     said = [line for line in lines if "begins" not in line and "cells/s" not in line]
@@ -94,7 +94,7 @@ def ended(process: subprocess.Popen) -> End:
 
 
 def done(out: Path) -> int:
-    """Tiles that are done."""
+    """Count tiles that are done."""
     return len(list(out.glob("status/tiles/[0-9]*.json")))
 
 
@@ -104,7 +104,7 @@ def finish(scene: Scene, out: Path) -> End:
 
 
 def differing(scene: Scene, found: "xr.Dataset") -> list[str]:
-    """Variables and coordinates that are not, bit for bit and in their attributes, those of an undisturbed run."""
+    """Name variables and coordinates that differ, in any bit or in attributes, from those of an undisturbed run."""
 
     def same(one: "xr.DataArray", other: "xr.DataArray") -> bool:
         return np.array_equal(one, other, equal_nan=True) and one.attrs == other.attrs
@@ -114,7 +114,7 @@ def differing(scene: Scene, found: "xr.Dataset") -> list[str]:
 
 
 def is_whole(scene: Scene, found: "xr.Dataset") -> bool:
-    """Whether a map is that of a run that nothing befell."""
+    """Say whether a map is that of a run that nothing befell."""
     return not differing(scene, found)
 
 
@@ -128,7 +128,7 @@ def verdict(scene: Scene, out: Path, began: int | None = None) -> bool:
 
 
 def kill(scene: Scene) -> bool:
-    """SIGKILL at random moments of one plane, resumed each time."""
+    """Send SIGKILL at random moments of one plane, and resume each time."""
     out, began, worst, kills = scene.store("kill"), 0, 0, 0
     while kills < scene.kills:
         before, process = done(out), start(scene.side, out)
@@ -147,7 +147,7 @@ def kill(scene: Scene) -> bool:
 
 
 def stop(scene: Scene) -> bool:
-    """SIGTERM and SIGINT at a random moment."""
+    """Send SIGTERM and SIGINT at a random moment."""
     good = True
     for which in (signal.SIGTERM, signal.SIGINT):
         out = scene.store("stop")
@@ -161,7 +161,7 @@ def stop(scene: Scene) -> bool:
 
 
 def worker(scene: Scene) -> bool:
-    """SIGKILL of one of two workers of a cluster at a random moment."""
+    """Send SIGKILL to one of two workers of a cluster at a random moment."""
     out = scene.store("worker")
     process = start(scene.side, out, "--workers", "2")
     while process.poll() is None and not done(out):
@@ -180,7 +180,7 @@ def worker(scene: Scene) -> bool:
 
 @contextmanager
 def disk(scene: Scene) -> Iterator[Path | None]:
-    """A small file system in memory, if this user may mount one."""
+    """Mount a small file system in memory, if this user may."""
     place = scene.folder / "disk"
     place.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK}m", "tmpfs", str(place)]
@@ -199,7 +199,7 @@ def remount(place: Path, option: str) -> None:
 
 
 def full_disk(scene: Scene) -> bool:
-    """A disk that is full after some tiles; then it grows."""
+    """Fill a disk after some tiles; then let it grow."""
     with disk(scene) as place:
         out = (place or scene.folder) / "full.zarr"
         if place:
@@ -214,7 +214,7 @@ def full_disk(scene: Scene) -> bool:
 
 
 def readonly(scene: Scene) -> bool:
-    """A store that may no longer be written when the run goes on."""
+    """Forbid writing a store when the run goes on."""
     with disk(scene) as place:
         if not place:
             print("    not done: no tmpfs may be mounted here")
@@ -324,7 +324,7 @@ DAMAGES: dict[str, tuple[str, Callable[[Path], None]]] = {
 
 
 def damages(scene: Scene) -> bool:
-    """Each kind of damage to a finished store, read and gone on with."""
+    """Do each kind of damage to a finished store, read it and go on with it."""
     good = True
     for name, (where, damage) in DAMAGES.items():
         out = scene.store("damaged")
@@ -342,7 +342,7 @@ def damages(scene: Scene) -> bool:
 
 
 def stopped_overwrite(scene: Scene) -> bool:
-    """SIGKILL while --overwrite puts a new store in the place of an old one; then a run, anew or not."""
+    """Send SIGKILL while --overwrite puts a new store in the place of an old one; then run, anew or not."""
     good = True
     for more in ((), ("--overwrite",)):
         out = scene.store("overwritten")
@@ -360,12 +360,12 @@ def stopped_overwrite(scene: Scene) -> bool:
 
 
 def left(out: Path) -> list[str]:
-    """What a killed run left beside a store."""
+    """List what a killed run left beside a store."""
     return [path.name for path in out.parent.glob(f".{out.stem}.*")]
 
 
 def foreign(scene: Scene) -> bool:
-    """Somebody's file in a store: --overwrite is refused, a run goes on."""
+    """Put somebody's file in a store: --overwrite is refused, a run goes on."""
     out = scene.store("foreign")
     shutil.copytree(scene.whole, out)
     thesis = out / "notes.part1.txt"
@@ -377,7 +377,7 @@ def foreign(scene: Scene) -> bool:
 
 
 def writers(scene: Scene) -> bool:
-    """A second run on a store that is being written."""
+    """Run a second time on a store that is being written."""
     out = scene.store("writers")
     process = start(scene.side, out)
     while not done(out):
@@ -401,7 +401,7 @@ FAULTS: dict[str, Callable[[Scene], bool]] = {
 
 
 def undisturbed(side: int, kills: int, folder: Path) -> Scene:
-    """A run that nothing befalls, timed."""
+    """Time a run that nothing befalls."""
     out = folder / "whole.zarr"
     ended(start(min(side, _WARM), folder / "warm.zarr"))  # compiles
     began, process, first = time.perf_counter(), start(side, out), 0.0
@@ -416,7 +416,7 @@ def undisturbed(side: int, kills: int, folder: Path) -> Scene:
 
 
 def main() -> int:
-    """Exit code 0 if nothing was lost."""
+    """Try all; exit with 0 if nothing was lost."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", choices=FAULTS, help="one fault")
     parser.add_argument("--side", type=int, default=512, help="cells along each axis [512]")

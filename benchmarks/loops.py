@@ -25,22 +25,22 @@ CALLS = {"steady": 10_000, "grad": 1_000, "trajectory": 500}
 
 
 def mappings() -> int:
-    """Memory mappings of this process: 65,530 is where Linux ends it."""
+    """Count memory mappings of this process: 65,530 is where Linux ends it."""
     return Path("/proc/self/maps").read_text(encoding="ascii").count("\n")
 
 
 def memory() -> float:
-    """Most memory that the process has held [MB]."""
+    """Measure the most memory that the process has held [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def device(number: float | jax.Array) -> vijax.Harvester:
-    """The default device with another stiffness."""
+    """Make the default device with another stiffness."""
     return dataclasses.replace(DEVICE, omega0=number)
 
 
 def works() -> dict[str, Callable[[int], object]]:
-    """What is called, by the number of the call."""
+    """List what is called; each takes the number of the call."""
     found = orbit_search.search(DEVICE.pair(), "RL", guesses=256)
     known = found[np.abs(np.asarray(found.multipliers)).max(axis=1) < 1][0]
     pair = vijax.impact_pair(0.2, 40.0, 0.5)

@@ -51,12 +51,12 @@ class Case(NamedTuple):
 
 
 def pair() -> vijax.ImpactPair:
-    """A soft cell."""
+    """Make a soft cell."""
     return vijax.impact_pair(0.2, 40.0, 0.5)
 
 
 def an_orbit() -> periodic.Orbit:
-    """A record such as a search returns, made by hand so that nothing is compiled."""
+    """Make a record such as a search returns, by hand so that nothing is compiled."""
     sequence = shooting.Sequence(jnp.array([[1, -1]], jnp.int32), jnp.array([2.0]), jnp.array([False]))
     wide = vijax.impact_pair([0.2], [40.0], [0.5])
     knots, two = jnp.array([[[0.1, 0.5, 0.05], [1.1, 0.5, 0.05]]]), jnp.full((1, 2), 0.01)
@@ -65,12 +65,12 @@ def an_orbit() -> periodic.Orbit:
 
 
 def a_design() -> optimise.Design:
-    """A design without optima."""
+    """Make a design without optima."""
     return optimise.Design((), ("omega0",), {"omega0": (20.0, 400.0)}, "P", (), 0, 0)
 
 
 def an_optimum() -> optimum.Optimum:
-    """An optimum of which no more than the orbit is known."""
+    """Make an optimum of which no more than the orbit is known."""
     path = np.zeros((1, 1))
     told: dict[str, Any] = {"values": {}, "gradient": {}, "active": (), "path": path, "heights": path[0]}
     told |= {"device": vijax.Harvester(), "label": "1:1", "height": 0.0, "P": 0.0, "P_stderr": 0.0}
@@ -78,7 +78,7 @@ def an_optimum() -> optimum.Optimum:
 
 
 def a_map() -> xr.Dataset:
-    """A dataset that is no map."""
+    """Make a dataset that is no map."""
     return xr.Dataset({"mass": ("d", [1.0, 2.0])})
 
 
@@ -596,13 +596,13 @@ LARGE: dict[str, Callable[[], Any]] = {
 
 
 def rigid_orbit() -> periodic.Orbit:
-    """As `an_orbit`, between rigid walls."""
+    """Make `an_orbit` between rigid walls."""
     soft = an_orbit()
     return periodic.Orbit(**(vars(soft) | {"pair": vijax.impact_pair([0.2], None, [0.5])}))
 
 
 def calls() -> Iterator[Case]:
-    """The malformed calls."""
+    """Yield the malformed calls."""
     for door, (function, right, wrong) in CALLS.items():
         for argument, values in wrong.items():
             for value in values:
@@ -615,7 +615,7 @@ def calls() -> Iterator[Case]:
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """The arguments that a text begins with: "d and s of sweep"."""
+    """Name the arguments that a text begins with: "d and s of sweep"."""
     words = text.split()
     return (words[0], words[2]) if words[1] == "and" else (words[0],)
 

@@ -246,7 +246,7 @@ _MODULES = {"paper": "paper.__main__"}
 
 
 def lines() -> Iterator[Case]:
-    """The malformed command lines, each run in the folder of the moment."""
+    """Yield the malformed command lines, each run in the folder of the moment."""
     for script, arguments, name in (*_of_tables(), *SHAPES):
         yield Case(_short(script, *arguments), (name,), partial(_run, script, arguments))
     for arguments, name in (*_of_pages(), *COMMANDS):
@@ -254,13 +254,13 @@ def lines() -> Iterator[Case]:
 
 
 def _short(*words: str) -> str:
-    """A line to read at a glance."""
+    """Shorten a line, to read at a glance."""
     line = " ".join(words)
     return line if len(line) <= 100 else f"{line[:35]} ... {line[-60:]}"
 
 
 def _of_tables() -> Iterator[tuple[str, tuple[str, ...], str]]:
-    """A script, its arguments, what the error must name."""
+    """Yield a script, its arguments, what the error must name."""
     for door, (right, wrong) in LINES.items():
         for option, texts in wrong.items():
             words = option.split()
@@ -269,7 +269,7 @@ def _of_tables() -> Iterator[tuple[str, tuple[str, ...], str]]:
 
 
 def _of_pages() -> Iterator[tuple[tuple[str, ...], str]]:
-    """The same of the command: a subcommand and its arguments, what the error must name."""
+    """Yield the same of the command: a subcommand and its arguments, what the error must name."""
     for script, arguments, name in (*_of_tables(), *SHAPES):
         if "--compare" in arguments:  # a subcommand of its own
             at = arguments.index("--compare")
@@ -279,7 +279,7 @@ def _of_pages() -> Iterator[tuple[tuple[str, ...], str]]:
 
 
 def _run(script: str, arguments: tuple[str, ...]) -> int:
-    """Exit code of a script, or of the command, in this process."""
+    """Run a script, or the command, in this process; give its exit code."""
     from vijax.cli import main, process
 
     if script == "vijax":

@@ -19,7 +19,7 @@ PERIOD = 2.0
 
 
 def push(t: Any, u: Any, v: Any, d: Any, kappa: Any, r: Any) -> Any:
-    """u'' with the contact decided by a `where`; automatic differentiation does not see the place of the switch."""
+    """Compute u'' with the contact decided by a `where`; automatic differentiation does not see where it switches."""
     log = jnp.log(r)
     mu = -2 * kappa * log / jnp.sqrt(math.pi**2 + log * log)
     side = jnp.where(u < 0, -1.0, 1.0)
@@ -29,7 +29,7 @@ def push(t: Any, u: Any, v: Any, d: Any, kappa: Any, r: Any) -> Any:
 
 @jax.jit
 def where_rk4(d: Any, kappa: Any, r: Any, u0: Any, v0: Any, periods: Any, steps: Any) -> tuple[Any, Any]:
-    """Displacement after some periods by classical Runge-Kutta, and its derivative by kappa through the `where`."""
+    """Find displacement after some periods by classical Runge-Kutta, and its derivative by kappa through a `where`."""
     h = PERIOD / jnp.asarray(steps, kappa.dtype)
 
     def last(kappa):
@@ -52,7 +52,7 @@ def where_rk4(d: Any, kappa: Any, r: Any, u0: Any, v0: Any, periods: Any, steps:
 
 
 def where_solver(solver: str, d: Any, kappa: Any, r: float, u0: float, v0: float, periods: int) -> Callable[[int], Any]:
-    """Displacement [N] after some periods by an explicit solver of diffrax with so many steps a period; no events."""
+    """Find displacement [N] after some periods by an explicit solver of diffrax, so many steps a period; no events."""
     numbers = jnp.asarray(d), jnp.asarray(r)
 
     def field(t, y, kappa):
@@ -79,7 +79,7 @@ def where_solver(solver: str, d: Any, kappa: Any, r: float, u0: float, v0: float
 @jax.jit
 @jax.vmap
 def event_solver(d: Any, u0: Any, v0: Any) -> Any:
-    """Time of the first impact, [N], by diffrax's event with a Newton root-find; inf for none in two periods."""
+    """Find when the first impact is, [N], by diffrax's event and Newton's root-find; inf for none in two periods."""
     done = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda t, y, _: jnp.stack([y[1], jnp.cos(math.pi * t)])),
         diffrax.Tsit5(),
@@ -103,7 +103,7 @@ class Chain(NamedTuple):
 
 
 def restart_chain(d: float, r: float, u0: float, v0: float, periods: int, restarts: int) -> Chain:
-    """Rigid walls by SciPy: solve to the wall, turn the velocity around, start again there, so many times at most."""
+    """Chain SciPy solves to a rigid wall, the velocity turned around, started again there, so many times at most."""
 
     def room(t, y):
         return 0.5 * d - abs(y[0])
@@ -128,7 +128,7 @@ def restart_chain(d: float, r: float, u0: float, v0: float, periods: int, restar
 
 
 def contact(kappa: Any, r: Any, speed: Any, s: Any, xp: Any = math) -> Any:
-    """Penetration a time s after an entry at phase 0, by the textbook's sum of a steady and a free oscillation.
+    """Compute penetration a time s after an entry at phase 0, by the textbook's steady and free oscillations.
 
     `xp` is a module with pi, log, exp, sqrt, sin and cos: `math`, or `mpmath` for the same formula in more digits.
     """

@@ -45,7 +45,7 @@ def say(what: str, value: str) -> None:
 
 
 def reference() -> None:
-    """The 50-digit orbits, from guesses 2 % off."""
+    """Find the 50-digit orbits, from guesses 2 % off."""
     worst = {"knots": 0.0, "penetrations": 0.0, "multipliers": 0.0, "P, relative": 0.0}
     for row in json.loads((DATA / "gradients.json").read_text())["orbits"]:
         t, v, stay, depth = (np.array([float(x) for x in row[name]]) for name in ("t_in", "v_in", "contact", "dmax"))
@@ -70,13 +70,13 @@ def reference() -> None:
 
 
 def period_1(walls, count: int) -> Sequence:
-    """Sequences of period 1."""
+    """Make sequences of period 1."""
     side = jnp.broadcast_to(jnp.asarray(walls, jnp.int32), (count, len(walls)))
     return Sequence(side, jnp.full(count, 2.0), jnp.zeros(count, bool))
 
 
 def throughput() -> None:
-    """Symmetric 1:1 orbits of many kappa, closed half way, each from a neighbour's knots, all of them verified."""
+    """Find symmetric 1:1 orbits of many kappa, closed half way, each from a neighbour's knots, all of them verified."""
     start = orbit_search.search(impact_pair(D, 40.0, 0.5), "RL", guesses=1024)
     start = symmetry.halved(start[np.flatnonzero(np.asarray(symmetry.symmetric(start)))])
     fast = start[jnp.argmax(start.knots[:, 0, 1], keepdims=True)]
@@ -109,7 +109,7 @@ STRIDES = (512, 16, 1)
 
 
 def solve_all(kappa: np.ndarray, anchor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Every 512th from the branch, every 16th from those, the others from those."""
+    """Solve every 512th from the branch, every 16th from those, the others from those."""
     knots, guess = np.full((kappa.size, 3), np.nan), anchor
     status, residual = np.full(kappa.size, -1), np.full(kappa.size, np.inf)
     for level, stride in enumerate(STRIDES):
@@ -128,7 +128,7 @@ def solve_all(kappa: np.ndarray, anchor: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def bifurcations() -> None:
-    """Where the issue's reference has them."""
+    """Find bifurcations where the issue's reference has them."""
     rigid = {"d": 0.2, "kappa": None, "r": 0.5}
     met("rigid 1:1 breaks symmetry, d", rigid, "RL", "d", (0.1, 0.3), "pitchfork", 0.2634316)
     met("rigid 1:1 flips, d", rigid, "RL", "d", (0.1, 0.3), "flip", 0.1870781)
@@ -145,7 +145,7 @@ def bifurcations() -> None:
 
 
 def met(what: str, at: dict, impacts: str, along: str, within, kind: str, known: float, device=None) -> None:
-    """The point of a kind nearest to the known one, on the branches from one orbit."""
+    """Find the point of a kind nearest to the known one, on the branches from one orbit."""
     found = orbit_search.search(impact_pair(**at), impacts, guesses=1024)
     points = [point for one in switching.family(found, along, within, device=device) for point in one.points]
     point = min((point for point in points if point.kind == kind), key=lambda point: abs(point.value - known))
@@ -155,7 +155,7 @@ def met(what: str, at: dict, impacts: str, along: str, within, kind: str, known:
 
 
 def attractors() -> None:
-    """Shares of the attractors at d = 0.2, kappa = 3, Lyapunov exponents in chaos."""
+    """Count shares of the attractors at d = 0.2, kappa = 3; compute Lyapunov exponents in chaos."""
     found = vijax.basin_fractions(d=0.2, kappa=3.0, r=0.5, starts=20_000, seed=1, merge_mirrors=True)
     for label, share in zip(found["label"].values.ravel(), found["fraction"].values.ravel(), strict=True):
         if share > 0:
@@ -169,7 +169,7 @@ def attractors() -> None:
 
 
 def diagram() -> None:
-    """Fig. 8's orbit diagram: 126 d, five kappa, both directions, 400 periods."""
+    """Compute Fig. 8's orbit diagram: 126 d, five kappa, both directions, 400 periods."""
     seconds = []
     for _ in range(RUNS + 1):
         begun = time.perf_counter()

@@ -29,12 +29,12 @@ BLOCK = 16  # cells that advance together: two AVX-512 registers, and still in L
 
 
 def _damping(r: float) -> float:
-    """mu / kappa, Eq. (19)."""
+    """Compute mu / kappa, Eq. (19)."""
     return -2 * math.log(r) / math.hypot(math.pi, math.log(r))
 
 
 def rk4_impacts_per_period(d, kappa, r: float, u0: float, v0: float, periods: int, steps: int) -> np.ndarray:
-    """Impacts per forcing period of each cell, as `rk4` counts them.
+    """Count impacts per forcing period of each cell, as `rk4` does.
 
     Args:
         d: gap, [N].
@@ -52,7 +52,7 @@ def rk4_impacts_per_period(d, kappa, r: float, u0: float, v0: float, periods: in
 
 
 def rk4(d, kappa, r: float, u0, v0, periods: int, steps: int, gamma: float = 0.0) -> tuple[np.ndarray, ...]:
-    """Impacts per period, final displacement and final velocity, each [N].
+    """Count impacts per period, and find final displacement and final velocity, each [N].
 
     Args of `rk4_impacts_per_period`, but that u0 and v0 may differ from cell to cell, and that gamma is free.
     """
@@ -124,7 +124,7 @@ _STEPS_PER_PERIOD = 1_000_000  # a run that needs more has failed
 
 
 def dormand_prince(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float) -> tuple[np.ndarray, ...]:
-    """Final displacement and velocity of every cell by an adaptive pair of order 5 with located events.
+    """Find displacement and velocity of every cell at last by an adaptive pair of order 5 with located events.
 
     Args:
         d: gap, [N].
@@ -147,7 +147,7 @@ def dormand_prince(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol:
 
 @numba.njit
 def _dormand_prince_step(t, u, v, h, side, half, stiffness, damping, gamma, speeds, pushes):
-    """Displacement and velocity after a step, and their error; side 0 is flight."""
+    """Compute displacement and velocity after a step, and their error; side 0 is flight."""
     held = abs(side)
     u_new, v_new = u, v
     for i in range(7):
@@ -167,13 +167,13 @@ def _dormand_prince_step(t, u, v, h, side, half, stiffness, damping, gamma, spee
 
 @numba.njit
 def _beyond(u, side, half):
-    """How far the ball is past the next event: outside the gap in flight, inside it in contact."""
+    """Say how far the ball is past the next event: outside the gap in flight, inside it in contact."""
     return abs(u) - half if side == 0 else half - side * u
 
 
 @numba.njit
 def _first_look(u, v, u_new, v_new, h, side, half):
-    """The first place of a step, as a part of it, at which the ball is past an event; above 1 if there is none."""
+    """Find the first place of a step, as a part of it, at which the ball is past an event; above 1 if there is none."""
     for look in range(1, _LOOKS + 1):
         s = look / _LOOKS
         rise = u_new - u
@@ -250,7 +250,7 @@ def _chain(half_gap, stiffness, damping, r, gamma, end, rtol, u_inout, v_inout):
 def scipy_events(
     d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float, solver: str
 ) -> tuple[np.ndarray, ...]:
-    """As `dormand_prince`, by SciPy's `solve_ivp` with terminal events, cell by cell; NaN where the solver gives up."""
+    """Do as `dormand_prince`, by SciPy's `solve_ivp` with terminal events, cell by cell; NaN where it gives up."""
     ends = [_scipy_cell(float(d), kappa, r, gamma, u, v, periods, rtol, solver) for d, u, v in np.broadcast(d, u0, v0)]
     u, v = np.array(ends).T
     return u, v
@@ -289,7 +289,7 @@ def _scipy_cell(d, kappa, r, gamma, u, v, periods, rtol, solver) -> tuple[float,
 
 
 def diffrax_chain(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float) -> tuple[np.ndarray, ...]:
-    """As `dormand_prince`, by diffrax: `diffeqsolve` with an `Event`, restarted to the end of the run, vmapped."""
+    """Do as `dormand_prince`, by diffrax: `diffeqsolve` with an `Event`, restarted to the end of the run, vmapped."""
     stiff = np.asarray(0.0 if kappa is None else kappa, dtype=float)
     d, u0, v0, stiff = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, u0, v0)), stiff)
     cells = [jnp.asarray(x) for x in (d / 2, u0, v0, stiff**2, stiff * _damping(r))]

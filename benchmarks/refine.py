@@ -37,7 +37,7 @@ GOALS = "at most 25 % computed, labels equal in 99.3 % of all cells, P within 1 
 
 
 def axes(plane: str, points: int) -> dict[str, Any]:
-    """The axes of a plane by name; the first is that of `scripts/grid.py`."""
+    """Name the axes of a plane; the first is that of `scripts/grid.py`."""
     kappa = np.geomspace(3, 400, points)
     planes: dict[str, dict[str, Any]] = {
         "default": {"d": np.linspace(0.05, 0.3, points), "kappa": kappa},
@@ -48,20 +48,20 @@ def axes(plane: str, points: int) -> dict[str, Any]:
 
 
 def timed(**asked: Any) -> tuple[Any, str]:
-    """A sweep and what it took, compilation and all; on a busy machine the processors' seconds are the fairer ones."""
+    """Time a sweep, compilation and all; on a busy machine the processors' seconds are the fairer ones."""
     start, busy = time.perf_counter(), time.process_time()
     found = vijax.sweep(**asked)
     return found, f"{time.perf_counter() - start:.1f} s, {time.process_time() - busy:.1f} s of all cores together"
 
 
 def labels(found: Any) -> np.ndarray:
-    """The labels of a plane, mirror images as one without gravity."""
+    """Find the labels of a plane, mirror images as one without gravity."""
     columns = (found[name].values for name in ("period", "impacts_left", "impacts_right", "status"))
     return label(*columns, merge_mirrors=float(found.gamma) == 0)
 
 
 def like_neighbours(words: np.ndarray) -> np.ndarray:
-    """How many of its four neighbours have the label of each cell; borders of the plane count as their own image."""
+    """Count neighbours, of four, with the label of each cell; borders of the plane count as their own image."""
     around = np.pad(words, 1, mode="edge")
     inner = slice(1, -1)
     sides = (around[:-2, inner], around[2:, inner], around[inner, :-2], around[inner, 2:])
@@ -69,7 +69,7 @@ def like_neighbours(words: np.ndarray) -> np.ndarray:
 
 
 def report(full: Any, refined: Any) -> list[str]:
-    """The figures, a line each."""
+    """Tell the figures, a line each."""
     words, told = labels(full), labels(refined)
     computed = refined.computed.values
     same = [

@@ -64,7 +64,7 @@ class Run(NamedTuple):
 
     @property
     def each(self) -> float:
-        """Microseconds a cell."""
+        """Give the microseconds a cell."""
         return 1e6 * self.seconds / self.cells
 
 
@@ -72,7 +72,7 @@ class Run(NamedTuple):
 
 
 def study(side: int, settings: str, cores: int, workers: int | None = None, engine: bool = True) -> Run:
-    """One study, on so many cores of this machine."""
+    """Run one study, on so many cores of this machine."""
     confine(cores)
     import vijax
 
@@ -104,7 +104,7 @@ def confine(cores: int) -> None:
 def sweep(
     side: int, settings: str, out: Path, workers: int | None = None, tell: Callable[[int, int], None] | None = None
 ) -> None:
-    """The plane into a store."""
+    """Sweep the plane into a store."""
     import vijax
 
     d, kappa = np.linspace(0.05, 0.3, side), np.geomspace(3, 400, side)
@@ -112,7 +112,7 @@ def sweep(
 
 
 def idle(pair: Any, u0: Any, v0: Any, scale: Any, device: Any, **settings: Any) -> Any:
-    """In place of the engine: numbers at once, which compress as badly as any."""
+    """Stand in for the engine: numbers at once, which compress as badly as any."""
     return _numbers(pair.d.size, scale.length_variant.size)
 
 
@@ -127,26 +127,26 @@ def _numbers(cells: int, variants: int) -> Any:
 
 
 def busy() -> float:
-    """Seconds of all cores so far, of this process and of those that it started and that have ended."""
+    """Count seconds of all cores so far, of this process and of those that it started and that have ended."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def resident() -> int:
-    """Bytes that the largest of these processes held at most."""
+    """Count the bytes that the largest of these processes held at most."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return max(one.ru_maxrss for one in used) * 1024  # KiB on Linux
 
 
 def inventory(out: Path) -> tuple[int, int, int]:
-    """Bytes and number of the files of a store, and bytes of its records."""
+    """Count bytes and number of the files of a store, and bytes of its records."""
     sizes = {file: file.stat().st_size for file in out.rglob("*") if file.is_file()}
     records = sum(size for file, size in sizes.items() if file.parent.name == "tiles")
     return sum(sizes.values()), len(sizes), records
 
 
 def resume(side: int) -> float:
-    """Seconds a tile to find that a finished store is whole."""
+    """Measure the seconds a tile to find that a finished store is whole."""
     confine(1)
     import vijax
 
@@ -161,7 +161,7 @@ def resume(side: int) -> float:
 
 
 def dealing(tasks: int) -> float:
-    """Tasks a second that one driver and its scheduler come to, when workers have nothing to do but take them."""
+    """Measure the tasks a second that one driver and its scheduler come to, when workers do nothing but take them."""
     from vijax.planes import cluster
 
     os.cpu_count = lambda: _THREADS
@@ -172,11 +172,11 @@ def dealing(tasks: int) -> float:
 
 
 def nothing(task: int) -> None:
-    """What is done with an empty task."""
+    """Do an empty task."""
 
 
 def weights(side: int) -> tuple[int, float]:
-    """Bytes of a task, and bytes a cell that a driver holds of a plane whose kappa follows from two axes."""
+    """Measure bytes of a task, and bytes a cell that a driver holds of a plane whose kappa follows from two axes."""
     from vijax.planes import sweep as sweeps
     from vijax.planes import tiled_store as studies
 
@@ -187,7 +187,7 @@ def weights(side: int) -> tuple[int, float]:
 
 
 def bandwidth() -> float:
-    """GB/s of memory that two cores read and write: twice the best of some copies on one."""
+    """Measure the GB/s of memory that two cores read and write: twice the best of some copies on one."""
     given, taken = np.ones(_NUMBERS), np.empty(_NUMBERS)
     seconds = []
     for _ in range(10):
@@ -207,7 +207,7 @@ APART: dict[str, Callable[..., Any]] = {
 
 
 def apart(what: str, **arguments: Any) -> Any:
-    """The result of one of these in a process of its own."""
+    """Run one of these in a process of its own; give its result."""
     command = [sys.executable, __file__, "--apart", json.dumps([what, arguments])]
     said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
     return json.loads(said.splitlines()[-1])
@@ -217,7 +217,7 @@ def apart(what: str, **arguments: Any) -> Any:
 
 
 def growth(settings: str, sides: tuple[int, ...], repeats: int) -> Run:
-    """Cost and memory as the plane grows, all on two cores; returns the largest."""
+    """Measure cost and memory as the plane grows, all on two cores; return the largest."""
     print(f"\n{settings} settings, two cores")
     print("       cells  tiles  us/cell  busy us/cell  bytes/cell  files  resident GiB")
     for side in sides:
@@ -232,7 +232,7 @@ def growth(settings: str, sides: tuple[int, ...], repeats: int) -> Run:
 
 
 def bookkeeping(side: int, whole: Run) -> None:
-    """What is done besides simulating: the busy time of a run whose engine does nothing, in that of a whole one."""
+    """Measure all besides simulating: the busy time of a run whose engine does nothing, in that of a whole one."""
     bare = Run(*apart("study", side=side, settings="default", cores=2, engine=False))
     idle, full = (1e6 * run.busy / run.cells for run in (bare, whole))
     print(
@@ -241,7 +241,7 @@ def bookkeeping(side: int, whole: Run) -> None:
 
 
 def scaling(side: int, repeats: int) -> None:
-    """One core against two, and one worker of a core against two, in turn."""
+    """Compare one core with two, and one worker of a core with two, in turn."""
     ways = {"cores": [{"cores": 1}, {"cores": 2}], "workers": [{"cores": n, "workers": n} for n in (1, 2)]}
     print()
     for name, both in ways.items():
@@ -259,7 +259,7 @@ def scaling(side: int, repeats: int) -> None:
 
 
 def table(run: Run, bytes_per_second: float) -> None:
-    """Hours and gigabytes of large planes."""
+    """Print hours and gigabytes of large planes."""
     faster = _GPU[1] / bytes_per_second
     print("\n       cells   2 cores [h]   one GPU [h]  100 GPUs [h]    store [GB]  files")
     for cells in _LARGE:
@@ -276,7 +276,7 @@ def table(run: Run, bytes_per_second: float) -> None:
 
 
 def limits(run: Run, bytes_per_second: float, quick: bool) -> None:
-    """What breaks first."""
+    """Print what breaks first."""
     rate = apart("dealing", tasks=200 if quick else 2000)
     task, held = apart("weights", side=300 if quick else 3000)
     again = apart("resume", side=300 if quick else 1000)

@@ -57,29 +57,29 @@ class Row(NamedTuple):
 
     @property
     def cell_period(self) -> float:
-        """Microseconds per cell-period."""
+        """Give the microseconds per cell-period."""
         return 1e6 * self.seconds / (self.cells * self.periods)
 
 
 def axes(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """The axes d and kappa of the plane at side x side cells."""
+    """Lay the axes d and kappa of the plane at side x side cells."""
     return np.linspace(0.05, 0.3, side), np.geomspace(3, 400, side)
 
 
 def cells(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """d and kappa of every cell of the plane."""
+    """List d and kappa of every cell of the plane."""
     d, kappa = np.meshgrid(*axes(side), indexing="ij")
     return d.ravel(), kappa.ravel()
 
 
 def sweep(side: int, periods: int, outputs: tuple[str, ...] = ("impacts_per_period",)) -> Any:
-    """The plane's dataset by vijax."""
+    """Sweep the plane by vijax."""
     d, kappa = axes(side)
     return vijax.sweep(d=d, kappa=kappa, r=R, u0=U0, v0=V0, until="window", periods=periods, outputs=outputs)
 
 
 def peer(side: int, periods: int) -> np.ndarray:
-    """The plane's impacts per period by RK4."""
+    """Count the plane's impacts per period by RK4."""
     from peers import rk4_impacts_per_period  # here: --scaling and --large do without numba, in time and memory
 
     return rk4_impacts_per_period(*cells(side), R, U0, V0, periods, PEER_STEPS)
@@ -98,13 +98,13 @@ def timed(what: str, side: int, periods: int, repeat: int, call: Callable[[], An
 
 
 def typical(rows: list[Row], what: str) -> Row:
-    """The median of the repeats of one thing."""
+    """Take the median of the repeats of one thing."""
     repeats = sorted((row for row in rows if row.what == what), key=lambda row: row.seconds)
     return repeats[(len(repeats) - 1) // 2]
 
 
 def against_peer(quick: bool) -> Iterator[Row]:
-    """Warm times of vijax, of vijax asked for P, and of the peer, in alternation; what compiling costs; accuracy."""
+    """Time vijax, vijax asked for P, and the peer, warm, in alternation; what compiling costs; accuracy."""
     side, periods, repeats = (64, 20, 3) if quick else (128, 100, 5)
     contenders: dict[str, Callable[[], Any]] = {
         "vijax": partial(sweep, side, periods),
@@ -158,14 +158,14 @@ def accuracy(side: int) -> None:
 
 
 def import_seconds() -> float:
-    """Seconds that `import vijax` and the first of its names take in a new process, the least of three."""
+    """Time `import vijax` and the first of its names in a new process, the least of three."""
     code = "import time; start = time.perf_counter(); import vijax.public; print(time.perf_counter() - start)"
     runs = (subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3))
     return min(float(run.stdout) for run in runs)
 
 
 def scaling(quick: bool) -> Iterator[Row]:
-    """Warm cost per cell as the plane grows, in rounds over the sizes; the first round compiles and is dropped."""
+    """Time warm cells as the plane grows, in rounds over the sizes; the first round compiles and is dropped."""
     sides, periods, repeats = ((64, 128, 256), 20, 2) if quick else ((128, 256, 512, 1024), 100, 3)
     rows = []
     for repeat in range(repeats + 1):
@@ -180,7 +180,7 @@ def scaling(quick: bool) -> Iterator[Row]:
 
 
 def large(quick: bool) -> Iterator[Row]:
-    """One cold call for the attractors and P of a large plane, and the most memory this process ever held."""
+    """Time one cold call for attractors and P of a large plane, and find the most memory this process ever held."""
     side, periods = (256 if quick else 1024), 400
     d, kappa = axes(side)
     start = time.perf_counter()
@@ -198,7 +198,7 @@ def large(quick: bool) -> Iterator[Row]:
 
 
 def ode(quick: bool) -> Iterator[Row]:
-    """Warm times of the ode engine and of a plain diffrax restart chain, and how wrong either is after some periods."""
+    """Time the ode engine and a plain diffrax restart chain, warm, and tell how wrong either is after some periods."""
     from peers import diffrax_chain
 
     side, periods, chained, repeats = (24, 10, 2, 1) if quick else (64, 100, ACCURACY_PERIODS, 3)

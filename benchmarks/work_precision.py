@@ -62,7 +62,7 @@ class Scene(NamedTuple):
 
     @property
     def title(self) -> str:
-        """As the chart says it."""
+        """Give it as the chart says it."""
         return self.name + ("" if self.kappa is None else rf", $\kappa$ = {self.kappa:g}")
 
 
@@ -117,7 +117,7 @@ class Contender(NamedTuple):
 
 
 def pair_of(cells: Cells, dtype: str = "float64", kappa: Any = None) -> vijax.ImpactPair:
-    """The parameters of the cells, or those with another kappa."""
+    """Make the parameters of the cells, or those with another kappa."""
     d, r, gamma = (jnp.broadcast_to(jnp.asarray(x, dtype), cells.d.shape) for x in (cells.d, R, cells.scene.gamma))
     if kappa is None and cells.scene.kappa is not None:
         kappa = jnp.full_like(d, cells.scene.kappa)
@@ -125,14 +125,14 @@ def pair_of(cells: Cells, dtype: str = "float64", kappa: Any = None) -> vijax.Im
 
 
 def follow(cells: Cells, dtype: str = "float64", **options: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The state after PERIODS by `vijax.trajectory`."""
+    """Find the state after PERIODS by `vijax.trajectory`."""
     room = None if options else ROOM  # a stepping engine's budget of steps grows with it, the exact engine's cost too
     states = vijax.trajectory(pair_of(cells, dtype), cells.u0, cells.v0, PERIODS, max_impacts=room, **options).states
     return np.asarray(states.u)[:, -1], np.asarray(states.v)[:, -1]
 
 
 def sweep(cells: Cells, periods: int, **options: Any) -> Any:
-    """A window by `vijax.sweep`, from axes to labelled dataset."""
+    """Run a window by `vijax.sweep`, from axes to labelled dataset."""
     scene = cells.scene
     wall = {"wall": "rigid"} if scene.kappa is None else {"kappa": scene.kappa}
     starts = {name: start for name, start in (("u0", cells.u0), ("v0", cells.v0)) if start is not None}
@@ -141,7 +141,7 @@ def sweep(cells: Cells, periods: int, **options: Any) -> Any:
 
 
 def slope(cells: Cells, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative of the state after PERIODS with respect to kappa."""
+    """Differentiate the state after PERIODS with respect to kappa."""
 
     def end(kappa):
         pair = pair_of(cells, kappa=kappa)
@@ -154,14 +154,14 @@ def slope(cells: Cells, **options: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rk4(cells: Cells, periods: int = PERIODS, *, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """The peer without events."""
+    """Run the peer without events."""
     d, kappa, u0, v0, gamma = cells.d, cells.scene.kappa, cells.u0, cells.v0, cells.scene.gamma
     _, u, v = peers.rk4(d, kappa, R, u0, v0, periods, steps, gamma=gamma)
     return u, v
 
 
 def located(solve: Callable, cells: Cells, periods: int = PERIODS, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-    """A peer with events."""
+    """Run a peer with events."""
     scene = cells.scene
     return solve(cells.d, scene.kappa, R, scene.gamma, cells.u0, cells.v0, periods, **options)
 
@@ -170,7 +170,7 @@ def located(solve: Callable, cells: Cells, periods: int = PERIODS, **options: An
 
 
 def settled(scene: Scene) -> Cells:
-    """The cells whose errors are measured, each on its attractor at phase 0."""
+    """Find the cells whose errors are measured, each on its attractor at phase 0."""
     cells = Cells(scene, np.linspace(*scene.d, COMPARED), 0.02, 0.3)
     for _ in range(SETTLING):
         u, v = follow(cells)
@@ -179,7 +179,7 @@ def settled(scene: Scene) -> Cells:
 
 
 def truth(cells: Cells, by_kappa: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """The state after PERIODS in 50 digits, or its derivative by kappa.
+    """Compute the state after PERIODS in 50 digits, or its derivative by kappa.
 
     The exact engine's impacts are only the guesses from which each event is found anew.
     """
@@ -218,7 +218,7 @@ def _slope_50(parameters: list[Any], guesses: list) -> list[mp.mpf]:
 
 
 def tolerances(*exponents: int) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Relative tolerances by their exponents, in words and as options; the absolute one is a hundredth."""
+    """Yield relative tolerances by their exponents, in words and as options; the absolute one is a hundredth."""
     for exponent in exponents:
         yield f"1e-{exponent}", {"rtol": 10.0**-exponent, "atol": 10.0 ** -(exponent + 2)}
 
@@ -229,7 +229,7 @@ MORE_STEPS = (16000, 64000)  # for the cheapest only
 
 
 def ours(scene: Scene) -> Iterator[Contender]:
-    """vijax by all its methods."""
+    """Yield vijax by all its methods."""
     for name, dtype in (("exact", "float64"), ("exact float32", "float32")):
         yield Contender(name, dtype, partial(follow, dtype=dtype), partial(sweep, dtype=dtype), TIMED["exact"])
     if scene.kappa is None:
@@ -245,7 +245,7 @@ def ours(scene: Scene) -> Iterator[Contender]:
 
 
 def theirs(scene: Scene) -> Iterator[Contender]:
-    """The peers."""
+    """Yield the peers."""
     if scene.kappa is not None:
         for steps in (*STEPS, *MORE_STEPS):
             run = partial(rk4, steps=steps)
@@ -263,7 +263,7 @@ def theirs(scene: Scene) -> Iterator[Contender]:
 
 
 def of_gradients() -> Iterator[Contender]:
-    """What can be differentiated."""
+    """Yield what can be differentiated."""
     choices: list[tuple[str, str, dict[str, Any]]] = [("exact", "float64", {})]
     for solver in ("Tsit5", "Dopri8"):
         named: dict[str, Any] = {"method": "ode", "solver": solver}
@@ -275,7 +275,7 @@ def of_gradients() -> Iterator[Contender]:
 
 
 def of_averages() -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """What can go on for long enough: names, settings, options of a sweep."""
+    """Yield what can go on for long enough: names, settings, options of a sweep."""
     for name, dtype in (("exact", "float64"), ("exact float32", "float32")):
         yield name, dtype, {"dtype": dtype}
     for setting, told in tolerances(4, 6, 8):
@@ -288,14 +288,14 @@ def of_averages() -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def seconds(call: Callable[[], Any]) -> float:
-    """Wall time of a call whose result lies in host memory."""
+    """Time a call whose result lies in host memory."""
     begun = time.perf_counter()
     call()
     return time.perf_counter() - begun
 
 
 def pace(run: Callable[[int], Any], cells: int, periods: int | None = None) -> tuple[float, float]:
-    """Microseconds per cell-period of a warm call, and what its first call took beyond a second one.
+    """Time a warm call in microseconds per cell-period, and what its first call took beyond a second one.
 
     Args:
         run: A call for a number of periods; it compiles one program for all of them.
@@ -312,18 +312,18 @@ def pace(run: Callable[[int], Any], cells: int, periods: int | None = None) -> t
 
 
 def as_it_is(answer: Callable[[Cells], Any], cells: Cells, _: int) -> Any:
-    """A run of PERIODS, which cannot be had for another number of periods without compiling it again."""
+    """Run for PERIODS, which cannot be had for another number of periods without compiling it again."""
     return answer(cells)
 
 
 def deviation(found: tuple[np.ndarray, np.ndarray], true: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Distance of each cell's answer from the true one, infinite where there is none."""
+    """Measure the distance of each cell's answer from the true one, infinite where there is none."""
     error = np.hypot(*(np.asarray(a, float) - b for a, b in zip(found, true, strict=True)))
     return np.where(np.isfinite(error), error, np.inf)
 
 
 def regular(scene: Scene, contenders: Iterator[Contender], quick: bool) -> Iterator[Row]:
-    """Error of the final state, cost and compile time of every contender on one scene."""
+    """Measure error of the final state, cost and compile time of every contender on one scene."""
     cells = settled(scene)
     true = truth(cells)
     middle = COMPARED // 2
@@ -338,12 +338,12 @@ def regular(scene: Scene, contenders: Iterator[Contender], quick: bool) -> Itera
 
 
 def summary(error: np.ndarray) -> tuple[float, float, int]:
-    """Median, worst and number of infinite errors."""
+    """Find median, worst and number of infinite errors."""
     return float(np.median(error)), float(error.max()), int(np.isinf(error).sum())
 
 
 def gradients(scene: Scene) -> Iterator[Row]:
-    """Relative error of the derivative of the final state with respect to kappa."""
+    """Measure the relative error of the derivative of the final state with respect to kappa."""
     cells = settled(scene)
     true = truth(cells, by_kappa=True)
     copies = np.resize(np.arange(COMPARED), TIMED["gradient"])
@@ -357,7 +357,7 @@ def gradients(scene: Scene) -> Iterator[Row]:
 
 
 def averages(scene: Scene) -> Iterator[Row]:
-    """Mean relative deviation of P over chaotic cells, and its standard error."""
+    """Measure the mean relative deviation of P over chaotic cells, and its standard error."""
     cells = Cells(scene, np.linspace(*scene.d, CHAOTIC_CELLS), None, None)
 
     def power(periods: int, transient: int, **told: Any) -> np.ndarray:
@@ -376,7 +376,7 @@ def averages(scene: Scene) -> Iterator[Row]:
 
 
 def quick_contenders() -> Iterator[Contender]:
-    """Few, that compile in seconds."""
+    """Yield few, that compile in seconds."""
     wanted = {
         "exact": {"float64"},
         "ode Tsit5": {"1e-4", "1e-6", "1e-8"},
@@ -389,7 +389,7 @@ def quick_contenders() -> Iterator[Contender]:
 
 
 def measure(quick: bool) -> Iterator[Row]:
-    """All rows."""
+    """Measure all rows."""
     if quick:
         yield from regular(MID, quick_contenders(), quick)
         return
@@ -400,7 +400,7 @@ def measure(quick: bool) -> Iterator[Row]:
 
 
 def tell(row: Row) -> str:
-    """A row in words."""
+    """Put a row in words."""
     name = row.scene.replace("$", "").replace("\\", "")
     noise = f" +- {row.noise:.1e}" if row.noise else ""
     lost = f"  {row.lost} CELLS LOST" if row.lost else ""
@@ -432,7 +432,7 @@ def main() -> None:
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a CSV file."""
+    """Read the rows of a CSV file."""
     kinds = Row.__annotations__.values()
     with path.open(newline="") as file:
         lines = list(csv.reader(file))[1:]

@@ -26,7 +26,7 @@ DIGITS = 50
 
 
 def reference_trajectories() -> list[dict[str, Any]]:
-    """The 50-digit impact sequences."""
+    """Read the 50-digit impact sequences."""
     return json.loads((DATA / "trajectories.json").read_text())["cases"]
 
 
@@ -42,12 +42,12 @@ class ReferenceOrbit(NamedTuple):
 
 
 def reference_rows() -> list[dict[str, Any]]:
-    """The 50-digit period-1 orbits as they are written down."""
+    """Read the 50-digit period-1 orbits as they are written down."""
     return json.loads((DATA / "gradients.json").read_text())["orbits"]
 
 
 def reference_orbits() -> list[ReferenceOrbit]:
-    """The 50-digit period-1 orbits."""
+    """Read the 50-digit period-1 orbits."""
     found = []
     for row in reference_rows():
         v, t, stay, depth = (np.array([float(x) for x in row[name]]) for name in ("v_in", "t_in", "contact", "dmax"))
@@ -85,7 +85,7 @@ def _program(steps: int):
 
 
 def march(pair: ImpactPair, state: State, steps: int = STEPS, tile: int = TILE) -> March:
-    """`steps` steps of every start, tile by tile, so that all tests share one compiled program per kind of wall."""
+    """Take `steps` steps of every start, tile by tile, so that all tests share one program per kind of wall."""
     count = np.size(state.u)
     size = -(-count // tile) * tile
     pair, state = jax.tree.map(
@@ -99,21 +99,21 @@ def march(pair: ImpactPair, state: State, steps: int = STEPS, tile: int = TILE) 
 
 
 def start(u, v, t=0.0, mode=0) -> State:
-    """States from numbers or arrays."""
+    """Make states from numbers or arrays."""
     given: Any = np.broadcast_arrays(u, v, t, mode)
     u, v, t, mode = given
     return State(u.astype(float), v.astype(float), t.astype(float), 0 * mode.astype(np.int32), mode.astype(np.int32))
 
 
 def pairs(d, kappa, r, gamma) -> ImpactPair:
-    """Pairs from numbers or arrays, kappa None for rigid walls."""
+    """Make pairs from numbers or arrays, kappa None for rigid walls."""
     given: Any = np.broadcast_arrays(d, 1.0 if kappa is None else kappa, r, gamma)
     d, frequency, r, gamma = (x.astype(float) for x in given)
     return ImpactPair(d, None if kappa is None else frequency, r, gamma)
 
 
 def random_cells(rng: np.random.Generator, count: int, soft: bool) -> tuple[ImpactPair, State]:
-    """Pairs over the whole range of the engine and starts in their gaps."""
+    """Draw pairs over the whole range of the engine and starts in their gaps."""
     d = np.exp(rng.uniform(np.log(0.005), np.log(2), count))
     kappa = np.exp(rng.uniform(np.log(0.5), np.log(1e5), count))
     r = np.where(rng.random(count) < 0.1, rng.choice([1e-6, 0.01, 0.99], count), rng.uniform(0.05, 0.97, count))
@@ -127,7 +127,7 @@ def random_cells(rng: np.random.Generator, count: int, soft: bool) -> tuple[Impa
 
 
 def long_flight(gamma, t0, v0, s):
-    """Rise and velocity of a flight in long double, by the plain formula."""
+    """Compute rise and velocity of a flight in long double, by the plain formula."""
     gamma, t0, v0, s = (np.asarray(x, np.longdouble) for x in (gamma, t0, v0, s))
     phase = LONG_PI * (t0 + s)
     sin0, cos0 = np.sin(LONG_PI * t0), np.cos(LONG_PI * t0)
@@ -136,7 +136,7 @@ def long_flight(gamma, t0, v0, s):
 
 
 def long_contact(kappa, r, gamma, side, t, w0, z0, s):
-    """Penetration and its rate a time s after phase t, in long double, by complex exponentials."""
+    """Compute penetration and its rate a time s after phase t, in long double, by complex exponentials."""
     kappa, r, gamma, side, t, w0, z0, s = (np.asarray(x, np.longdouble) for x in (kappa, r, gamma, side, t, w0, z0, s))
     decrement = -np.log(r)
     scale = kappa / np.sqrt(LONG_PI**2 + decrement**2)
@@ -153,7 +153,7 @@ def long_contact(kappa, r, gamma, side, t, w0, z0, s):
 
 
 def _peak(values: np.ndarray) -> np.ndarray:
-    """Largest value on an even grid (last axis), by a parabola through each sample that tops its neighbours."""
+    """Find the largest value on an even grid (last axis), by a parabola through samples that top their neighbours."""
     left, middle, right = values[..., :-2], values[..., 1:-1], values[..., 2:]
     bend, tilt = 2 * middle - left - right, right - left
     top = (middle >= left) & (middle >= right) & (bend > 0)
@@ -162,7 +162,7 @@ def _peak(values: np.ndarray) -> np.ndarray:
 
 
 def audit_flights(pair: ImpactPair, ran: March, samples: int = 400) -> np.ndarray:
-    """How far each flight was beyond a wall before its reported end (negative: never), over the scale of its terms."""
+    """Find how far flights were beyond a wall before their reported ends (negative: never), over their terms' scale."""
     flew = (ran.before.mode == 0) & ~(ran.out.permanent & (ran.out.impact.side == 0))
     index = np.nonzero(flew)
     d, gamma = pair.d[index[0]], pair.gamma[index[0]]
@@ -189,7 +189,7 @@ _WIDTHS = (
 
 
 def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
-    """How far w was below zero before the reported end of each contact, over the scale of w (negative: never)."""
+    """Find how far w was below zero before the reported end of each contact, over the scale of w (negative: never)."""
     held = ((ran.out.impact.side != 0) | (ran.before.mode != 0)) & ~np.isnan(ran.out.stay)
     index = np.nonzero(held)
     d, kappa, r, gamma = (np.asarray(x)[index[0]] for x in (pair.d, pair.kappa, pair.r, pair.gamma))
@@ -219,7 +219,7 @@ def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
 
 
 def both_ways(hit, out) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """What a fast step found of an impact, and what the careful step did, by name."""
+    """Name what a fast step found of an impact, and what the careful step did."""
     impact = out.impact
     return {
         "flight": (hit.flight, out.flight),
@@ -241,7 +241,7 @@ class Extrema(NamedTuple):
     ran: March
 
     def wrong(self) -> int:
-        """Turning points that the engine put on the wrong side: hit where it turns before the wall, or missed."""
+        """Count turning points that the engine put on the wrong side: hit where it turns before the wall, or missed."""
         length = np.where(self.ran.before.mode[:, 0] != 0, self.ran.out.stay[:, 0], self.ran.out.flight[:, 0])
         early = (length <= self.reach * (1 + 1e-9)) & ~self.ran.out.quiet[:, 0]
         return int(np.sum(early != (self.height > 0)))
@@ -252,7 +252,7 @@ def _offsets(rng, count):
 
 
 def grazing_flights(rng: np.random.Generator, count: int, steps: int = STEPS, tile: int = TILE) -> Extrema:
-    """Flights that turn a given distance before or behind a wall, built backwards from the turning point."""
+    """Make flights that turn a given distance before or behind a wall, built backwards from the turning point."""
     many = 8 * count
     d = np.exp(rng.uniform(np.log(0.02), np.log(2), many))
     gamma = rng.choice([0.0, 0.3, 1.5], many) * rng.uniform(-1, 1, many)
@@ -278,7 +278,7 @@ def grazing_flights(rng: np.random.Generator, count: int, steps: int = STEPS, ti
 
 
 def grazing_contacts(rng: np.random.Generator, count: int, steps: int = STEPS, tile: int = TILE) -> Extrema:
-    """Contacts whose penetration has a least value a given distance above or below zero, started inside the wall."""
+    """Make contacts whose penetration is least a given distance above or below zero, started inside the wall."""
     many = 12 * count
     d = np.exp(rng.uniform(np.log(0.02), np.log(2), many))
     kappa = np.exp(rng.uniform(np.log(0.5), np.log(1e3), many))
@@ -310,14 +310,14 @@ def grazing_contacts(rng: np.random.Generator, count: int, steps: int = STEPS, t
 
 
 def mp_flight(gamma, t0, v0, s):
-    """Rise and velocity of a flight."""
+    """Compute rise and velocity of a flight."""
     sin0, cos0 = mp.sinpi(t0), mp.cospi(t0)
     rise = v0 * s - gamma * s * s / 2 + (cos0 - mp.cospi(t0 + s) - mp.pi * s * sin0) / mp.pi**2
     return rise, v0 - gamma * s + (mp.sinpi(t0 + s) - sin0) / mp.pi
 
 
 def mp_oscillate(kappa, r, force, w0, z0, s):
-    """(w, w') of w'' + mu w' + kappa^2 w = c cos(pi s) - q sin(pi s) - g, force = (c, q, g)."""
+    """Compute (w, w') of w'' + mu w' + kappa^2 w = c cos(pi s) - q sin(pi s) - g, force = (c, q, g)."""
     c, q, g = force
     decrement = -mp.log(r)
     scale = kappa / mp.sqrt(mp.pi**2 + decrement**2)
@@ -332,7 +332,7 @@ def mp_oscillate(kappa, r, force, w0, z0, s):
 
 
 def mp_contact(kappa, r, gamma, side, t, z0, s, w0=0):
-    """Penetration, its rate and its second derivative a time s after phase t."""
+    """Compute penetration, its rate and its second derivative a time s after phase t."""
     force = (side * mp.cospi(t), side * mp.sinpi(t), side * gamma)
     w, z = mp_oscillate(kappa, r, force, w0, z0, s)
     mu = -2 * kappa * mp.log(r) / mp.sqrt(mp.pi**2 + mp.log(r) ** 2)
@@ -340,7 +340,7 @@ def mp_contact(kappa, r, gamma, side, t, z0, s, w0=0):
 
 
 def newton(function, x, iterations: int = 8):
-    """Root of a function that returns value and slope, from a guess good to a few digits."""
+    """Find the root of a function that returns value and slope, from a guess good to a few digits."""
     for _ in range(iterations):
         value, slope = function(x)
         x = x - value / slope
@@ -359,7 +359,7 @@ class Row(NamedTuple):
 
 
 def mp_march(parameters, count: int, guesses: list | None = None) -> tuple[list[Row], list]:
-    """The first impacts of a start (d, kappa or None, r, gamma, u0, v0) at t = 0, each event from a dense scan.
+    """Find the first impacts of a start (d, kappa or None, r, gamma, u0, v0) at t = 0, each event from a dense scan.
 
     `guesses` of a run nearby replace the scans.
     """
@@ -416,12 +416,12 @@ RIGID = [case for case in CASES if case["case"].get("hard")]
 
 
 def sensitive(case) -> bool:
-    """Whether float64 loses more than a rounding a step on it: chaotic, or the rigid wall's slow impacts."""
+    """Say whether float64 loses more than a rounding a step on it: chaotic, or the rigid wall's slow impacts."""
     return case["float64_max_err"]["t"] > 1e-14
 
 
 def compare(cases) -> list[tuple[dict, dict[str, np.ndarray]]]:
-    """Relative errors per impact of the reference sequences."""
+    """Compute relative errors per impact of the reference sequences."""
     given = [[float(case["case"][name]) for case in cases] for name in ("d", "kappa", "r", "gamma")]
     rigid = bool(cases[0]["case"].get("hard"))
     begin = [[float(case[name]) for case in cases] for name in ("u0", "v0", "t0")]
@@ -445,7 +445,7 @@ def compare(cases) -> list[tuple[dict, dict[str, np.ndarray]]]:
 
 
 def determinants(pair, ran, steps: int) -> np.ndarray:
-    """|det - expected|/max(1, |M|^2) of the first steps' monodromy, NaN where a step was no plain impact."""
+    """Compute |det - expected|/max(1, |M|^2) of the first steps' monodromy, NaN where a step was no plain impact."""
     plain = ((ran.out.impact.side != 0) & ~ran.out.permanent & ~ran.out.stuck & np.isfinite(ran.out.stay))[:, :steps]
     matrix = np.eye(2)
     for k in range(steps):

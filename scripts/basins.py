@@ -11,7 +11,7 @@ from vijax.cli.process import run
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit code; see `process.run`."""
+    """Run the command and give its exit code; see `process.run`."""
     return run(basins, arguments)
 
 

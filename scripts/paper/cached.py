@@ -21,7 +21,7 @@ _IMPACTS = 3  # orbits are padded to so many, so that one program follows the br
 
 @lru_cache(maxsize=16)
 def diagram(run: Run) -> "xr.Dataset":
-    """The orbit diagram of a run."""
+    """Compute the orbit diagram of a run."""
     axes: Any = {name: np.asarray(values) if isinstance(values, tuple) else values for name, values in run.axes}
     return orbit_diagram(
         along=run.along,
@@ -36,7 +36,7 @@ def diagram(run: Run) -> "xr.Dataset":
 
 @lru_cache(maxsize=64)
 def orbits(walls: str, d: float, kappa: float | None, r: float = 0.5, period: int = 1) -> periodic.Orbit:
-    """Every orbit found with these walls, stable or not; kappa is None of rigid walls."""
+    """Find every orbit with these walls, stable or not; kappa is None of rigid walls."""
     return orbit_search.search(impact_pair(d, kappa, r), walls, period)
 
 
@@ -44,7 +44,7 @@ def orbits(walls: str, d: float, kappa: float | None, r: float = 0.5, period: in
 def branches(
     walls: str, along: str, within: tuple[float, float], d: float, kappa: float | None, r: float = 0.5, period: int = 1
 ) -> list[continuation.Branch]:
-    """The branches of all orbits with these walls; along omega those of the device of Figs. 12-16."""
+    """Follow all orbits with these walls; along omega those of the device of Figs. 12-16."""
     found = orbits(walls, d, kappa, r, period)
     if not len(found):
         return []

@@ -109,13 +109,13 @@ class PaperFigure(NamedTuple):
 
 
 def run(along: str, *values: float, **told: Any) -> Run:
-    """A `Run`: its settings by their names, everything else an axis."""
+    """Make a `Run`: its settings by their names, everything else an axis."""
     settings = {name: told.pop(name) for name in ("direction", "wall", "periods", "keep") if name in told}
     return Run(along, values, tuple(told.items()), **settings)
 
 
 def _chaos(along: str, value: float, **told: Any) -> Run:
-    """A long run at one point, for a Poincare section."""
+    """Make a long run at one point, for a Poincare section."""
     return run(along, value, periods=SECTION_PERIODS + PERIODS, keep=SECTION_PERIODS, **told)
 
 
@@ -142,12 +142,12 @@ _ENERGY = "Energies are microjoules, as Eq. (34) with Tables I and II gives them
 
 
 def _each(letters: str, shows: tuple[str, ...], sources: tuple[Source, ...]) -> list[View]:
-    """Panels of the same sources."""
+    """Make panels of the same sources."""
     return [View(letter, what, sources) for letter, what in zip(letters, shows, strict=True)]
 
 
 def _planes(letters: str, *sources: Source) -> list[View]:
-    """Phase planes of the same sources at the three gaps of Figs. 3 and 5."""
+    """Make phase planes of the same sources at the three gaps of Figs. 3 and 5."""
     return [
         View(
             letter,
@@ -161,7 +161,7 @@ def _planes(letters: str, *sources: Source) -> list[View]:
 
 
 def _by_stiffness(r: float, **where: float) -> tuple[Source, ...]:
-    """Five kappa of Figs. 8-11 in their colours."""
+    """Make sources of the five kappa of Figs. 8-11 in their colours."""
     return tuple(
         Source(BY_GAP[r], {"kappa": kappa, **where}, colour, rf"$\kappa = {kappa:g}$")
         for kappa, colour in zip(STIFFNESSES, COLOURS, strict=True)
@@ -169,7 +169,7 @@ def _by_stiffness(r: float, **where: float) -> tuple[Source, ...]:
 
 
 def _by_spring(r: float, **where: float) -> tuple[Source, ...]:
-    """Five k of Figs. 12-16 in their colours."""
+    """Make sources of the five k of Figs. 12-16 in their colours."""
     return tuple(
         Source(BY_FREQUENCY[r], {"k": k, **where}, colour, f"$k = {k:g}$ N/m")
         for k, colour in zip(SPRINGS, COLOURS, strict=True)
@@ -231,7 +231,7 @@ _FAST_ORBIT = Source(SOFTENED, {"d": 0.2, "kappa": 4.0}, COLOURS[-1], r"$\kappa 
 
 
 def _fast(r: float) -> tuple[Source, ...]:
-    """The three stiffest membranes at the frequencies of Fig. 16(b)."""
+    """Make sources of the three stiffest membranes at the frequencies of Fig. 16(b)."""
     stiff, medium, soft = _by_spring(r)[:3]
     return tuple(
         source._replace(where=source.where | {"omega": omega})

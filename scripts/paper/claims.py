@@ -71,7 +71,7 @@ def _claim(name: str, where: str, says: str, paper: str) -> Callable[[Callable[[
 
 
 def line(claim: Claim, found: Finding) -> str:
-    """A claim and what was found, for a terminal."""
+    """Put a claim and what was found in words, for a terminal."""
     return (
         f"{claim.name} ({claim.where}): {claim.says}\n"
         f"  paper      {claim.paper}\n"
@@ -82,7 +82,7 @@ def line(claim: Claim, found: Finding) -> str:
 
 
 def markdown(rows: list[tuple[Claim, Finding]]) -> str:
-    """The table of claims."""
+    """Lay the claims out in a table."""
     heads = ("claim", "paper", "ours by the paper's procedure", "ours converged", "verdict")
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for claim, found in rows:
@@ -195,7 +195,7 @@ def _end_of_two_to_three() -> Finding:
 
 
 def _slow_sides(d: float) -> float:
-    """Share of slow impacts that lie on the wall with fewer of them, in a long run."""
+    """Count the share of slow impacts that lie on the wall with fewer of them, in a long run."""
     found = orbit_diagram(along="d", values=np.array([d]), r=0.5, wall="rigid", periods=6000, keep=5000)
     side = found["side"].where(abs(found["v_in"]) < SLOW_IMPACT)
     counts = [int((side == wall).sum()) for wall in (-1, 1)]
@@ -286,7 +286,7 @@ _WALLS = ({"wall": "rigid"}, {"kappa": 400.0})
 
 
 def _peak(branches: list[Branch]) -> tuple[float, float]:
-    """kappa and value of the largest impact speed along branches, by the parabola through the three highest points."""
+    """Find kappa and value of the largest impact speed along branches, by the parabola through the highest points."""
     best = max(branches, key=lambda each: float(np.nanmax(evidence.speeds(each.orbit))))
     top = np.nanmax(evidence.speeds(best.orbit), axis=1)
     i = int(np.clip(np.argmax(top), 1, top.size - 2))
@@ -331,7 +331,7 @@ def _coexistence() -> Finding:
 
 
 def _first_one_to_one(d: float, paper: float, other: float) -> Finding:
-    """Where 1:2 gives way to 1:1 as kappa falls."""
+    """Find where 1:2 gives way to 1:1 as kappa falls."""
     names = evidence.labels(SOFTENED, d=d)
     first, _ = evidence.stretch(names, "1:1", 12.0)
     index = int(np.argmin(np.abs(names["kappa"].values - first)))
@@ -483,13 +483,13 @@ def _all_symmetric() -> Finding:
 
 
 def _both_walls(name: str, at: float, end: int) -> tuple[float, float]:
-    """First (0) or last (1) omega of the stretch of a name around a value, soft and rigid."""
+    """Find first (0) or last (1) omega of the stretch of a name around a value, soft and rigid."""
     soft, rigid = evidence.labels(BY_FREQUENCY[0.5], k=560.0), evidence.labels(RIGID_BY_FREQUENCY)
     return evidence.stretch(soft, name, at)[end], evidence.stretch(rigid, name, at)[end]
 
 
 def _fork(walls: str, kind: str, near: float, at: float, within: tuple[float, float], period: int = 1) -> list[float]:
-    """A point along omega, soft and rigid; rigid walls have it where their d is that of the frequency."""
+    """Find a point along omega, soft and rigid; rigid walls have it where their d is that of the frequency."""
     soft = evidence.met(branches(walls, "omega", within, *evidence.at_frequency(at, 560.0), 0.5, period), kind, near)
     gap, rigid_gap = (evidence.at_frequency(omega, None)[0] for omega in (at, near))
     bounds = tuple(evidence.at_frequency(omega, None)[0] for omega in within)
@@ -601,7 +601,7 @@ def _softer_gives_more() -> Finding:
 
 
 def _admissible(k: float) -> float:
-    """Share of frequencies in the 1:1 zone at which the energies are admissible."""
+    """Count the share of frequencies in the 1:1 zone at which the energies are admissible."""
     from vijax.planes.sweep import sweep
 
     found = sweep(s=GAP_IN_METRES, omega=np.linspace(3.2, 6.0, 29), k=k, r=0.5, outputs=("admissible",))

@@ -54,20 +54,20 @@ _LOGARITHMIC = {"energy", "power"}
 
 
 def axis_label(name: str) -> str:
-    """Symbol and unit of the axis that a figure sweeps, as the paper writes them."""
+    """Write symbol and unit of the axis that a figure sweeps, as the paper writes them."""
     axis = AXES[name]
     return f"${axis.attributes['symbol']}$" + (f" [{axis.unit}]" if axis.unit else "")
 
 
 def selected(source: Source) -> "xr.Dataset":
-    """The part of a diagram that a source names; the points nearest to its values."""
+    """Pick the part of a diagram that a source names; the points nearest to its values."""
     found = _mirrored(source.run) if source.mirror else diagram(source.run)
     return found.sel({name: value for name, value in source.where.items() if name in found.dims}, method="nearest")
 
 
 @lru_cache(maxsize=2)
 def _mirrored(run: Run) -> "xr.Dataset":
-    """The mirror image (u, t) -> (-u, t + 1) of a diagram along one axis: its strobes are half a period away."""
+    """Mirror a diagram along one axis, (u, t) -> (-u, t + 1): its strobes are half a period away."""
     found = diagram(run)
     later = np.floor(found["phase"])  # of two half periods, the second becomes the first of the next period
     image = {name: -found[name] for name in ("v_in", "v_out", "side")}
@@ -84,19 +84,19 @@ def _points_of(found: "xr.Dataset", run: Run) -> Iterator["xr.Dataset"]:
 
 
 def _impacts(point: "xr.Dataset") -> tuple[np.ndarray, ...]:
-    """Times on one clock, walls, velocities and contact times of the impacts of a single point."""
+    """List times on one clock, walls, velocities and contact times of the impacts of a single point."""
     t = (point["phase"] + 2.0 * point["period_number"]).where(point["v_in"].notnull())
     return t.values, *(point[name].values for name in ("side", "v_in", "v_out", "duration"))
 
 
 def pair_of(point: "xr.Dataset", wall: str) -> ImpactPair:
-    """The cell of a single point of a diagram."""
+    """Make the cell of a single point of a diagram."""
     d, kappa, r, gamma = (float(point[name]) for name in ("d", "kappa", "r", "gamma"))
     return impact_pair(d, None if wall == "rigid" else kappa, r, gamma)
 
 
 def motion(source: Source, periods: int | None = None) -> Curve:
-    """The dense curve through the kept impacts of a single point; of its first `periods` if given."""
+    """Draw the dense curve through the kept impacts of a single point; of its first `periods` if given."""
     point = selected(source)
     t, *rest = _impacts(point)
     if periods is not None:
@@ -105,7 +105,7 @@ def motion(source: Source, periods: int | None = None) -> Curve:
 
 
 def panels(number: int) -> dict[str, Panel]:
-    """Every panel of a figure, by letter."""
+    """Make every panel of a figure, by letter."""
     figure = FIGURES[number]
     return {view.letter: _SHOWS.get(view.shows, _sweep)(figure, view) for view in figure.views}
 
@@ -129,7 +129,7 @@ def draw(number: int, file: str | Path | None = None) -> Any:
 
 
 def _sweep(figure: PaperFigure, view: View) -> Panel:
-    """A quantity over the swept axis."""
+    """Lay a quantity over the swept axis."""
     if view.shows == "energies":
         shown = [(source, name) for source in view.sources for name in ("energy", "power")]
     else:
@@ -161,7 +161,7 @@ def _sweep(figure: PaperFigure, view: View) -> Panel:
 
 
 def _points(source: Source, shows: str) -> Layer:
-    """Every value of a quantity over the swept axis."""
+    """Lay every value of a quantity over the swept axis."""
     quantity, found = QUANTITIES[shows], selected(source)
     length = found["A"] * np.pi**2 / found["omega"] ** 2
     time = np.pi / found["omega"]
@@ -186,7 +186,7 @@ def _phase_plane(figure: PaperFigure, view: View) -> Panel:
 
 
 def _unstable_branches(view: View) -> list[Layer]:
-    """Impact velocities of unstable orbits between rigid walls over d, and of their mirror images."""
+    """Lay out impact velocities of unstable orbits between rigid walls over d, and of their mirror images."""
     layers = []
     for walls in view.unstable:
         for each in branches(walls, "d", BRANCHES_WITHIN, BRANCHES_FROM, None):
@@ -198,7 +198,7 @@ def _unstable_branches(view: View) -> list[Layer]:
 
 
 def _unstable_orbits(view: View) -> Iterator[Curve]:
-    """Unstable orbits at the parameters of the last source."""
+    """Find unstable orbits at the parameters of the last source."""
     source = view.sources[-1]
     pair = pair_of(selected(source), source.run.wall)
     for walls in view.unstable:
@@ -210,7 +210,7 @@ def _unstable_orbits(view: View) -> Iterator[Curve]:
 
 
 def _image(line: Curve, other: Curve) -> int:
-    """-1 where two motions lean to opposite sides, so that the mirror image of one is like the other."""
+    """Give -1 where two motions lean to opposite sides, so that the mirror image of one is like the other."""
     lean, reference = (np.trapezoid(each.u, each.t) for each in (line, other))
     return -1 if lean * reference < 0 else 1
 
@@ -222,7 +222,7 @@ def _section(figure: PaperFigure, view: View) -> Panel:
 
 
 def _chaos(figure: PaperFigure, view: View) -> Panel:
-    """The orbit in gray under its Poincare section."""
+    """Lay the orbit in gray under its Poincare section."""
     (source,) = view.sources
     line, section = motion(source, CHAOS_PERIODS), _section(figure, view)
     return section._replace(layers=[Layer(line.u, line.v, "0.75", "line"), *section.layers])

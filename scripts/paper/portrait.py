@@ -79,12 +79,12 @@ class Panel(NamedTuple):
 
 
 def phase_plane(title: str, layers: Sequence[Layer], d: float | None) -> Panel:
-    """A panel of u' over u with the walls at +-d/2; without walls where panels of several d share it."""
+    """Make a panel of u' over u with the walls at +-d/2; without walls where panels of several d share it."""
     return Panel(title, "$u$", r"$\dot{u}$", layers, walls=None if d is None else 0.5 * d)
 
 
 def time_series(title: str, line: Any, impacts: tuple[Any, Any], d: float) -> Panel:
-    """Displacement of ball and walls in the frame of the ground, where a ball in flight goes straight.
+    """Make a panel of ball and walls over time in the frame of the ground, where a ball in flight goes straight.
 
     The capsule moves by z = cos(pi t)/pi^2 (Z'' = -A cos(omega tau)), fastest where its walls pass +-d/2: dashed blue.
 
@@ -113,7 +113,7 @@ def time_series(title: str, line: Any, impacts: tuple[Any, Any], d: float) -> Pa
 def small_multiples(
     panels: dict[str, Panel], layout: Sequence[str], caption: str = "", path: str | Path | None = None
 ) -> Figure:
-    """Panels side by side over one legend and one caption; a legend each where a colour has several meanings.
+    """Set panels side by side over one legend and one caption; a legend each where a colour has several meanings.
 
     Args:
         panels: By the letter that stands for each in the layout; a capital continues the panel of the small letter.
@@ -172,7 +172,7 @@ def _draw(axes: Axes, letter: str, panel: Panel, columns: int) -> None:
 
 
 def _key(panel: Panel) -> dict[str, Line2D]:
-    """A handle for every text among a panel's layers."""
+    """Make a handle for every text among a panel's layers."""
     return {
         layer.text: Line2D([], [], color=layer.colour, **_LOOKS["rings" if layer.look == "rings" else "thick"])
         for layer in panel.layers
@@ -181,7 +181,7 @@ def _key(panel: Panel) -> dict[str, Line2D]:
 
 
 def _wrapped(text: str, width: int) -> str:
-    """Lines of at most `width` letters; formulas between dollars are not broken."""
+    """Wrap a text to `width` letters; formulas between dollars are not broken."""
     lines, words, inside = [""], text.split(" "), False
     for word in words:
         fits = inside or len(lines[-1]) + len(word) < width

@@ -21,7 +21,7 @@ _FOR_EVER = 1e7  # half periods
 
 
 def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
-    """One impact of every lane: by the quick step on level cells, by certified sampling with gravity."""
+    """Take every lane one impact on: by the quick step on level cells, by certified sampling with gravity."""
     pair, ball = cell.pair, cell.ball
     arrival = None
     if cell.wall is not None:
@@ -43,7 +43,7 @@ def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
 
 
 def knows_arrival(plan: Plan) -> bool:
-    """Whether a declined lane's flight is known: it is nearly always the contact, of soft walls, that is declined."""
+    """Say whether a declined lane's flight is known: of soft walls it is nearly always the contact that is declined."""
     return plan.level and not plan.rigid
 
 
@@ -66,12 +66,12 @@ class Answer(eqx.Module):
 
 
 def request(plan: Plan, settings: Settings, cell: Cell) -> Request:
-    """What serving each lane would need."""
+    """Say what serving each lane would need."""
     return Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell.since), cell.arrival)
 
 
 def sampled_answer(plan: Plan, request: Request) -> Answer:
-    """By certified sampling."""
+    """Answer by certified sampling."""
     hit, sure = sampled.sampled_step(request.pair, request.ball, request.arrival, deep=plan.deep, tangent=plan.tangent)
     no = jnp.zeros_like(sure)
     sure = sure & (request.held == 0)
@@ -79,7 +79,7 @@ def sampled_answer(plan: Plan, request: Request) -> Answer:
 
 
 def careful_answer(plan: Plan, request: Request) -> Answer:
-    """`exact.step` on every lane."""
+    """Answer by `exact.step`, which is sure of every lane."""
     pair, ball, held = request.pair, request.ball, request.held
     horizon = 2 * (jnp.maximum(request.end - ball.n, 0.0) + QUIET)
     state = State(ball.u, ball.v, ball.t, jnp.zeros(ball.n.shape, jnp.int32), held.astype(jnp.int32))
@@ -109,13 +109,13 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
 
 
 def neutral(pair: ImpactPair, ball: Ball) -> Mask:
-    """Whether a flight that nothing stops stays within the gap for as good as ever."""
+    """Say whether a flight that nothing stops stays within the gap for as good as ever."""
     drift = ball.v - jnp.sin(flow.PI * ball.t) / flow.PI
     return jnp.abs(drift) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
 
 
 def settle(plan: Plan, settings: Settings, cell: Cell, answer: Answer, served: Mask) -> Cell:
-    """The cells with the answers of those that were served."""
+    """Give the cells with the answers of those that were served."""
     event, left = answer.event, answer.left & served
     ours = served & answer.sure
     event = Event(event.hit, event.real & ours, event.quiet & ours, event.permanent & ours, event.stuck & ours)

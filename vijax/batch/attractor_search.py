@@ -27,17 +27,17 @@ _WITHIN = 0.3
 
 
 def grain(settings: Settings) -> Float[Array, ""] | float:
-    """How far a round started from one point may end apart: nothing but where a solver chooses its steps."""
+    """Say how far apart a round from one point may end: not at all, unless a solver chooses its steps."""
     return 0.0 if settings.method is None else settings.method.grain
 
 
 def recurrence(dtype, grain=0.0):
-    """How closely an impact must recur to start a Newton round: 1e-6 in float64, and more as the method is coarse."""
+    """Say how closely an impact must recur to start a Newton round: 1e-6 in float64, more as the method is coarse."""
     return (1e-6 if dtype == jnp.float64 else 3e-3) + 100 * grain
 
 
 def settled(dtype, grain=0.0):
-    """Newton correction below which an orbit is accepted, in units of u and u': 2e-12 in float64, 4e-6 in float32.
+    """Give the Newton correction below which an orbit is accepted, of u and u': 2e-12 in float64, 4e-6 in float32.
 
     In float32 that is nearer to rounding: an orbit accepted at the first look would keep the decay of a flip, which
     recurs sooner after two turns than after one, and have twice its period.
@@ -46,7 +46,7 @@ def settled(dtype, grain=0.0):
 
 
 def blank_candidate(settings: Settings, like: Lane, ball: Ball) -> Candidate:
-    """A search that has seen no impact yet."""
+    """Make a search that has seen no impact yet."""
     zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
     inf = jnp.full_like(like, jnp.inf)
     return Candidate(
@@ -151,7 +151,7 @@ class _Newton(NamedTuple):
 
 
 def _newton(cell: Cell) -> _Newton:
-    """Newton's correction of the round's start, by the tangent map of the round."""
+    """Compute Newton's correction of the round's start, by the tangent map of the round."""
     c, tangent = present(cell.candidate), present(cell.tangent)
     grown = jnp.exp(present(cell.exponent) * jnp.log(TANGENT_SCALE))
     m = jnp.stack([jnp.stack(tangent[:2], -1), jnp.stack(tangent[2:], -1)], -2) * grown[:, None, None]
@@ -206,7 +206,7 @@ def _begin_round(plan: Plan, cell: Cell, newton: _Newton, begin: Mask, first: Ma
 
 
 def _back_to_search(plan: Plan, cell: Cell, bad: Mask, least: Float[Array, ""] | float) -> Cell:
-    """A candidate that is no attractor: go on from where the search stood, with a tolerance a hundred times tighter.
+    """Give up a candidate that is no attractor: go on from where the search stood, a hundred times more strictly.
 
     Newton may have taken the ball onto an orbit that repels, which it would leave only after hundreds of periods.
     What recurs to rounding and is none will not become one: the search is over, or it would hold the cell for

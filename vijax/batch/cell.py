@@ -190,7 +190,7 @@ class Event(eqx.Module):
 
 
 def blank_tally(plan: Plan, like: Lane) -> Tally:
-    """Sums of nothing yet."""
+    """Make sums of nothing yet."""
     zero = jnp.zeros_like(like)
     wide = jnp.zeros((*like.shape, plan.variants), like.dtype)
     harvest = Harvest(wide, wide, wide, wide) if plan.energies else None
@@ -201,13 +201,13 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
 
 
 def last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:
-    """Where the window of a cell ends; one that a failed round made begin late is a share of the periods long too."""
+    """Say where a cell's window ends; one that a failed round made begin late is a share of the periods long too."""
     if plan.until == "window":
         return settings.periods + settings.transient + jnp.zeros_like(since)
     return jnp.maximum(settings.periods, since + jnp.ceil(TRANSIENT_SHARE * settings.periods))
 
 
 def batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
-    """Periods of a batch behind the standard error."""
+    """Give the periods of a batch behind the standard error."""
     window = settings.periods * (1.0 if plan.until == "window" else 1 - TRANSIENT_SHARE)
     return jnp.maximum(jnp.floor(window / BATCHES), 1.0)

@@ -38,12 +38,12 @@ class Handover(eqx.Module):
 
 
 def begin(ball: Ball, held: Lane) -> Relay:
-    """The record of a cell that has just started."""
+    """Make the record of a cell that has just started."""
     return Relay(start=ball, mark=ball, held=held, last=ball, latest=jnp.full_like(held, -jnp.inf))
 
 
 def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Relay | None:
-    """The record with one impact more; None of a cell that is not chained."""
+    """Add one impact to the record; there is none of a cell that is not chained."""
     old = cell.relay
     if old is None:
         return None
@@ -63,7 +63,7 @@ def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Rel
 
 
 def _ahead(n: Lane, end: Lane, period: Lane) -> Lane:
-    """Whole rounds, in periods, that take period n to the last such period before `end`."""
+    """Count whole rounds, in periods, that take period n to the last such period before `end`."""
     return period * (jnp.ceil((end - n) / period) - 1)
 
 
@@ -72,7 +72,7 @@ def _moved(ball: Ball, periods: Lane) -> Ball:
 
 
 def depart(cell: Cell, begins: Mask) -> Relay | None:
-    """The record as a round begins."""
+    """Make the record ready for a round that begins."""
     old = cell.relay
     if old is None:
         return None
@@ -80,7 +80,7 @@ def depart(cell: Cell, begins: Mask) -> Relay | None:
 
 
 def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end: Lane) -> Handover:
-    """What is handed on of cells that are done; of one that failed, its start."""
+    """Give what is handed on of cells that are done; of one that failed, its start."""
     old, pair = present(cell.relay), cell.pair
     quiet, permanent = cell.status == Status.NO_IMPACT, cell.status == Status.PERMANENT_CONTACT
     last = choose(periodic, old.last, cell.ball)
@@ -98,7 +98,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
 
 
 def resting(pair: ImpactPair, end: Lane) -> Ball:
-    """A ball that never leaves the wall on which it lies, at phase 0, when all but its steady motion has decayed."""
+    """Make a ball that stays for ever on the wall on which it lies, at phase 0, once only its steady motion is left."""
     side, zero = -jnp.sign(pair.gamma), jnp.zeros_like(end)
     if pair.rigid:
         return Ball(0.5 * side * pair.d, zero, zero, end)
@@ -112,5 +112,5 @@ def resting(pair: ImpactPair, end: Lane) -> Ball:
 
 
 def within(pair: ImpactPair, u: Lane) -> Lane:
-    """Displacement of a start; one that the gap of a rigid wall does not hold is put back into it."""
+    """Put a start that the gap of a rigid wall does not hold back into it; give the displacement."""
     return jnp.clip(u, -_START_REACH * pair.d, _START_REACH * pair.d) if pair.rigid else u

@@ -25,12 +25,12 @@ _STROBES = (64, 4096)
 
 
 def _time(state: State) -> Float[AnyArray, "..."]:
-    """Time since phase 0 of period 0."""
+    """Compute the time since phase 0 of period 0."""
     return 2.0 * state.n.astype(state.t.dtype) + state.t
 
 
 def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[AnyArray, ""]) -> tuple:
-    """Displacement, velocity and mode at a time `when` after the start of a step."""
+    """Compute displacement, velocity and mode at a time `when` after the start of a step."""
     aloft = (when <= out.flight) | out.quiet
     rise, v = flow.flight(pair.gamma, start.t, start.v, jnp.where(aloft, when, 0.0))
     held = start.mode != 0
@@ -72,7 +72,7 @@ def _set_out(pair: ImpactPair, u0, v0, t0) -> _Reached:
 
 
 def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArray, ""], count: int):
-    """So many steps on, the first of which has a number in the run: where the balls are then, and the `_Flown`."""
+    """Take balls so many steps on, the first of a given number in the run: where they are then, and the `_Flown`."""
 
     def advance(reached: _Reached, index):
         state, over = reached
@@ -100,7 +100,7 @@ _stretch = jax.jit(partial(_onward, count=_STRETCH))
 
 
 def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Reached, _Flown]:
-    """All steps of rows of starts: as many as there is room for where they are traced, else until all runs are over."""
+    """Take all steps of rows of starts: as many as there is room for where traced, else until all runs are over."""
     reached = _set_out(pair, *starts)
     # One step more than impacts: the flight or contact in which the last period ends.
     steps = room.impacts + 1
@@ -118,7 +118,7 @@ def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Re
 
 
 def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Trajectory:
-    """By the exact engine, of rows of starts."""
+    """Run rows of starts by the exact engine."""
     reached, flown = _fly(asked, room, pair, (u0, v0, t0))
     own = tiles.library((pair, flown))
     out, idle = flown.out, flown.idle
@@ -146,7 +146,7 @@ exact_traced = jax.jit(exact_run, static_argnames="room")
 
 
 def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:
-    """The balls at phase 0 of periods 1 ... periods, [row, period]: each in the last step that began before."""
+    """Find the balls at phase 0 of periods 1 ... periods, [row, period]: each in the last step that began before."""
     own = tiles.library((pair, flown))
     begun, out, idle = flown
     clock = own.where(idle, own.inf, _time(begun))
@@ -172,7 +172,7 @@ def _balls_at(rows: tuple) -> tuple:
 
 
 def _before(clock: Float[AnyArray, "row step"], now: Float[AnyArray, "row period"]) -> Int[AnyArray, "row period"]:
-    """The last step of each row that began by then; -1 before all."""
+    """Find the last step of each row that began by then; -1 before all."""
     if tiles.library((clock, now)) is jnp:
         return jax.vmap(partial(jnp.searchsorted, side="right"))(clock, now) - 1
     rows: Any = zip(clock, now, strict=True)

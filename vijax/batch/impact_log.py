@@ -77,7 +77,7 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
 
 @lru_cache(maxsize=1)
 def _compiled():
-    """Some steps of a tile of balls."""
+    """Compile some steps of a tile of balls."""
 
     def steps(pair, states, over, periods):
         def one(carry, _):
@@ -94,7 +94,7 @@ def _compiled():
 
 
 def _advance(pair: ImpactPair, states: State, periods: int) -> tuple[State, np.ndarray, _Step, np.ndarray]:
-    """Balls some steps on: where they are, which have arrived, the steps [ball, step], which of these were taken."""
+    """Take balls some steps on: where they are, which have arrived, the steps [ball, step], which of these are real."""
     parts = []
     for tile in tiles.tiles(states.u.size, (_TILE,)):
         args = jax.tree.map(lambda x, rows=tile.rows: x[rows], (pair, states))
@@ -106,7 +106,7 @@ def _advance(pair: ImpactPair, states: State, periods: int) -> tuple[State, np.n
 
 
 def _impacts(ball: np.ndarray, steps: Any, count: int, periods: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The impacts among the steps, as a padded table."""
+    """Pick the impacts among the steps, as a padded table."""
     if steps is None:
         return {name: np.full((count, 0), np.nan) for name in _KEPT}, np.zeros(count, int)
     impact = steps.out.impact
@@ -122,7 +122,7 @@ def _impacts(ball: np.ndarray, steps: Any, count: int, periods: int) -> tuple[di
 
 
 def _strobes(pair: ImpactPair, ball: np.ndarray, steps: Any, count: int, periods: int) -> tuple[np.ndarray, np.ndarray]:
-    """The balls at phase 0 of every period: in the last step that began before."""
+    """Find the balls at phase 0 of every period: in the last step that began before."""
     u, v = (np.full((count, periods), np.nan) for _ in range(2))
     if steps is None:
         return u, v
@@ -143,7 +143,7 @@ def _strobes(pair: ImpactPair, ball: np.ndarray, steps: Any, count: int, periods
 
 @lru_cache(maxsize=1)
 def _compiled_balls():
-    """Displacement and velocity of balls at a time `when` after the start of their steps."""
+    """Compile displacement and velocity of balls at a time `when` after the start of their steps."""
 
     def balls(pair, steps, when):
         u, v, _ = jax.vmap(ball_at)(pair, steps.begun, steps.out, when)

@@ -37,7 +37,7 @@ class Next(eqx.Module):
 
 
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
-    """By the quick step, of level cells."""
+    """Answer by the quick step, of level cells."""
     wall = quick_contact.prepare(request.pair)
     hit, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
     no = jnp.zeros_like(sure)
@@ -45,7 +45,7 @@ def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
 
 
 def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
-    """By certified sampling; of a contact alone where the quick step knows the flight."""
+    """Answer by certified sampling; of a contact alone where the quick step knows the flight."""
     if advance.knows_arrival(plan):
         known = quick.quick_step(quick_contact.prepare(request.pair), request.pair.gamma, request.ball).arrival
         request = replace(request, arrival=known)
@@ -64,7 +64,7 @@ def _compiled(answer: Callable, plan: Plan):
 
 
 def _answered(work: Callable, requests: advance.Request) -> tuple[Next, np.ndarray]:
-    """What the work says of every request, in padded tiles."""
+    """Ask the work about every request, in padded tiles."""
     parts = []
     for tile in tiles.tiles(requests.held.size, _TILES):
         part = work(jax.tree.map(lambda leaf, rows=tile.rows: leaf[rows], requests))

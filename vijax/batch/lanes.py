@@ -71,7 +71,7 @@ class Program(NamedTuple):
     arithmetic: bool = True
 
     def kernel(self, work: Callable[P, T]) -> Callable[P, T]:
-        """The function as one kernel, if all of the program may be put in kernels."""
+        """Make one kernel of a function, if all of the program may be put in kernels."""
         return kernel(work) if self.arithmetic else work
 
 
@@ -84,7 +84,7 @@ class _Batch(NamedTuple):
 
 
 def _cumulative(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
-    """Running sum by doubling: on CPU ten times faster than XLA's."""
+    """Sum up to each lane, by doubling: on CPU ten times faster than XLA's."""
     reach = 1
     while reach < count.size:
         count = count + jnp.pad(count[:-reach], (reach, 0))
@@ -94,7 +94,7 @@ def _cumulative(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
 
 @shared
 def _first(mask: Bool[Array, "lane"], width: int) -> _Batch:
-    """The first `width` lanes of a mask.
+    """Find the first `width` lanes of a mask.
 
     By rank and binary search: gathers run at memory speed on every backend, scatters do not.
     """
@@ -109,7 +109,7 @@ def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
 
 
 def choose(mask: Bool[Array, "lane"], new: Carry, old: Carry) -> Carry:
-    """`new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
+    """Take `new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
@@ -125,12 +125,12 @@ def _declined(program: Program, at: _AtWork) -> Bool[Array, "lane"]:
 
 
 def _able(program: Program, at: _AtWork) -> Int[Array, ""]:
-    """How many lanes the next step would move."""
+    """Count the lanes that the next step would move."""
     return ((at.cell >= 0) & ~_declined(program, at) & ~program.stopped(at.carry)).sum()
 
 
 def _round(program: Program, width: int, steps: int, at: _AtWork) -> Carry:
-    """One round of the lanes that have a cell: steps, service, review.
+    """Run one round of the lanes that have a cell: steps, service, review.
 
     Args:
         program: What a cell is.
@@ -147,7 +147,7 @@ def _round(program: Program, width: int, steps: int, at: _AtWork) -> Carry:
 
 
 def _steps(program: Program, most: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
-    """Up to so many steps; fewer once half the lanes that set out wait for something else."""
+    """Take up to so many steps; fewer once half the lanes that set out wait for something else."""
 
     def some_steps(at: _AtWork) -> _AtWork:
         at_first = _able(program, at)
@@ -168,7 +168,7 @@ def _steps(program: Program, most: int, cell: Int[Array, "lane"], carry: Carry) 
 def _service_due(
     program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
 ) -> Bool[Array, ""]:
-    """Whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
+    """Say whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
     at = _AtWork(cell, carry)
     asking, hard = _declined(program, at), service.hard(carry)
     full = ((asking & ~hard).sum() >= width) | ((asking & hard).sum() >= width)
@@ -189,7 +189,7 @@ def _serve(program: Program, service: Service, width: int, cell: Int[Array, "lan
 def _ask(
     program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
 ) -> tuple[Bool[Array, ""], _Batch, Any]:
-    """Whose turn it is, easy lanes or hard ones, and their requests."""
+    """Say whose turn it is, easy lanes or hard ones, and what they request."""
     asking, hard = _declined(program, _AtWork(cell, carry)), service.hard(carry)
     easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
     batch = _first(asking & (hard != easy), width)
@@ -197,7 +197,7 @@ def _ask(
 
 
 def _settle(service: Service, carry: Carry, answers: Any, batch: _Batch) -> Carry:
-    """The lanes with the answers of those that were served."""
+    """Give the lanes with the answers of those that were served."""
     blank = jax.tree.map(lambda leaf: jnp.zeros((batch.chosen.size, *leaf.shape[1:]), leaf.dtype), answers)
     return service.settle(carry, put(blank, answers, batch.members, batch.real), batch.chosen)
 
@@ -248,7 +248,7 @@ def run(
 
 
 def _all_waiting(program: Program, table: _Table, outputs: int, lanes: int) -> _Queue:
-    """The queue before the first cell is loaded: `_refill` loads the first ones too, until then lanes hold zeros."""
+    """Make the queue before any cell is loaded: `_refill` loads the first ones too, until then lanes hold zeros."""
     fresh = jax.eval_shape(program.load, jax.ShapeDtypeStruct((lanes, table.cells.shape[1]), table.cells.dtype))
     return _Queue(
         _AtWork(jnp.full(lanes, -1, jnp.int32), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh)),
@@ -270,7 +270,7 @@ def _refill(program: Program, table: _Table, width: int, queue: _Queue) -> _Queu
 
 
 def _free(program: Program, table: _Table, at: _AtWork, waiting: Int[Array, ""]) -> Bool[Array, "lane"]:
-    """Lanes whose cell is done, or that wait for their first."""
+    """Find the lanes whose cell is done, or that wait for their first."""
     return jnp.where(at.cell >= 0, program.done(at.carry), waiting < table.real)
 
 
@@ -281,7 +281,7 @@ def _refill_due(program: Program, table: _Table, width: int, at: _AtWork, waitin
 
 
 def _exchange(program: Program, table: _Table, width: int, at: _AtWork, waiting: Int[Array, ""]):
-    """Lanes with new cells, and rows of the result table for those that were done; no cell: past its end."""
+    """Give lanes with new cells, and rows of the result table for those that were done; no cell: past its end."""
     cells, count = table.cells, table.real
     batch = _first(_free(program, table, at, waiting), width)
     rows = at.cell[batch.members]

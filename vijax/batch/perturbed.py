@@ -69,7 +69,7 @@ def averages(
 
 
 def _either(plans: list[Plan], tilted: Any, given: Any) -> Float[Array, "ball out"]:
-    """By the quick program of level ground if all balls are on it; where that is not known yet, both are compiled."""
+    """Run the quick program of level ground if all balls are on it; where that is not known yet, both are compiled."""
     if isinstance(tilted, bool):
         return _traced(plans[tilted], given)
     return lax.cond(tilted, partial(_traced, plans[1]), partial(_traced, plans[0]), given)
@@ -77,7 +77,7 @@ def _either(plans: list[Plan], tilted: Any, given: Any) -> Float[Array, "ball ou
 
 @partial(jax.jit, static_argnums=0)
 def _traced(plan: Plan, given: Any) -> Float[Array, "ball out"]:
-    """The table of results inside a larger program; of a batch of devices one after another.
+    """Compute the table of results inside a larger program; of a batch of devices one after another.
 
     One call known by its identity, so that a batch is compiled once.
     """

@@ -43,5 +43,5 @@ def unpack(table: Any, like: Record) -> Record:
 
 
 def width(like: Any) -> int:
-    """Columns of the rows of a record with one axis of rows."""
+    """Count the columns of the rows of a record with one axis of rows."""
     return sum(math.prod(leaf.shape[1:]) for leaf in jax.tree.leaves(like))

@@ -43,7 +43,7 @@ class Scale(eqx.Module):
 
 
 def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
-    """Fresh cells."""
+    """Make fresh cells."""
     pair, d = entry.pair, entry.pair.d
     zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
     ball = Ball(entry.u, entry.v, zero if entry.t is None else entry.t, zero)
@@ -79,7 +79,7 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
 
 
 def entry_shapes(plan: Plan, dtype: Any) -> Entry:
-    """What a run is told of a cell, as shapes."""
+    """Give what a run is told of a cell, as shapes."""
     one: Any = jax.ShapeDtypeStruct((1,), dtype)
     pair = ImpactPair(one, None if plan.rigid else one, one, one)
     device = jax.tree.map(lambda _: one, electrical(Harvester())) if plan.devices else None
@@ -87,7 +87,7 @@ def entry_shapes(plan: Plan, dtype: Any) -> Entry:
 
 
 def program(plan: Plan, settings: Settings) -> lanes.Program:
-    """What lanes are told of a cell."""
+    """Make what lanes are told of a cell."""
     entry, method = entry_shapes(plan, settings.periods.dtype), settings.method
     cells = lanes.Program(
         load=lambda table: load(plan, settings, rows.unpack(table, entry)),
@@ -117,7 +117,7 @@ def program(plan: Plan, settings: Settings) -> lanes.Program:
 
 @lru_cache(maxsize=32)
 def compiled(plan: Plan, width: int) -> export_cache.Program:
-    """The program of a plan: a whole tile of cells in one call."""
+    """Compile the program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
         outputs = rows.width(shapes(plan, cells.dtype))
@@ -127,7 +127,7 @@ def compiled(plan: Plan, width: int) -> export_cache.Program:
 
 
 def width_of(cells: int, level: bool) -> int:
-    """Lanes for a tile: enough to fill vectors and hide loop overhead, few enough to stay in cache and to refill.
+    """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
 
     A sampled step holds some dozens of samples a lane.
     """
@@ -135,7 +135,7 @@ def width_of(cells: int, level: bool) -> int:
 
 
 def tolerances(dtype: str) -> dict[str, float]:
-    """The tolerances that a run in the given precision uses, by name."""
+    """Name the tolerances that a run in the given precision uses."""
     kind = jnp.dtype(dtype)
     return {
         "recurrence": recurrence(kind),
@@ -233,13 +233,13 @@ def summarise(
 
 
 def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""], settings: Settings) -> Summary:
-    """The summary of a tile, of NumPy's arrays."""
+    """Summarise a tile, of NumPy's arrays."""
     table = compiled(plan, width_of(cells.shape[0], plan.level))(cells, count, settings)
     return rows.unpack(np.asarray(table), shapes(plan, cells.dtype))
 
 
 def blank(count: int, variants: int, dtype: str) -> Summary:
-    """A summary without content of so many cells: which shape and kind of number each field has."""
+    """Make an empty summary of so many cells: which shape and kind of number each field has."""
     plan = Plan(deep=True, energies=True, asymmetry=True, variants=variants)
     like = shapes(plan, np.dtype(dtype))
     return rows.unpack(np.zeros((count, rows.width(like)), dtype), like)
@@ -278,7 +278,7 @@ def attractors(
 
 
 def _chained(pair: ImpactPair) -> Plan:
-    """The plan of cells whose ends are wanted."""
+    """Make the plan of cells whose ends are wanted."""
     level = bool((np.asarray(pair.gamma) == 0).all())
     return Plan(rigid=pair.rigid, level=level, deep=True, energies=True, chained=True)
 
@@ -315,13 +315,13 @@ class Growth(eqx.Module):
 def _succeed(
     plan: Plan, settings: Settings, cell: Cell, table: Float[AnyArray, "lane in"]
 ) -> Float[AnyArray, "lane in"]:
-    """Rows of the next cells, with the start that the last ones hand on in the place of their growth."""
+    """Make rows of the next cells, with the start that the last ones hand on in the place of their growth."""
     end = present(unload(plan, settings, cell).handover)
     return _start(plan, table, end.u, end.v, end.t)
 
 
 def _start(plan: Plan, table: Float[AnyArray, "lane in"], u: Lane, v: Lane, t: Lane) -> Float[AnyArray, "lane in"]:
-    """Rows that hold a growth, with the start that it makes of a state."""
+    """Give rows that hold a growth the start that it makes of a state."""
     entry = rows.unpack(table, entry_shapes(plan, table.dtype))
     u = chain.within(entry.pair, u * entry.u)
     return rows.pack(dataclasses.replace(entry, u=u, v=v * entry.v, t=t))
@@ -329,7 +329,7 @@ def _start(plan: Plan, table: Float[AnyArray, "lane in"], u: Lane, v: Lane, t: L
 
 @lru_cache(maxsize=32)
 def _compiled_chains(plan: Plan) -> export_cache.Program:
-    """The program of chains: all their links in one call."""
+    """Compile the program of chains: all their links in one call."""
 
     def follow(links, starts, count, length, settings):
         first = _start(plan, links[:, 0], starts.u, starts.v, starts.t)

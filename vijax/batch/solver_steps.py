@@ -22,7 +22,7 @@ _STEPS = 20_000  # steps per period before a cell is stopped, where the method c
 
 
 def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane) -> Course:
-    """Lanes at the start of a run or of a round."""
+    """Set lanes off at the start of a run or of a round."""
     whole = ball.n.astype(jnp.int32)
     state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
     carry = jax.vmap(partial(method.start, deep=plan.deep, tangent=plan.tangent))(pair, state)
@@ -33,7 +33,7 @@ def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane
 
 
 def step(method: Method, cell: Cell) -> Cell:
-    """One step of every lane. A finished impact waits for review; a lane that finishes another waits with it."""
+    """Take every lane one step on. A finished impact waits for review; a lane that finishes another waits with it."""
     old = present(cell.course)
     carry, passage, finished = share(jax.vmap(method.step)(cell.pair, old.wall, old.carry))
     blocked = old.waits & finished

@@ -27,7 +27,7 @@ class _Recording(eqx.Module):
 
 
 def _recording(room: Room, carry: Any, like: Float[AnyArray, "lane"]) -> _Recording:
-    """Empty records."""
+    """Make empty records."""
     lanes = like.shape[0]
     whole = jnp.zeros(lanes, jnp.int32)
 
@@ -42,7 +42,7 @@ def _recording(room: Room, carry: Any, like: Float[AnyArray, "lane"]) -> _Record
 
 
 def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) -> Any:
-    """A table [lane, width] with a row written at each lane's index, where wanted."""
+    """Write a row into a table [lane, width] at each lane's index, where wanted."""
 
     def write(leaf, value):
         column = jnp.where(wanted, index, leaf.shape[1])
@@ -53,7 +53,7 @@ def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) ->
 
 @partial(jax.jit, static_argnames="room")
 def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Trajectory:
-    """All lanes step together, each until its last period is over and its last contact has ended."""
+    """Step all lanes together, each until its last period is over and its last contact has ended."""
     periods, max_impacts, chunks = asked
     begun = jax.vmap(begin)(pair, u0, v0, t0)
     wall = jax.vmap(method.law.wall)(pair)

@@ -41,7 +41,7 @@ class Summary(eqx.Module):
 
 
 def shapes(plan: Plan, dtype: Any) -> Any:
-    """What `unload` gives of one cell, as shapes: tracing it for them takes a fifth of a second of every program."""
+    """Give what `unload` gives of one cell, as shapes: tracing it for them takes a fifth of a second a program."""
     number: Any = jax.ShapeDtypeStruct((1,), dtype)
     whole = jax.ShapeDtypeStruct((1,), jnp.int32)
     energies = ("P", "P_stderr", "energy_ratio")
@@ -79,7 +79,7 @@ class _End(eqx.Module):
 
     @property
     def still(self) -> Mask:
-        """At rest, in flight or in contact."""
+        """Say which balls are at rest, in flight or in contact."""
         return self.silent | self.permanent
 
 
@@ -97,7 +97,7 @@ def _ended(plan: Plan, settings: Settings, cell: Cell) -> _End:
 
 
 def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
-    """What is kept of cells that are done."""
+    """Say what is kept of cells that are done."""
     t, e = cell.tally, _ended(plan, settings, cell)
     still, failed, hits = e.still, e.failed, t.left + t.right
     period, status, lyapunov = _kind(cell, e)
@@ -112,7 +112,7 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
     labelled = e.periodic | (still & (cell.candidate is not None))
 
     def number(impacts):
-        """Impacts in the period of the label, -1 where there is none."""
+        """Count impacts in the period of the label, -1 where there is none."""
         each = jnp.where(still, 0.0, jnp.round(impacts * e.prime / e.span))
         return jnp.where(labelled, each, -1.0).astype(jnp.int32)
 
@@ -148,7 +148,7 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
 
 
 def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, "lane"], Lane | None]:
-    """Period (0: chaos, -1: neither known), status and Lyapunov exponent."""
+    """Tell the period (0: chaos, -1: neither known), status and Lyapunov exponent."""
     attractor, none = cell.candidate is not None, e.still | e.failed
     period, lyapunov = jnp.where(e.periodic, e.prime, -1.0), None
     status = jnp.where(e.silent, Status.NO_IMPACT, jnp.where(e.permanent | e.failed, cell.status, Status.OK))
@@ -170,7 +170,7 @@ def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, "lane"], Lane | None
 
 
 def _power(plan: Plan, settings: Settings, cell: Cell, harvest: Harvest, e: _End) -> tuple[Values, Values]:
-    """Energy per half period, and its standard error by batch means (0 on an orbit)."""
+    """Compute the energy per half period, and its standard error by batch means (0 on an orbit)."""
     length = batch_length(plan, settings)
     batches = jnp.floor(e.window / length)
     last = (cell.batch < batches)[:, None]  # the running batch is a whole one: nothing came after it

@@ -78,7 +78,7 @@ def _batch_of(plan: Plan, settings: Settings, cell: Cell, hit: Hit) -> Lane:
 
 
 def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
-    """Tangent map with the new step on the left; started afresh by the first impact of the window."""
+    """Put the new step on the left of the tangent map; the first impact of the window starts it afresh."""
     if cell.tangent is None:
         return None, None
     fresh = counted & (cell.batch < 0)
@@ -96,7 +96,7 @@ def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
 
 
 def _add(settings: Settings, cell: Cell, hit: Hit, counted: Mask, turned: Mask, stuck: Mask) -> Tally:
-    """The tally with one impact more."""
+    """Add one impact to the tally."""
     old = cell.tally
     left, right = counted & (hit.side < 0), counted & (hit.side > 0)
     rebound = -hit.v_out / jnp.where(hit.v_in == 0, 1.0, hit.v_in)
@@ -122,7 +122,7 @@ def _add(settings: Settings, cell: Cell, hit: Hit, counted: Mask, turned: Mask, 
 
 
 def _harvested(settings: Settings, cell: Cell, old: Harvest, hit: Hit, counted: Mask, turned: Mask) -> Harvest:
-    """What has been harvested with one impact more."""
+    """Add what one impact harvests."""
     metres = (present(hit.depth) * cell.length)[:, None] * settings.length_variant
     speeds = cell.speed[:, None] * settings.speed_variant
     device = settings.device if cell.device is None else jax.tree.map(lambda x: x[:, None], cell.device)

@@ -35,7 +35,7 @@ def _precision(pair: ImpactPair) -> str:
 
 
 def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any]) -> Method | None:
-    """The method, as `choose` makes it unless it is a record already, if the pair suits its membrane."""
+    """Take the method as it is, or as `choose` makes it of a name, if the pair suits its membrane."""
     if not isinstance(method, Method):
         method = choose(method, options, wall=_wall(pair), dtype=_precision(pair))
     lossy = method is None or not isinstance(method.law, HuntCrossley)
@@ -108,7 +108,7 @@ def trajectory(
 def _followed(
     method: Method | None, pair: ImpactPair, starts: tuple, periods: int, max_impacts: int | None
 ) -> tuple[Trajectory, tuple[int, ...]]:
-    """The trajectories of all starts as rows, records padded; and the shape that the starts have."""
+    """Follow all starts as rows, records padded; give the trajectories, and the shape that the starts have."""
     dtype, own = jnp.result_type(pair.d), tiles.library((pair, starts))
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves((pair, starts))))
     rows = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), shape).reshape(-1), (pair, starts))
@@ -129,12 +129,12 @@ def _followed(
 
 
 def _most(periods: int) -> int:
-    """Room for impacts in so many periods, unless something else is asked for."""
+    """Say for how many impacts there is room in so many periods, unless something else is asked for."""
     return 16 * periods + 16
 
 
 def _cut(found: Trajectory, shape: tuple[int, ...], periods: int, max_impacts: int) -> Trajectory:
-    """Without what lies beyond the numbers asked for, in the shape of the starts."""
+    """Leave out what lies beyond the numbers asked for, and give the rest the shape of the starts."""
 
     def shaped(leaf, width=None):
         return leaf.reshape(shape + leaf.shape[1:])[..., :width] if leaf.ndim > 1 else leaf.reshape(shape)

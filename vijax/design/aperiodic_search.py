@@ -60,12 +60,12 @@ class Place:
 
     @property
     def known(self) -> bool:
-        """Whether an ensemble was taken."""
+        """Say whether an ensemble was taken."""
         return bool(self.path)
 
     @property
     def sure(self) -> float:
-        """Logarithm of the objective that it has reached for certain."""
+        """Give the logarithm of the objective that it has reached for certain."""
         kept = self.known and self.surface.margins.min() >= 0
         return float(self.surface.value - _SURE * self.surface.value_error) if kept else -np.inf
 
@@ -95,7 +95,7 @@ def search(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
 
 
 def _begun(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
-    """The most promising places of every device, apart from each other."""
+    """Choose the most promising places of every device, apart from each other."""
     settings, places = task.settings, []
     promise = multistart.promise(unrest, task.objective)
     least = known + np.log(settings.min_chaos)
@@ -118,7 +118,7 @@ def _begun(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
 
 
 def _told(task: Task, which: np.ndarray, value: np.ndarray, lacks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What the balls that were met at each value say of it: logarithm of their mean, and what lacks to the limits.
+    """Judge each value by the balls met at it: logarithm of their mean, and what lacks to the limits.
 
     The worst of them, or of the share that counts, says how much room there is.
     """
@@ -207,7 +207,7 @@ def _windows(
 
 
 def climbed(task: Task, some: list[Place], room: np.ndarray | float = 0.0) -> np.ndarray:
-    """Where the surfaces are highest within the trust regions and the limits less some room, by optax's L-BFGS."""
+    """Find where surfaces are highest in trust regions and the limits less some room, by optax's L-BFGS."""
     centre = np.array([one.best for one in some])
     surface = Surface(*(np.array(x) for x in zip(*(one.surface for one in some), strict=True)))
     surface = surface._replace(margins=surface.margins - np.broadcast_to(room, len(some))[:, None])
@@ -230,7 +230,7 @@ def _compiled(settings: DesignSettings):
 
 
 def _look(centre, surface: Any, z, near, memory) -> Look:
-    """What is seen of surfaces at points, for `ascent.ascend`."""
+    """See what there is of surfaces at points, for `ascent.ascend`."""
     x = z - centre
     bend = (surface.curvature * x[:, None]).sum(axis=2)
     return Look(

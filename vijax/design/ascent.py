@@ -115,7 +115,7 @@ def ascend(
 
 
 def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb:
-    """Before the first look, which the loop takes: so it is compiled once."""
+    """Stand before the first look, which the loop takes: so it is compiled once."""
     starts = z.shape[0]
     shapes = jax.eval_shape(partial(_view, task), z, z, memory)
     blank: Look = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
@@ -137,7 +137,7 @@ def _begun(task: _Task, z: Float[Array, "start variable"], memory: Any) -> Climb
 
 
 def _advance(task: _Task, c: Climb) -> Climb:
-    """One trial of every start that is on its way."""
+    """Make one trial of every start that is on its way."""
     # Who has ended looks where it is, which is soon seen: what its last trial lost would be sought in vain again.
     trial = c.z + jnp.where(c.going, c.pace, 0.0)[:, None] * c.step
     seen = _view(task, trial, c.z, c.seen.memory)
@@ -180,7 +180,7 @@ def _lighter(settings: DesignSettings, weight: Float[Array, "start"]) -> Float[A
 
 
 def _view(task: _Task, z, near, memory) -> Look:
-    """What is seen, with the bounds among the constraints."""
+    """Look, with the bounds among the constraints."""
     seen = task.look(z, near, memory)
     eye = jnp.broadcast_to(jnp.eye(z.shape[1], dtype=z.dtype), (*z.shape, z.shape[1]))
     return seen._replace(
@@ -190,13 +190,13 @@ def _view(task: _Task, z, near, memory) -> Look:
 
 
 def _little(c: Climb) -> Bool[Array, "start"]:
-    """Which have converged for the weight of their barrier: the step promises less than the barrier weighs."""
+    """Say which have converged for the weight of their barrier: the step promises less than the barrier weighs."""
     promised = c.pace * (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
     return c.going & _inside(c.seen) & (promised < c.weight)
 
 
 def _turns(task: _Task, c: Climb, trial: Look) -> Bool[Array, "start"]:
-    """Which may have to turn back: converged at an edge beyond which there is no point.
+    """Say which may have to turn back: converged at an edge beyond which there is no point.
 
     The barrier may have pushed them there; with less of it the way may lead elsewhere.
     """
@@ -204,12 +204,12 @@ def _turns(task: _Task, c: Climb, trial: Look) -> Bool[Array, "start"]:
 
 
 def _forgotten(task: _Task, z) -> Any:
-    """The state of optax without any memory of curvature."""
+    """Make a state of optax without any memory of curvature."""
     return jax.vmap(task.lbfgs.init)(z)
 
 
 def _aim(task: _Task, z, seen: Look, weight, state):
-    """The next step, and the state of optax after it; afresh where its curvature points down."""
+    """Aim the next step, and give the state of optax after it; afresh where its curvature points down."""
     ahead = _gradient(seen, weight)
     # Optax mixes whole numbers and truths, which callers may have forbidden.
     with jax.numpy_dtype_promotion("standard"):
@@ -219,7 +219,7 @@ def _aim(task: _Task, z, seen: Look, weight, state):
 
 
 def converged(c: Climb) -> Bool[Array, "start"]:
-    """Which ended with a barrier that no longer matters; the others stalled, or lost their point."""
+    """Say which ended with a barrier that no longer matters; the others stalled, or lost their point."""
     return c.weight <= _CONVERGED
 
 
@@ -236,7 +236,7 @@ def _inside(seen: Look) -> Bool[Array, "start"]:
 
 
 def _gradient(seen: Look, weight: Float[Array, "start"]) -> Float[Array, "start variable"]:
-    """Of value and barrier; where a constraint is violated, of the margin that lacks most."""
+    """Differentiate value and barrier; where a constraint is violated, the margin that lacks most."""
     safe = jnp.where(seen.margins > 0, seen.margins, 1.0)
     barrier = weight[:, None] * (seen.slopes / safe[..., None]).sum(axis=1)
     worst = seen.margins.argmin(axis=1)[:, None, None]
@@ -245,7 +245,7 @@ def _gradient(seen: Look, weight: Float[Array, "start"]) -> Float[Array, "start 
 
 
 def _higher(c: Climb, trial: Look) -> Bool[Array, "start"]:
-    """Whether a trial is better: admissible and higher, or nearer to admissible where none is yet."""
+    """Say whether a trial is better: admissible and higher, or nearer to admissible where none is yet."""
     before, after = (seen.margins.min(axis=1) for seen in (c.seen, trial))
     gain = trial.value - c.seen.value
     ratio = jnp.where((c.seen.margins > 0) & (trial.margins > 0), trial.margins / c.seen.margins, 1.0)
@@ -254,7 +254,7 @@ def _higher(c: Climb, trial: Look) -> Bool[Array, "start"]:
 
 
 def _shortened(task: _Task, step, seen: Look) -> Float[Array, "start variable"]:
-    """As far along a step as the trust region and the linearised constraints allow."""
+    """Go as far along a step as the trust region and the linearised constraints allow."""
     closing = -(seen.slopes * step[:, None]).sum(axis=2)
     limited = (seen.margins > 0) & (closing > 0)
     share = jnp.where(limited, task.settings.max_approach * seen.margins / jnp.where(limited, closing, 1.0), 1.0)

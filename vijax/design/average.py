@@ -56,7 +56,7 @@ class Smoothness(enum.IntEnum):
 
     @property
     def advice(self) -> str:
-        """What it means for the derivatives, in a sentence."""
+        """Say what it means for the derivatives, in a sentence."""
         return _ADVICE[self]
 
 
@@ -201,7 +201,7 @@ class _Design(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _design(balls: int, seed: int | None) -> _Design:
-    """Where so many balls are: on lattices, or drawn at random by a seed."""
+    """Place so many balls: on lattices, or drawn at random by a seed."""
     half = balls // 2
     if seed is None:
         start, some = lattice(half, 2).T, lattice(half, 4).T
@@ -224,7 +224,7 @@ def _fly(at: _Inputs, design: _Design, periods: int, width: float) -> _Flown:
 
 @jax.jit
 def _spread(at: _Inputs, width: Float[Array, ""], offsets: Float[Array, "ball 4"]):
-    """Offsets and pairs of the balls; units of length, electrical constants and the steps between them [variant]."""
+    """Spread balls: offsets and pairs; units of length, electrical constants and the steps between them [variant]."""
     pair, moved = at.pair, width * offsets
     d, kappa = pair.d * jnp.exp(moved[:, 0]), present(pair.kappa) * jnp.exp(moved[:, 1])
     r = jnp.minimum(pair.r * jnp.exp(moved[:, 2]), 1.0)
@@ -278,7 +278,7 @@ class _Fit(NamedTuple):
     left: Float[Array, ""]
 
     def errors(self) -> Float[Array, "term column"]:
-        """Standard errors, with the scatter as it is, pair by pair."""
+        """Compute standard errors, with the scatter as it is, pair by pair."""
         return jnp.sqrt((self.added**2).sum(axis=0))
 
 
@@ -303,12 +303,12 @@ def _fit(x: Float[Array, "ball 4"], y: Float[Array, "ball column"], some: Bool[A
 
 @partial(jax.jit, static_argnames="second")
 def _concluded(device: Harvester, at: _Inputs, flown: _Flown, second: bool) -> Average:
-    """The record of an ensemble."""
+    """Make the record of an ensemble."""
     fit = _fit(flown.x, jnp.column_stack([flown.P, flown.fixed]), flown.real, second)
     value = fit.found[0, 0]
 
     def slopes(coefficients: Float[Array, "term column"]) -> _Inputs:
-        """Derivatives of P from coefficients of the fit."""
+        """Turn coefficients of the fit into derivatives of P."""
         pair = coefficients[1:5, 0] / flown.width / jnp.stack([at.pair.d, present(at.pair.kappa), at.pair.r, 1.0])
         blank = jax.tree.map(jnp.zeros_like, at.device)
         constants = [coefficients[0, 2 + i] for i in range(len(_ELECTRICAL))]
@@ -338,7 +338,7 @@ def _concluded(device: Harvester, at: _Inputs, flown: _Flown, second: bool) -> A
 
 
 def _verdict(flown: _Flown, fit: _Fit, second: bool) -> Int[Array, ""]:
-    """Whether the averages of all balls lie on one smooth surface."""
+    """Judge whether the averages of all balls lie on one smooth surface."""
     value, periodic = fit.found[0, 0], _share(flown)
     within = (flown.P_stderr**2).sum() / flown.real.sum(dtype=value.dtype)
     between = (fit.rest[:, 0] ** 2).sum() / fit.left
@@ -358,13 +358,13 @@ def _verdict(flown: _Flown, fit: _Fit, second: bool) -> Int[Array, ""]:
 
 
 def _share(flown: _Flown) -> Float[Array, ""]:
-    """Share of the balls that ended on orbits."""
+    """Count the share of the balls that ended on orbits."""
     return flown.periodic.sum(dtype=flown.P.dtype) / flown.real.sum(dtype=flown.P.dtype)
 
 
 @jax.custom_jvp
 def _follows(inputs: _Inputs, value: Float[Array, ""], slopes: _Inputs) -> Float[Array, ""]:
-    """`value` as a function of the inputs, with measured slopes."""
+    """Make `value` a function of the inputs, with measured slopes."""
     return value
 
 
@@ -378,7 +378,7 @@ def _follows_jvp(primals, tangents):
 
 @jax.custom_jvp
 def _constant(inputs: _Inputs, slopes: _Inputs) -> _Inputs:
-    """Slopes whose own derivatives are not known."""
+    """Give slopes whose own derivatives are not known."""
     return slopes
 
 

@@ -40,11 +40,11 @@ class Averages(NamedTuple):
     end: Starts
 
     def some(self, index: Any) -> "Averages":
-        """Those with the given indices."""
+        """Pick those with the given indices."""
         return jax.tree.map(lambda x: x[index], self)
 
     def labels(self) -> np.ndarray:
-        """Names of their motions; what is undecided counts as aperiodic, as its average does."""
+        """Name their motions; what is undecided counts as aperiodic, as its average does."""
         names = label(self.period, self.left, self.right, self.status)
         return np.where(names == "undecided", "aperiodic", names)
 
@@ -55,14 +55,14 @@ class Averages(NamedTuple):
         return self.P * np.asarray(device.omega) / np.pi if objective == "power" else self.P
 
     def margins(self, device: Harvester) -> np.ndarray:
-        """Logarithms [ball, 2] of the room that is left below the penetration limit and the energy that was given."""
+        """Compute logarithms [ball, 2] of the room left below the penetration limit and the energy given."""
         with np.errstate(divide="ignore"):
             room = np.stack([np.log(np.asarray(device.depth_limit) / self.depth), -np.log(self.ratio)], axis=-1)
         return np.minimum(room, _MOST)
 
 
 def averages(device: Harvester, ended: Any) -> Averages:
-    """What a survey's cells gave.
+    """Average what a survey's cells gave.
 
     Args:
         device: Of every cell: arrays [cell].

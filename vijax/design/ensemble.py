@@ -50,17 +50,17 @@ class Task(NamedTuple):
 
     @property
     def expected(self) -> bool:
-        """Whether balls start anywhere; else they start on the motion that is meant."""
+        """Say whether balls start anywhere; else they start on the motion that is meant."""
         return self.objective == "expected"
 
     @property
     def balls(self) -> int:
-        """How many make an ensemble."""
+        """Say how many make an ensemble."""
         return self.settings.expected_balls if self.expected else self.settings.ensemble_balls
 
     @property
     def last_flights(self) -> list[tuple[int, int]]:
-        """Balls and forcing periods of the flights that a design has to pass in turn; the last one proves it."""
+        """List balls and forcing periods of the flights that a design has to pass in turn; the last one proves it."""
         settings = self.settings
         if self.expected:
             return [(_MORE * settings.expected_balls, settings.ensemble_periods)]
@@ -68,7 +68,7 @@ class Task(NamedTuple):
         return [(balls, max(periods // _FIRST, 1)), (balls, periods)]
 
     def unit(self, owner: int) -> np.ndarray:
-        """What a radius of 1 is in every variable: a factor of e; of an inclination the width of its bounds."""
+        """Say what a radius of 1 is in every variable: a factor of e; of an inclination the width of its bounds."""
         low, high = self.box[owner]
         return np.where([name in LINEAR for name in self.tune], high - low, 1.0)
 
@@ -81,7 +81,7 @@ class Ensemble(NamedTuple):
     device: Harvester
 
     def some(self, index: np.ndarray) -> "Ensemble":
-        """Those with the given indices."""
+        """Pick those with the given indices."""
         return Ensemble(self.offsets[index], self.found.some(index), jax.tree.map(lambda x: x[index], self.device))
 
 
@@ -123,7 +123,7 @@ def fly(
 
 
 def _cells(device: Harvester, z: np.ndarray, names: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
-    """Devices with tuned quantities, and their pairs, as NumPy's arrays."""
+    """Make devices with tuned quantities, and their pairs, as NumPy's arrays."""
     found = tiles.map_tiles(lambda rows: cells(*rows, names), (device, z), _TILES)
     return jax.tree.map(np.asarray, found)
 
@@ -134,7 +134,7 @@ def _changed(device: Harvester, constants: dict[str, np.ndarray]) -> Harvester:
 
 
 def pairs(balls: int, size: int) -> np.ndarray:
-    """Offsets in [-1, 1] [ball, variable], evenly spread in every variable, in pairs of opposite ones."""
+    """Draw offsets in [-1, 1] [ball, variable], evenly spread in every variable, in pairs of opposite ones."""
     half = (balls + 1) // 2
     # Not a lattice: of few balls it would leave the ends of each variable out, where a surface is fixed best.
     order = np.random.default_rng(size).permuted(np.tile(np.arange(half), (size, 1)), axis=1).T
@@ -143,20 +143,20 @@ def pairs(balls: int, size: int) -> np.ndarray:
 
 
 def _on(starts: list[Starts], balls: int) -> Starts:
-    """So many balls on the motion of every centre, in turn where fewer are known."""
+    """Put so many balls on the motion of every centre, in turn where fewer are known."""
     turn = [jax.tree.map(lambda x: np.resize(x, balls), one) for one in starts]
     return jax.tree.map(lambda *x: np.concatenate(x), *turn)
 
 
 def _anywhere(d: Any, centres: int, balls: int) -> Starts:
-    """Balls anywhere in the gap, in every ensemble the same ones."""
+    """Put balls anywhere in the gap, in every ensemble the same ones."""
     u, v = (np.tile(x.values, centres) for x in spread(balls, None))
     begun: Any = u * d, 2 * SPEED * v, np.zeros_like(d)
     return Starts(*begun)
 
 
 def alike(found: Averages) -> np.ndarray:
-    """Which balls are on the kind of motion that most of them are on; those of another would bend the surface."""
+    """Say which balls are on the kind of motion that most of them are on; those of another would bend the surface."""
     fine = np.isin(found.status, AVERAGED) & (found.P > 0)
     restless, periodic = fine & (found.period <= 0), fine & (found.period > 0)
     return restless if restless.sum() >= periodic.sum() else periodic

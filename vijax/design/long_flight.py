@@ -38,7 +38,7 @@ class _Proof:
 
     @property
     def stage(self) -> int:
-        """Which flight is the next one."""
+        """Say which flight is the next one."""
         return len(self.passed)
 
 
@@ -75,7 +75,7 @@ def prove(task: Task, places: list[Place], known: np.ndarray) -> list[AperiodicO
 
 
 def _flown(task: Task, some: dict[int, _Proof], stage: int) -> "dict[int, _Told | None]":
-    """What the flights of a stage show of the last places of some proofs, by their owners."""
+    """Fly the last places of some proofs through a stage; tell what that shows of them, by their owners."""
     owner, proofs = np.array(list(some)), list(some.values())
     places = [proof.places[-1] for proof in proofs]
     if stage:
@@ -91,7 +91,7 @@ def _flown(task: Task, some: dict[int, _Proof], stage: int) -> "dict[int, _Told 
 
 
 def _move(task: Task, proof: _Proof, mixed: bool, lacks: float) -> None:
-    """Where the next long flight goes: further within the limits, beside a window, or to the next best place."""
+    """Choose where the next long flight goes: further within the limits, beside a window, or to the next best place."""
     settings = task.settings
     proof.flights += 1
     proof.passed.clear()
@@ -115,7 +115,7 @@ class _Told:
 
 
 def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble) -> _Told | None:
-    """The design that a long flight showed; None where its balls ended on different motions, or on none."""
+    """Tell the design that a long flight showed; None where its balls ended on different motions, or on none."""
     found, device = ensemble.found, ensemble.device
     shares = Counter(found.labels().tolist())
     if not task.expected and (len(shares) > 1 or not np.isin(found.status, AVERAGED).all()):
@@ -153,7 +153,7 @@ def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble) -> _Told 
 
 
 def _active(task: Task, above: np.ndarray, below: np.ndarray, room: np.ndarray) -> tuple[str, ...]:
-    """What holds a design where it is."""
+    """Name what holds a design where it is."""
     settings = task.settings
     limits = zip(LIMITS, room, strict=True)
     words = [word for word, left in limits if left < _NEAR * settings.limit_room]

@@ -87,7 +87,7 @@ class Met(NamedTuple):
     step: np.ndarray
 
     def some(self, index: np.ndarray) -> "Met":
-        """Those with the given indices."""
+        """Pick those with the given indices."""
         return jax.tree.map(lambda x: x[index], self)
 
 
@@ -100,7 +100,7 @@ class Begun(NamedTuple):
     owner: np.ndarray
 
     def some(self, index: np.ndarray) -> "Begun":
-        """Those with the given indices."""
+        """Pick those with the given indices."""
         return jax.tree.map(lambda x: x[index], self)
 
 
@@ -128,7 +128,7 @@ def find(
     *,
     orbits_alone: bool = True,
 ) -> tuple[Begun, Met, list[Looked]]:
-    """The attractors to climb from, all motion that is no orbit to climb from, and what was met of every device.
+    """Find the attractors to climb from, all motion that is no orbit to climb from, and what was met of every device.
 
     Args:
         devices: Where quantities that are not tuned are taken from.
@@ -161,14 +161,14 @@ def find(
 def every_start(
     devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: Effort
 ) -> tuple[Met, list[Looked]]:
-    """What every start came to, where that is the answer, and what was met of every device; arguments as in `find`."""
+    """Find what every start came to, where that is the answer, and what each device met; arguments as in `find`."""
     seen = _first_look(_Scene(devices, tune, box, effort))
     met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
     return seen.every(), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
 
 
 def _first_look(scene: "_Scene") -> "_Seen":
-    """The coarse survey: as many balls at every value."""
+    """Survey coarsely: as many balls at every value."""
     levels = len(_levels(scene.tune, scene.effort))
     shape = len(scene.devices), levels, scene.points, scene.effort.starts
     owner, level, step, _ = (x.ravel() for x in np.indices(shape))
@@ -177,7 +177,7 @@ def _first_look(scene: "_Scene") -> "_Seen":
 
 
 def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
-    """What was met of a device, by the closer survey too."""
+    """Sum up what was met of a device, by the closer survey too."""
     met, unrest = met.some(met.owner == one), unrest.some(unrest.owner == one)
     broken, rest = promise(met, "P").lacks < 0, promise(unrest, "P")
     power = np.where(rest.lacks < 0, 0.0, np.nan_to_num(np.exp(rest.value)))
@@ -210,22 +210,22 @@ class _Scene(NamedTuple):
 
     @property
     def points(self) -> int:
-        """Values of the first quantity at which is looked."""
+        """Count the values of the first quantity at which is looked."""
         return 1 if _first(self.tune) is None else self.effort.points
 
     @property
     def cells(self) -> int:
-        """Balls of a device that are flown in a look, at most."""
+        """Count the balls of a device that are flown in a look, at most."""
         return len(_levels(self.tune, self.effort)) * self.points * self.effort.starts
 
 
 def _first(tune: tuple[str, ...]) -> int | None:
-    """Index of the first quantity that moves the ball, along which surveys look."""
+    """Find the first quantity that moves the ball, along which surveys look, by its index."""
     return next((i for i, name in enumerate(tune) if moving(name)), None)
 
 
 def _levels(tune: tuple[str, ...], effort: Effort) -> np.ndarray:
-    """Values [level, quantity] of the others, in parts of their bounds."""
+    """List values [level, quantity] of the others, in parts of their bounds."""
     first, levels = _first(tune), effort.settings.survey_levels
     return np.array(
         list(itertools.product(*((0.5,) if i == first or not moving(x) else levels for i, x in enumerate(tune))))
@@ -242,15 +242,15 @@ class _Seen(NamedTuple):
     step: np.ndarray
 
     def orbits(self, impacts: int) -> Met:
-        """The periodic attractors of at most so many impacts."""
+        """Find the periodic attractors of at most so many impacts."""
         return self._met(self.found.closing(impacts))
 
     def restless(self, impacts: int) -> Met:
-        """What was met that is no such orbit."""
+        """Find what was met that is no such orbit."""
         return self._met(self.found.restless(impacts))
 
     def every(self) -> Met:
-        """All that was met."""
+        """Give all that was met."""
         return self._met(np.arange(self.step.size))
 
     def _met(self, cells: np.ndarray) -> Met:
@@ -281,7 +281,7 @@ def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
 
 
 def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, most_cells: int) -> _Places:
-    """About the steps where what is no orbit promises about as much as the best orbit, or more.
+    """Choose places about the steps where what is no orbit promises about as much as the best orbit, or more.
 
     Cells of a device, so many at most, are spread evenly over these steps, and over each of them.
     """
@@ -298,7 +298,7 @@ def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, most_
 
 
 def _promising(met: Met, objective: str, devices: int, points: int, settings: DesignSettings) -> np.ndarray:
-    """Indices of the attractors to climb from: the best of their kind as far as so many steps away.
+    """Choose the attractors to climb from: the best of their kind as far as so many steps away.
 
     A kind is given by span and impacts; the walls may change places where the tube is level.
     """
@@ -312,7 +312,7 @@ def _promising(met: Met, objective: str, devices: int, points: int, settings: De
 
 
 def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) -> np.ndarray:
-    """Indices of the rows that none of their group beats within so many steps; of one step's rows the first best.
+    """Find the rows that none of their group beats within so many steps; of one step's rows the first best.
 
     Args:
         group: What rows of one group have in common, [row, ...].
@@ -333,7 +333,7 @@ def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) 
 
 
 def _impacts(met: Met) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right impacts of orbits; in a level tube the more and the fewer."""
+    """Count left and right impacts of orbits; in a level tube the more and the fewer."""
     left, right = met.ended.impacts_left, met.ended.impacts_right
     swap = (met.pair.gamma == 0) & (right > left)
     return np.where(swap, right, left), np.where(swap, left, right)
@@ -347,19 +347,19 @@ class _Promise(NamedTuple):
 
     @property
     def total(self) -> np.ndarray:
-        """What may be left where no constraint is broken any more."""
+        """Compute what may be left where no constraint is broken any more."""
         return self.value + self.lacks
 
 
 def promise(met: Met, objective: str) -> _Promise:
-    """What motions gave, and what they lacked."""
+    """Judge motions: what they gave, and what they lacked."""
     with np.errstate(divide="ignore"):
         value = np.log(np.nan_to_num(met.found.value(objective, met.device)))
     return _Promise(value, np.nanmin(met.found.margins(met.device), axis=1, initial=0.0))
 
 
 def _rivals(met: Met, unrest: Met, objective: str, devices: int, settings: DesignSettings) -> np.ndarray:
-    """Indices of the attractors that may lead to the best design, where any motion may win.
+    """Choose the attractors that may lead to the best design, where any motion may win.
 
     What promises too little, or exceeds a limit by far, never did.
     """
@@ -370,7 +370,7 @@ def _rivals(met: Met, unrest: Met, objective: str, devices: int, settings: Desig
 
 
 def _most(hope: _Promise, owner: np.ndarray, devices: int) -> np.ndarray:
-    """What the best admissible attractor of every device promises; -inf where there is none."""
+    """Find what the best admissible attractor of every device promises; -inf where there is none."""
     most = np.full(devices, -np.inf)
     np.maximum.at(most, owner, np.where(hope.lacks < 0, -np.inf, hope.value))
     return most

@@ -52,7 +52,7 @@ class Scene(eqx.Module):
     objective: str = eqx.field(static=True)
 
     def device(self, device: Harvester, z, factors) -> Harvester:
-        """The device with tuned quantities and scattered constants."""
+        """Make the device with tuned quantities and scattered constants."""
         tuned = variables.tuned(device, self.names, z)
         off = {name: getattr(tuned, name) * x for name, x in zip(self.scattered, factors, strict=True)}
         return eqx.tree_at(lambda d: [getattr(d, n) for n in off], tuned, list(off.values())) if off else tuned
@@ -67,7 +67,7 @@ class _Seen(NamedTuple):
 
 
 def _measure(scene: Scene, device: Harvester, sequence: Sequence, factors, knots, residual, z):
-    """The objective at an orbit as a function of the variables, and the status."""
+    """Compute the objective at an orbit as a function of the variables, and the status."""
     own = scene.device(device, z, factors)
     there = steady.response(own, own.pair(), sequence, knots, residual)
     value = {"power": there.power, "speed": there.speed}.get(scene.objective, there.P)
@@ -88,7 +88,7 @@ class Known(NamedTuple):
 
 
 def _settled(scene: Scene, batch: Batch, z, factors, guess):
-    """Knots and residuals [start, node] of the orbits near guesses."""
+    """Find knots and residuals [start, node] of the orbits near guesses."""
     one = lambda device, z, factors: scene.device(device, z, factors).pair()  # noqa: E731
     pair = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)))(batch.device, z, factors)
     starts, count = guess.shape[:2]
@@ -99,7 +99,7 @@ def _settled(scene: Scene, batch: Batch, z, factors, guess):
 
 
 def begin(scene: Scene, batch: Batch) -> Known:
-    """The orbits of all nodes, followed in a few steps from the nominal ones."""
+    """Follow the orbits of all nodes in a few steps from the nominal ones."""
     starts, count = batch.z.shape[0], scene.weights.size
     wide = jnp.broadcast_to(scene.factors, (starts, *scene.factors.shape))
 
@@ -114,7 +114,7 @@ def begin(scene: Scene, batch: Batch) -> Known:
 
 
 def _orbits(scene: Scene, batch: Batch, z, near, known: Known):
-    """Knots and residuals [start, node] of the orbits that follow from those near."""
+    """Find knots and residuals [start, node] of the orbits that follow from those near."""
     guess = known.knots + (known.slopes * (z - near)[:, None, None, None]).sum(axis=-1)
     # A device whose orbit was lost may have the nominal one again.
     guess = jnp.where(known.there[..., None, None], guess, guess[:, :1])
@@ -123,13 +123,13 @@ def _orbits(scene: Scene, batch: Batch, z, near, known: Known):
 
 
 def _over_all(function):
-    """A function of (device, sequence, factors, knots, residual, z), over starts and nodes."""
+    """Map a function of (device, sequence, factors, knots, residual, z) over starts and nodes."""
     over_nodes = jax.vmap(function, in_axes=(None, None, 0, 0, 0, None))
     return jax.vmap(over_nodes, in_axes=(0, 0, None, 0, 0, 0))
 
 
 def look(scene: Scene, batch: Batch, z, near, known: Known) -> Look:
-    """The objective of every start with its derivatives, for `ascent.ascend`."""
+    """See the objective of every start with its derivatives, for `ascent.ascend`."""
     knots, residual = _orbits(scene, batch, z, near, known)
     slope = jax.jacfwd(partial(_measure, scene), argnums=5, has_aux=True)
     slopes, (seen, status) = _over_all(slope)(batch.device, batch.sequence, scene.factors, knots, residual, z)
@@ -160,7 +160,7 @@ def look(scene: Scene, batch: Batch, z, near, known: Known) -> Look:
 
 @jax.jit
 def spread(scene: Scene, batch: Batch) -> tuple[Array, ...]:
-    """Mean and worst value of designs over tolerances, shares of those lost and inadmissible; see `optimise.Spread`."""
+    """Compute mean and worst value of designs over tolerances, shares of those lost and inadmissible; see `Spread`."""
     knots, residual = _orbits(scene, batch, batch.z, batch.z, begin(scene, batch))
     measure = _over_all(partial(_measure, scene))
     _, (seen, status) = measure(batch.device, batch.sequence, scene.factors, knots, residual, batch.z)

@@ -56,7 +56,7 @@ class Extent(NamedTuple):
 
     @property
     def percent(self) -> float:
-        """The nearer end."""
+        """Give the nearer end."""
         return min(self.below.percent, self.above.percent)
 
 
@@ -113,7 +113,7 @@ class _Way:
 
     @property
     def going(self) -> bool:
-        """Whether its end is not known yet to a thousandth of it."""
+        """Say whether its end is not known yet to a thousandth of it."""
         return self.off < _FARTHEST and self.step > max(0.1 * _FINEST, 1e-3 * self.off)
 
 
@@ -157,7 +157,7 @@ def arrival(optimum: Optimum | AperiodicOptimum) -> Arrival:
 
 
 def scattered(optimum: AperiodicOptimum, tolerances: tuple[Tolerance, ...], samples: int | None) -> Spread:
-    """What becomes of a motion that is no orbit when constants scatter; see `optimise.under`."""
+    """Find what becomes of a motion that is no orbit when constants scatter; see `optimise.under`."""
     balls = _DEVICES if samples is None else samples
     task = _task(optimum, "P")._replace(tolerances=tolerances)
     z, some = _z(optimum, task.tune)[None], [optimum.starts]
@@ -183,7 +183,7 @@ def _z(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...]) -> np.ndarra
 
 
 def _start(optimum: Optimum | AperiodicOptimum) -> Starts:
-    """A ball on the motion: at an impact of an orbit; where the long flight left one."""
+    """Put a ball on the motion: at an impact of an orbit; where the long flight left one."""
     if isinstance(optimum, AperiodicOptimum):
         return jax.tree.map(lambda x: x[:1], optimum.starts)
     orbit = optimum.orbit
@@ -195,6 +195,6 @@ def _start(optimum: Optimum | AperiodicOptimum) -> Starts:
 
 
 def _own(optimum: Optimum | AperiodicOptimum, found: Averages) -> np.ndarray:
-    """Which balls are on a motion of the design's label, mirror images alike."""
+    """Say which balls are on a motion of the design's label, mirror images alike."""
     turned = found._replace(left=found.right, right=found.left)
     return (found.labels() == optimum.label) | (turned.labels() == optimum.label)

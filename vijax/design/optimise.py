@@ -66,12 +66,12 @@ class Design:
 
     @property
     def best(self) -> Optimum | AperiodicOptimum | None:
-        """The highest optimum."""
+        """Give the highest optimum."""
         return self.optima[0] if self.optima else None
 
     @property
     def orbits(self) -> tuple[Optimum, ...]:
-        """Those whose motion is an orbit that was climbed, the best first."""
+        """Give those whose motion is an orbit that was climbed, the best first."""
         return tuple(one for one in self.optima if isinstance(one, Optimum))
 
 
@@ -140,7 +140,7 @@ def optimise_all(
     max_evaluations: int = 60,
     settings: DesignSettings = DEFAULT,
 ) -> list[Design]:
-    """The admissible designs that harvest most, each device's tuned quantities between bounds.
+    """Find the admissible designs that harvest most, each device's tuned quantities between bounds.
 
     Attractors of a coarse survey along the first quantity, from many starts of the ball, are where the ascents begin.
     All of them climb in one jitted call along exact gradients; an optimum is admissible in every impact (E_j <= W_j,
@@ -212,21 +212,21 @@ def optimise_all(
 
 
 def _on_orbits(task: Task, starts: Begun, cloud: Nodes, max_evaluations: int) -> list[list[Optimum]]:
-    """The optima of every device to which its orbits climb, the best first."""
+    """Climb along the orbits of every device; give its optima, the best first."""
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), task.tune, cloud.names, task.objective)
     ends = _climbed(scene, starts, task.box, max_evaluations, task.settings)
     return verified(scene, starts, ends, task.devices, max_evaluations, task.settings)
 
 
 def _beyond(task: Task, met: Met, orbits: list[list[Optimum]]) -> list[AperiodicOptimum | None]:
-    """The best design of every device whose motion is no orbit, where it gives more than the best orbit does."""
+    """Find the best design of every device whose motion is no orbit, where it gives more than the best orbit does."""
     known = np.array([math.log(some[0].height) if some else -math.inf for some in orbits])
     return long_flight.prove(task, aperiodic_search.search(task, met, known), known)
 
 
 @door
 def under(optimum: Optimum | AperiodicOptimum, tolerances: Iterable[Tolerance], samples: int | None = None) -> Spread:
-    """What becomes of a design when constants scatter.
+    """Find what becomes of a design when constants scatter.
 
     Of a motion that is no orbit the balls of random devices tell, each of which starts on it.
 
@@ -251,7 +251,7 @@ def under(optimum: Optimum | AperiodicOptimum, tolerances: Iterable[Tolerance], 
 
 
 def effort(survey_points: int, starts: int, max_impacts: int, survey_periods: int = 200) -> Effort:
-    """How far a survey looks; raises ValueError as `optimise_all` does."""
+    """Say how far a survey looks; raise ValueError as `optimise_all` does."""
     return Effort(
         checks.whole("survey_points", survey_points, 2, _MOST_POINTS),
         checks.whole("starts", starts, 1, _MOST_POINTS),
@@ -261,7 +261,7 @@ def effort(survey_points: int, starts: int, max_impacts: int, survey_periods: in
 
 
 def expected(devices: int, far: Effort) -> Estimate:
-    """What the survey of so many devices asks of the machine; ascents take less.
+    """Estimate what the survey of so many devices asks of the machine; ascents take less.
 
     Raises:
         ValueError: If its balls do not fit in memory.
@@ -279,7 +279,7 @@ def check(
     objective: str,
     tolerances: tuple[Tolerance, ...],
 ) -> np.ndarray:
-    """Bounds [device, 2, variable] of what `optimise_all` is asked for; raises ValueError as it does, runs nothing."""
+    """Give the bounds [device, 2, variable] asked for; raise ValueError as `optimise_all` does, but run nothing."""
     check_names(tune)
     if not devices:
         raise ValueError("devices must hold at least one; got none")
@@ -296,7 +296,7 @@ def check(
 
 
 def check_motion(motion: str, objective: str, reliability: float) -> float:
-    """The reliability, if motion, objective and it go together; raises ValueError as `optimise_all` does."""
+    """Take the reliability, if motion, objective and it go together; raise ValueError as `optimise_all` does."""
     checks.choice("motion", motion, get_args(Motion))
     if motion == "periodic" and objective == "expected":
         raise ValueError('motion must be "any" with objective expected, which takes every start; got "periodic"')
@@ -317,7 +317,7 @@ def _compiled(max_evaluations: int, settings: DesignSettings):
 
 
 def _climbed(scene: Scene, starts: Begun, box: np.ndarray, max_evaluations: int, settings: DesignSettings) -> list[End]:
-    """The ascent of every start, in padded tiles on every core: orbits of few impacts and of many apart."""
+    """Climb from every start, in padded tiles on every core: orbits of few impacts and of many apart."""
     count, work = (starts.flown.side != 0).sum(axis=1), _compiled(max_evaluations, settings)
     ends: list[End | None] = [None] * count.size
 

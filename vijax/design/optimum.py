@@ -136,7 +136,7 @@ def verified(
     max_evaluations: int,
     settings: DesignSettings,
 ) -> list[list[Optimum]]:
-    """What was reached for every device: admissible, verified, each optimum once, the best first."""
+    """Verify what was reached for every device: admissible, by the exact map, each optimum once, the best first."""
     owner = starts.owner
     good = [i for i, end in enumerate(ends) if end.margins.min() >= 0 and np.isfinite(end.height)]
     good = [i for rows in apart(good, ends, owner, settings.same_optimum) for i in rows]
@@ -208,7 +208,7 @@ def _compiled_states():
 
 @door
 def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
-    """The steady state of every device on its known orbit, in padded tiles."""
+    """Find the steady state of every device on its known orbit, in padded tiles."""
     given, found = jax.tree.map(lambda *x: np.array(x), *devices), []
     for tile in tiles.tiles(len(orbit), _FEW):
         some = _compiled_states()(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
@@ -218,7 +218,7 @@ def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
 
 
 def _active(scene: Scene, end: End, side: Any, near: float) -> tuple[str, ...]:
-    """What holds an end where it is."""
+    """Name what holds an end where it is."""
     count, width = len(scene.names), end.knots.shape[0]
     margins, low, high = np.split(end.margins, [end.margins.size - 2 * count, end.margins.size - count])
     words = []

@@ -37,7 +37,7 @@ def describe(
     tolerances: Sequence[Tolerance] = (),
     spread: Spread | None = None,
 ) -> dict[str, Any]:
-    """All of a design as nested dicts and lists of numbers and words.
+    """Describe all of a design in nested dicts and lists of numbers and words.
 
     Args:
         design: What `vijax.optimise` returned.
@@ -78,7 +78,7 @@ def describe(
 
 
 def optimum(one: Optimum | AperiodicOptimum) -> dict[str, Any]:
-    """An optimum as plain data.
+    """Describe an optimum in plain data.
 
     Of an orbit, for each impact: penetration, energy, energy given to the membrane, their ratio. Of any other motion
     the largest penetration and ratio of all that was flown, and the standard errors of averages.
@@ -156,7 +156,7 @@ def _surroundings(found: Surroundings) -> dict[str, Any]:
 
 
 def _highest(diagram: "xr.Dataset") -> dict[str, Any]:
-    """The point of a diagram with the largest P."""
+    """Find the point of a diagram with the largest P."""
     along = str(diagram.attrs["along"])
     peak = diagram.isel({dim: int(i) for dim, i in diagram["P"].fillna(0.0).argmax(("direction", along)).items()})
     names = ("P", "max_penetration", "energy_ratio", "admissible")
@@ -164,7 +164,7 @@ def _highest(diagram: "xr.Dataset") -> dict[str, Any]:
 
 
 def factors(name: str, tolerances: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
-    """By how much a quantity may be off by the tolerance of the constant that decides it; None if it has none."""
+    """Say by how much a quantity may be off by the tolerance of the constant that decides it; None if it has none."""
     for one in tolerances:
         if one["name"] == constant(name) and name not in LINEAR:
             x = one["spread"]
@@ -177,7 +177,7 @@ def factors(name: str, tolerances: Sequence[dict[str, Any]]) -> tuple[float, flo
 
 
 def amount(value: float, unit: str, digits: int = 7) -> str:
-    """A value with a prefix of its unit: 57.75761 uJ."""
+    """Write a value with a prefix of its unit: 57.75761 uJ."""
     if not np.isfinite(value) or not value:
         return f"{value:g} {unit}"
     size = abs(value) * (1 + 0.5 * 10.0**-digits)
@@ -186,12 +186,12 @@ def amount(value: float, unit: str, digits: int = 7) -> str:
 
 
 def quantity(name: str, value: float) -> str:
-    """A tuned quantity: omega0 = 40.07126 rad/s."""
+    """Write a tuned quantity: omega0 = 40.07126 rad/s."""
     return f"{name} = {value:.7g} {UNITS.get(name, '')}".rstrip()
 
 
 def lines(report: dict[str, Any]) -> Iterator[str]:
-    """What a builder needs to know before trusting a design, from what `describe` returned."""
+    """Say what a builder needs to know before trusting a design, from what `describe` returned."""
     checks.record("report", report, ("bounds", "objective", "best"), "vijax.design.report.describe")
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in report["bounds"].items())
     yield f"tuned: {ranges}; objective {report['objective']}, {report['objective_means']}"
@@ -210,7 +210,7 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
 
 
 def _instead(survey: dict[str, Any]) -> Iterator[str]:
-    """What a survey met where no design came of it, and what to do about each."""
+    """Say what a survey met where no design came of it, and what to do about each."""
     if survey["limit"]:
         yield (
             f"the {survey['limit']} stands everywhere: the motion nearest to keeping the limits exceeds it by "
@@ -281,7 +281,7 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
 
 
 def _flown(best: dict[str, Any]) -> Iterator[str]:
-    """What proves a motion that is no orbit."""
+    """Say what proves a motion that is no orbit."""
     exponent = f"; Lyapunov exponent {best['lyapunov']:.3g} a period" if np.isfinite(best["lyapunov"]) else ""
     yield f"  {best['balls']} balls flown for {best['periods']:,} periods each at exactly these values{exponent}"
     if best["kept_limits"] < 1:
@@ -292,7 +292,7 @@ def _flown(best: dict[str, Any]) -> Iterator[str]:
 
 
 def _regular(best: dict[str, Any]) -> Iterator[str]:
-    """What proves an orbit."""
+    """Say what proves an orbit."""
     modulus = ", ".join(f"{np.hypot(*one):.4g}" for one in best["multipliers"])
     yield f"  |multipliers| {modulus}; condition of I - DP {best['condition']:.4g}; residual {best['residual']:.1e}"
     room = best["clearance"]
@@ -303,7 +303,7 @@ def _regular(best: dict[str, Any]) -> Iterator[str]:
 
 
 def _off_design(best: dict[str, Any], extents: list[dict[str, Any]], arrival: dict[str, Any] | None) -> Iterator[str]:
-    """How far the motion lasts, what comes after it, and how balls arrive at it."""
+    """Say how far the motion lasts, what comes after it, and how balls arrive at it."""
     for one in extents:
         for way in ("below", "above"):
             side = one[way]
@@ -344,7 +344,7 @@ def _edge(edge: dict[str, Any]) -> str:
 
 
 def _height(one: dict[str, Any], objective: str) -> str:
-    """The objective there: worst 51.78932 uJ."""
+    """Write the objective there: worst 51.78932 uJ."""
     return f"{objective} {amount(one['height'], {'power': 'W', 'speed': 'm/s'}.get(objective, 'J'))}"
 
 
@@ -382,7 +382,7 @@ def _unconstrained(report: dict[str, Any]) -> Iterator[str]:
 
 
 def table(report: dict[str, Any]) -> Iterator[str]:
-    """The best designs along an axis, a line each: `over`, its name and values, and `designs`, of `describe` each."""
+    """Tell the best designs along an axis, a line each: `over` is its name and values, `designs` of `describe` each."""
     checks.record("report", report, ("over", "designs"), "scripts/design.py --over")
     name, values = report["over"]["name"], report["over"]["values"]
     for value, one in zip(values, report["designs"], strict=True):

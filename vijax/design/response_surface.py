@@ -31,13 +31,13 @@ class Surface(NamedTuple):
     slopes: np.ndarray
 
     def worth(self, step: np.ndarray, price: float) -> float:
-        """Logarithm of the objective at an offset, less by a price for each unit that limits lack there."""
+        """Compute the logarithm of the objective at an offset, less by a price for each unit that limits lack there."""
         rise = self.gradient @ step + 0.5 * step @ self.curvature @ step
         return float(self.value + rise + price * min((self.margins + self.slopes @ step).min(), 0.0))
 
 
 def unknown(size: int, constraints: int = 2) -> Surface:
-    """A surface of so many variables below any other."""
+    """Make a surface of so many variables below any other."""
     nothing, level, flat = np.float64(-np.inf), np.zeros(size), np.zeros((size, size))
     return Surface(
         nothing, level, flat, np.float64(0), level, np.full(constraints, -np.inf), np.zeros((constraints, size))
@@ -85,7 +85,7 @@ def fit(offsets: np.ndarray, values: np.ndarray, margins: np.ndarray, *, share: 
 
 
 def _below(x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
-    """Coefficients of the highest plane that lies on or below so many of the points, by linear programming.
+    """Fit the highest plane that lies on or below so many of the points, by linear programming.
 
     All of them: its mean over the points is largest. A share: quantile regression, in which room above the plane costs
     1 - share and room below it costs share.

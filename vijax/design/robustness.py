@@ -96,7 +96,7 @@ def _checked(reach: Any) -> float:
 
 
 def _attractors(device: Harvester, starts: int, seed: int | None) -> tuple[Neighbour, ...]:
-    """What attracts the balls of a device, mirror images as one, the largest share first."""
+    """Find what attracts the balls of a device, mirror images as one, the largest share first."""
     d, kappa, r, gamma = (float(x) for x in jax.tree.leaves(device.pair()))
     found = basin_fractions(
         d=d, kappa=kappa, r=r, gamma=gamma, starts=starts, seed=seed, device=device, merge_mirrors=gamma == 0
@@ -122,7 +122,7 @@ def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
 
 @door
 def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int | None = None) -> Optimum | None:
-    """The design of most P times basin share, by line searches from the optima along one tuned quantity after another.
+    """Find the design of most P times basin share, by line searches from the optima along each tuned quantity in turn.
 
     Shares come from simulated starts: they have no gradient.
 
@@ -188,7 +188,7 @@ def _device(optimum: Optimum, names: tuple[str, ...], z: np.ndarray) -> Harveste
 
 
 def _followed(optimum: Optimum, device: Harvester) -> Orbit:
-    """The optimum's orbit as its device becomes another one, in small steps."""
+    """Follow the optimum's orbit as its device becomes another one, in small steps."""
     begin, end, orbit = optimum.device.pair(), device.pair(), optimum.orbit
     for step in range(1, _STEPS + 1):
         pair = jax.tree.map(lambda a, b, part=step / _STEPS: jnp.array([a + part * (b - a)]), begin, end)

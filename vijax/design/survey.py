@@ -42,7 +42,7 @@ class Flown(NamedTuple):
     cell: np.ndarray
 
     def sequence(self, width: int) -> Sequence:
-        """Walls and closing of all orbits, of so many impacts: with the knots what `periodic.solve` takes."""
+        """Give walls and closing of all orbits, of so many impacts: with the knots what `periodic.solve` takes."""
         return Sequence(jnp.asarray(self.side[:, :width]), jnp.asarray(self.span), jnp.zeros(self.span.size, bool))
 
 
@@ -60,7 +60,7 @@ class Survey(NamedTuple):
     longest: int
 
     def orbits(self, impacts: int) -> Flown:
-        """The periodic attractors of at most so many impacts, of mirror images on level ground one.
+        """Fly the periodic attractors of at most so many impacts, of mirror images on level ground one.
 
         Of cells that differ in their starts alone each one once.
         """
@@ -69,17 +69,17 @@ class Survey(NamedTuple):
         return flown(pair, ended, impacts)._replace(cell=some)
 
     def closing(self, impacts: int) -> np.ndarray:
-        """Cells that met such an attractor first."""
+        """Find the cells that met such an attractor first."""
         some = np.flatnonzero(self._closing(impacts))
         return some[_distinct(*jax.tree.map(lambda x: x[some], (self.pair, self.ended)))]
 
     def restless(self, impacts: int) -> np.ndarray:
-        """Cells whose motion is no such orbit: chaos, what has not settled, what takes too many periods or impacts."""
+        """Find cells whose motion is no such orbit: chaos, not settled, or of too many periods or impacts."""
         going = np.isin(self.ended.status, (*_SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
         return np.flatnonzero(going & ~self._closing(impacts))
 
     def _closing(self, impacts: int) -> np.ndarray:
-        """Which cells ended on an orbit that is wanted."""
+        """Say which cells ended on an orbit that is wanted."""
         ended, count = self.ended, self.ended.impacts_left + self.ended.impacts_right
         some = (ended.period > 0) & (ended.period <= self.longest) & (count > 0) & (count <= impacts)
         return np.isin(ended.status, _SETTLED) & some
@@ -100,7 +100,7 @@ def survey(pair: ImpactPair, device: Harvester, starts: Starts, *, longest: int,
 
 
 def flown(pair: ImpactPair, ended: Any, impacts: int) -> Flown:
-    """The orbits of cells that ended on some, of at most so many impacts, flown once more impact by impact."""
+    """Fly the orbits of cells that ended on some, of at most so many impacts, once more impact by impact."""
     # A period more, lest rounding moves an impact at phase 0 out of it.
     table = _recorded(pair, ended.handover, ended.period + 1, impacts)
     count = ended.impacts_left + ended.impacts_right
@@ -108,7 +108,7 @@ def flown(pair: ImpactPair, ended: Any, impacts: int) -> Flown:
 
 
 def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, periods: int) -> Any:
-    """How every cell ended, a `Summary`, in tiles on every core."""
+    """Run every cell to its end, a `Summary`, in tiles on every core."""
     cells = pair.d.size
     share = math.ceil(cells / workers())
     size = min(max(padded(share), _SMALLEST_TILE), _LARGEST_TILE)
@@ -128,7 +128,7 @@ def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, pe
 
 
 def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
-    """Indices of the cells that met an attractor of their pair first; by impacts, greatest speed and depth."""
+    """Find the cells that met an attractor of their pair first; by impacts, greatest speed and depth."""
     left, right = ended.impacts_left, ended.impacts_right
     swap = (pair.gamma == 0) & (right > left)
     measures = [np.round(np.log(x) / _SAME) for x in (ended.fastest, ended.deepest)]
@@ -141,7 +141,7 @@ _COLUMNS = "n", "t", "side", "v_in", "duration", "depth", "work"
 
 
 def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int) -> dict[str, np.ndarray]:
-    """So many first impacts of the last periods of cells by name, [cell, impact], NaN beyond."""
+    """Record so many first impacts of the last periods of cells by name, [cell, impact], NaN beyond."""
     u, v, t, n, held = jax.tree.leaves((handover.mark, handover.held))
     mark = State(u, v, t, n.astype(np.int32), held.astype(np.int32))
 
@@ -164,7 +164,7 @@ def _recorded(pair: ImpactPair, handover: Any, periods: np.ndarray, impacts: int
 def _flown(
     pair: ImpactPair, span: np.ndarray, table: dict[str, np.ndarray], real: np.ndarray, cell: np.ndarray
 ) -> Flown:
-    """Motions from the table of their impacts, of which some are meant."""
+    """Make motions of the table of their impacts, of which some are meant."""
     knots = np.stack([2 * table["n"] + table["t"], np.abs(table["v_in"]), table["duration"]], axis=-1)
     return Flown(
         pair=pair,

@@ -32,7 +32,7 @@ class Tolerance(NamedTuple):
 
 
 def check_tolerances(tolerances: Iterable[Tolerance], bounded: bool = False) -> tuple[Tolerance, ...]:
-    """The tolerances, if they can be.
+    """Pass the tolerances, if they can be.
 
     Args:
         tolerances: Of several constants.
@@ -53,7 +53,7 @@ def check_tolerances(tolerances: Iterable[Tolerance], bounded: bool = False) -> 
 
 
 def check_samples(samples: Any) -> int:
-    """How many random devices there are, if there may be so many."""
+    """Take the number of random devices, if there may be so many."""
     return checks.whole("samples", samples, 1, _MOST_SAMPLES)
 
 
@@ -66,7 +66,7 @@ class Nodes(NamedTuple):
 
 
 def nodes(tolerances: tuple[Tolerance, ...], samples: int | None = None, seed: int = 0) -> Nodes:
-    """Nodes of the tolerances together.
+    """Lay out nodes of the tolerances together.
 
     Args:
         tolerances: None for the nominal device alone.
@@ -109,7 +109,7 @@ class Spread(NamedTuple):
 
 
 def drawn(tolerances: tuple[Tolerance, ...], count: int, seed: int = 0) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names of the constants, and factors [device, constant] of so many random devices."""
+    """Draw so many random devices: names of the constants, and factors [device, constant]."""
     draw = np.random.default_rng(seed)
     columns = [_factors(one, _drawn(one, draw, count)) for one in tolerances]
     return tuple(one.name for one in tolerances), np.stack(columns, axis=1)
@@ -124,7 +124,7 @@ def _drawn(one: Tolerance, draw: np.random.Generator, count: int) -> np.ndarray:
 
 
 def _rule(one: Tolerance, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights of one constant, in units of its spread."""
+    """Compute nodes and weights of one constant, in units of its spread."""
     if one.kind == "lognormal":
         x, w = np.polynomial.hermite_e.hermegauss(count)
         return x, w / w.sum()

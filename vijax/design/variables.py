@@ -28,31 +28,31 @@ NAMES = CONSTANTS + tuple(_ALIASES)
 
 
 def constant(name: str) -> str:
-    """The constant of the device that a name decides."""
+    """Name the constant of the device that a name decides."""
     return _ALIASES.get(name, name)
 
 
 def moving(name: str) -> bool:
-    """Whether the motion depends on it, and not the energies alone."""
+    """Say whether the motion depends on it, and not the energies alone."""
     return constant(name) in PARAMETERS
 
 
 @door
 def values(names: tuple[str, ...], z: Any) -> Any:
-    """Values of the quantities for their variables, [..., quantity]."""
+    """Turn variables into values of the quantities, [..., quantity]."""
     plain = np.array([name in LINEAR for name in names])
     return jnp.where(plain, z, jnp.exp(jnp.where(plain, 0.0, z)))
 
 
 def variables(names: tuple[str, ...], x: Any) -> np.ndarray:
-    """Variables of the quantities for their values, [..., quantity]; the inverse of `values`."""
+    """Turn values of the quantities into variables, [..., quantity]; the inverse of `values`."""
     plain, x = np.array([name in LINEAR for name in names]), np.asarray(x, float)
     return np.where(plain, x, np.log(np.where(plain, 1.0, x)))
 
 
 @door
 def tuned(device: Harvester, names: tuple[str, ...], z: Any) -> Harvester:
-    """The device with the quantities that the variables say."""
+    """Make the device with the quantities that the variables say."""
     given = dict(zip(names, values(names, z), strict=True))
     device = dataclasses.replace(device, **{name: x for name, x in given.items() if name not in _ALIASES})
     for name in _ALIASES:
@@ -69,7 +69,7 @@ def cells(devices: Harvester, z: Float[Array, "cell variable"], names: tuple[str
 
 
 def _decided(device: Harvester, name: str, x: Any) -> Harvester:
-    """The device in which a quantity that is no constant has the given value."""
+    """Make the device in which a quantity that is no constant has the given value."""
     value = {
         "k": lambda: jnp.sqrt(x / device.m_b),
         "kappa": lambda: x * device.omega / math.pi,
@@ -80,7 +80,7 @@ def _decided(device: Harvester, name: str, x: Any) -> Harvester:
 
 
 def value_of(device: Harvester, name: str) -> Any:
-    """The quantity's value in a device."""
+    """Find the quantity's value in a device."""
     if name not in _ALIASES:
         return getattr(device, name)
     if name == "k":
@@ -100,7 +100,7 @@ def check_names(names: tuple[str, ...]) -> None:
 
 
 def limits(names: tuple[str, ...], bounds: Mapping[str, tuple[float, float]], device: Harvester) -> np.ndarray:
-    """Lower and upper bounds [2, quantity] of the quantities of a device.
+    """Give lower and upper bounds [2, quantity] of the quantities of a device.
 
     Args:
         names: Checked by `check_names`.

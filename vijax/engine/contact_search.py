@@ -33,7 +33,7 @@ class _Search(eqx.Module):
 
 
 def _free_end(m: Membrane, w: Scalar, z: Scalar) -> Scalar:
-    """Time until the unforced oscillator at (w, z) would return to zero: less than half a free cycle.
+    """Find when the unforced oscillator at (w, z) would return to zero: within less than half a free cycle.
 
     At the root itself w may come out below zero by rounding: that is zero, not the beginning of another cycle.
     """
@@ -42,7 +42,7 @@ def _free_end(m: Membrane, w: Scalar, z: Scalar) -> Scalar:
 
 
 def _amplitude(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -> Scalar:
-    """Largest homogeneous part from time s on: it only decays."""
+    """Bound the homogeneous part from time s on: it only decays."""
     sin_s, cos_s, _, _ = flow.half_turn(s)
     free = w - (steady.c * cos_s - steady.q * sin_s - steady.g)
     rate = z + PI * (steady.c * sin_s + steady.q * cos_s)
@@ -50,7 +50,7 @@ def _amplitude(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -> S
 
 
 def _envelope_end(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -> Scalar:
-    """A time up to which the steady response alone keeps w positive: inf if for ever, s if nothing can be said."""
+    """Find a time up to which the steady response alone keeps w positive: inf if for ever, s if nothing can be said."""
     bound = _amplitude(m, steady, w, z, s) * (1 + snap(s.dtype))
     spell = spell_after(Force(steady.c, steady.q, steady.g + bound), s)
     return jnp.where(jnp.isfinite(bound) & spell.positive, spell.end, s)
@@ -66,7 +66,7 @@ def first_return(
     patience: int | Array = PATIENCE,
     limit: Scalar | float = math.inf,
 ) -> Scalar:
-    """First s in (0, limit) with w(s) = 0 of the forced oscillator that starts at w0 >= 0, moving up or held up.
+    """Find the first zero of w in (0, limit) of the forced oscillator from w0 >= 0, moving up or held up.
 
     inf if there is none; NaN if `patience` stages do not decide it.
 
@@ -223,7 +223,7 @@ def turning_points(
 
 
 def _compared(seen: Turns, s: Scalar, w: Scalar, turns: Flag, rises: Flag) -> Turns:
-    """The turning points seen, with one more where it `turns`: a minimum where it `rises` after."""
+    """Add one turning point to those seen, where it `turns`: a minimum where it `rises` after."""
     higher, lower = turns & (w > seen.highest), rises & (w < seen.lowest)
     return Turns(
         exit=seen.exit,
@@ -238,7 +238,7 @@ def _compared(seen: Turns, s: Scalar, w: Scalar, turns: Flag, rises: Flag) -> Tu
 def exit_and_crest(
     m: Membrane, force: Force, w0: Scalar, z0: Scalar, wanted: Flag, patience: int | Array = PATIENCE
 ) -> tuple[Scalar, Scalar]:
-    """The first return of w to zero (see `first_return`), and when w is largest before.
+    """Find the first return of w to zero (see `first_return`), and when w is largest before.
 
     NaN for the crest if `patience` turning points do not get there, or if there is no telling the exit.
     """

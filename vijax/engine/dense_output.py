@@ -32,24 +32,24 @@ class Dense(eqx.Module):
     c5: Scalar
 
     def place(self, s: Scalar) -> Scalar:
-        """Position."""
+        """Compute the position."""
         return self.c0 + s * (self.c1 + s * (self.c2 + s * (self.c3 + s * (self.c4 + s * self.c5))))
 
     def rate(self, s: Scalar) -> Scalar:
-        """Derivative of the position by theta."""
+        """Differentiate the position by theta."""
         return self.c1 + s * (2 * self.c2 + s * (3 * self.c3 + s * (4 * self.c4 + s * (5 * self.c5))))
 
     def bend(self, s: Scalar) -> Scalar:
-        """Second derivative."""
+        """Differentiate it twice."""
         return 2 * self.c2 + s * (6 * self.c3 + s * (12 * self.c4 + s * (20 * self.c5)))
 
     def jerk(self, s: Scalar) -> Scalar:
-        """Third derivative."""
+        """Differentiate it three times."""
         return 6 * self.c3 + s * (24 * self.c4 + s * (60 * self.c5))
 
 
 def dense_output(h: Scalar, y0: Point, f0: Point, y1: Point, f1: Point) -> Dense:
-    """The dense output of a step of length h from the states at its ends and their derivatives."""
+    """Make the dense output of a step of length h from the states at its ends and their derivatives."""
     z, a = y0.z * h, f0.z * h * h
     rise, gain, change = y1.x - y0.x - z - 0.5 * a, y1.z * h - z - a, f1.z * h * h - a
     return Dense(
@@ -63,7 +63,7 @@ def dense_output(h: Scalar, y0: Point, f0: Point, y1: Point, f1: Point) -> Dense
 
 
 def root(function, low: Scalar, high: Scalar) -> Scalar:
-    """Root of a rising function in [low, high], by Newton's iteration with bisection where it leaves the bracket."""
+    """Find the root of a rising function in [low, high], by Newton with bisection where that leaves the bracket."""
     x = 0.5 * (low + high)
     for _ in range(_ROUNDS):
         value, slope = function(x)

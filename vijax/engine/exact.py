@@ -37,7 +37,7 @@ class Outcome(eqx.Module):
 
 
 def stick_speed(dtype: Any) -> float:
-    """Exit speed below which a chattering ball counts as stuck: 1e-9 in float64, else by the root of eps."""
+    """Give the exit speed below which a chattering ball counts as stuck: 1e-9 in float64, else by the root of eps."""
     return 1e-9 * math.sqrt(jnp.finfo(dtype).eps / jnp.finfo(jnp.float64).eps)
 
 
@@ -55,7 +55,7 @@ def _soft_contact(
     deep: bool,
     patience: int | Array,
 ):
-    """Duration (inf: for ever), outward speed -w' at the exit, and largest penetration of a contact."""
+    """Find duration (inf: for ever), outward speed -w' at the exit, and largest penetration of a contact."""
     force = flow.contact_force(pair.gamma, side, t)
     args = (wall, force, w0, z0)
     frozen = lax.stop_gradient(args)
@@ -88,7 +88,7 @@ def _crossing(s, args):
 
 
 def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, held: Flag):
-    """Outward speed after a rigid impact, whether it sticks, and for how long (inf: for ever).
+    """Find the outward speed after a rigid impact, whether it sticks, and for how long (inf: for ever).
 
     A chatter is a geometric series of bounces; what is left of it lasts 2 v/(a (1 - r)).
     """
@@ -168,7 +168,7 @@ def step(
 
 
 def start_mode(pair: ImpactPair, u: Values, v: Values, t: Values) -> Values:
-    """Contact side (0: none) of a start: inside a soft wall; on a wall by the velocity, at rest by the acceleration.
+    """Find a start's contact side (0: none): inside a soft wall; on a wall by velocity, at rest by acceleration.
 
     A rigid wall holds only a ball that rests on it and is pushed against it. Where the acceleration is zero, or as good
     as that, it counts as what it is about to be: a ball that is set free for 1e-16 of a period has no impact.
@@ -182,7 +182,7 @@ def start_mode(pair: ImpactPair, u: Values, v: Values, t: Values) -> Values:
 
 
 def tangent(pair: ImpactPair, outcome: Outcome) -> Float[Array, "2 2"]:
-    """Tangent map of one step in (du, du') at fixed times, from flight to flight, saltations included.
+    """Compute the tangent map of a step in (du, du') at fixed times, from flight to flight, saltations included.
 
     A stuck ball forgets how it came: the zero matrix.
     """

@@ -23,7 +23,7 @@ class _Scan(eqx.Module):
 
 
 def next_turn(force: Force, s: Scalar) -> Scalar:
-    """The next zero of a flight's acceleration after s."""
+    """Find the next zero of a flight's acceleration after s."""
     return spell_after(force, s).end
 
 
@@ -33,7 +33,7 @@ LONGEST_PIECE = 1.0  # a flight whose acceleration has no zero is looked at in p
 def monotone_piece(
     gamma: Scalar, force: Force, t0: Scalar, v0: Scalar, s: Scalar, v: Scalar, end: Scalar, wanted: Flag
 ) -> tuple[Scalar, Flag, Scalar]:
-    """The velocity at the end of a piece without a zero of the acceleration; whether and when the ball turns on it.
+    """Find the velocity at the end of a piece without a zero of the acceleration, and whether and when the ball turns.
 
     Args:
         gamma, t0, v0: Of the flight; `force` is its `flow.flight_force`.
@@ -57,7 +57,7 @@ def monotone_piece(
 def next_wall(
     gamma: Scalar, room: tuple[Scalar, Scalar], t0: Scalar, v0: Scalar, horizon: Scalar, wanted: Flag
 ) -> tuple[Scalar, Scalar]:
-    """Time to the first wall crossing and its side (0: none before `horizon`).
+    """Find the time to the first wall crossing and its side (0: none before `horizon`).
 
     Between zeros of the acceleration (analytic) the velocity is monotone, so each velocity zero is bracketed; between
     those the position is monotone, so each crossing is bracketed. `room` holds the room to the left and right wall.
@@ -89,7 +89,7 @@ def next_wall(
 
 
 def _beyond(gamma, room, t0, v0, heading, s):
-    """`heading` if the ball, moving that way, is past the wall there at time s, else 0."""
+    """Give `heading` if the ball, moving that way, is past the wall there at time s, else 0."""
     rise, _ = flow.flight(gamma, t0, v0, s)
     past = jnp.where(heading > 0, rise > room[1], rise < -room[0])
     return jnp.where(past & (heading != 0), heading, 0.0)

@@ -11,7 +11,7 @@ from vijax.runtime.xla import once
 
 
 def snap(dtype: Any) -> float:
-    """Two event times closer than this are one: a few units in the last place of a period."""
+    """Say how close two event times count as one: a few units in the last place of a period."""
     return 16 * float(jnp.finfo(dtype).eps)
 
 
@@ -23,7 +23,7 @@ class Spell(eqx.Module):
 
 
 def _half_width(force: Force) -> Values:
-    """Half the length of the positive stretch of c cos - q sin - g; 0 or 1 where the sign never changes."""
+    """Compute half the length of the positive stretch of c cos - q sin - g; 0 or 1 where the sign never changes."""
     amplitude = jnp.hypot(force.c, force.q)
     level = force.g / jnp.where(amplitude > 0, amplitude, 1.0)
     level = jnp.where(amplitude > 0, level, jnp.where(force.g < 0, -1.0, 1.0))
@@ -32,7 +32,7 @@ def _half_width(force: Force) -> Values:
 
 @once
 def spell_after(force: Force, s: Values) -> Spell:
-    """The sign of the forcing just after s, and the end of that stretch; an end within rounding of s counts as past."""
+    """Find the sign of the forcing just after s, and the end of that stretch; an end within rounding of s is past."""
     half = _half_width(force)
     x = s + jnp.arctan2(force.q, force.c) / PI
     x = x - 2 * jnp.round(0.5 * x)  # the positive stretch is |x| < half

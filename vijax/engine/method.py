@@ -27,12 +27,12 @@ _DECISION = "decision"
 
 
 def decided(choice: Any) -> Any:
-    """Marks what a step decides (which branch it takes, how long the next one is) to be taken once; see `repeated`."""
+    """Mark what a step decides (which branch it takes, how long the next one is) to be taken once; see `repeated`."""
     return jax.tree.map(partial(checkpoint_name, name=_DECISION), choice)
 
 
 def repeated(run: Callable[..., Any]) -> Callable[..., Any]:
-    """A run of steps that a derivative in reverse does again, with the decisions of the first time.
+    """Make a run of steps that a derivative in reverse does again, with the decisions of the first time.
 
     The compiler may round the repetition in another way. To the motion that is rounding, but the error estimate of a
     step is itself close to it: lengths came out different in the sixth digit, steps were refused that had been
@@ -68,19 +68,19 @@ class Carry(Protocol):
 
     @property
     def n(self) -> Array:
-        """Periods completed."""
+        """Count the periods completed."""
 
     @property
     def mode(self) -> Array:
-        """The wall that the ball is inside of, -1 or +1; 0 in flight."""
+        """Say which wall the ball is inside of, -1 or +1; 0 in flight."""
 
     @property
     def onset_n(self) -> Array:
-        """The period in which its last contact began."""
+        """Say in which period its last contact began."""
 
     @property
     def depth(self) -> Array:
-        """Its greatest depth in this contact so far."""
+        """Say how deep it has been in this contact so far."""
 
 
 C = TypeVar("C", bound=Carry)
@@ -130,12 +130,12 @@ class Method(eqx.Module, Generic[C]):
 
     @property
     def arithmetic(self) -> bool:
-        """Whether a step calls no library, so that it may be put into kernels (`xla.kernel`); False is never wrong."""
+        """Say whether a step calls no library, so that kernels may hold it (`xla.kernel`); False is never wrong."""
         return False
 
     @property
     def grain(self) -> Scalar | float:
-        """How far apart two motions from one point may end: 0 unless the method chooses its steps."""
+        """Say how far apart two motions from one point may end: 0 unless the method chooses its steps."""
         return 0.0
 
     def taken(self, carry: C) -> Array | None:

@@ -25,7 +25,7 @@ _FINEST = 8  # roundings: no error estimate is worth anything below
 
 
 def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype: str = "float64") -> Method | None:
-    """The method of a name, with what it is told; None for the exact one, which is told nothing.
+    """Make the method of a name, with what it is told; None for the exact one, which is told nothing.
 
     Args:
         method: "exact", "ode" or "rk4".
@@ -71,14 +71,14 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
 
 
 def describe(law: Law) -> str:
-    """A membrane law in words: its name, as `--membrane` takes it, and its numbers."""
+    """Put a membrane law in words: its name, as `--membrane` takes it, and its numbers."""
     if isinstance(law, Linear):
         return "linear"
     return f"hunt-crossley with chi {float(law.chi):g}, exponent {float(law.exponent):g}"
 
 
 def record(method: Method | None) -> dict[str, Any]:
-    """What a method was told, by name, for the attributes of a map."""
+    """Name what a method was told, for the attributes of a map."""
     if method is None:
         return {}
     told = {field.name: getattr(method, field.name) for field in dataclasses.fields(method) if field.name != "law"}

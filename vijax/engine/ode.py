@@ -115,12 +115,12 @@ class Ode(Method[Motion]):
 
     @property
     def arithmetic(self) -> bool:
-        """Whether a step calls no library: the implicit solvers leave their linear systems to LAPACK."""
+        """Say whether a step calls no library: the implicit solvers leave their linear systems to LAPACK."""
         return not self.solver.startswith("Kvaerno")
 
     @property
     def grain(self) -> Scalar | float:
-        """How far apart two motions from one point may end: steps of other lengths, each as wrong as is allowed."""
+        """Say how far apart two motions from one point may end: steps of other lengths, each as wrong as is allowed."""
         return self.rtol
 
     def taken(self, m: Motion) -> Int[Array, ""]:
@@ -222,7 +222,7 @@ class Ode(Method[Motion]):
 
 
 def _solver(engine: Ode, recorded: bool) -> Solver:
-    """diffrax's solver; its loop over stages is differentiable in reverse where a run is recorded."""
+    """Make diffrax's solver; its loop over stages is differentiable in reverse where a run is recorded."""
     solver, kind = getattr(diffrax, engine.solver), "bounded" if recorded else "lax"
     if issubclass(solver, diffrax.AbstractImplicitSolver):
         tolerances: Any = (engine.rtol, engine.atol)
@@ -231,7 +231,7 @@ def _solver(engine: Ode, recorded: bool) -> Solver:
 
 
 def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: Point, y1: Point, error: Point):
-    """Whether a step is accepted, and the length of the next; the error of position and velocity alone decides."""
+    """Say whether a step is accepted, and how long the next is; the error of position and velocity alone decides."""
     if engine.dt is not None:
         return jnp.ones_like(t0, bool), jnp.full_like(t0, engine.dt)
     controller = diffrax.PIDController(rtol=engine.rtol, atol=engine.atol)
@@ -258,7 +258,7 @@ class _Trial(eqx.Module):
 
 
 def _try(engine: Ode, solver: Solver, m: Motion, spell: Spell, recorded: bool) -> _Trial:
-    """One step of the solver, at most to the end of the period if it is recorded."""
+    """Try one step of the solver, at most to the end of the period if it is recorded."""
     h = jnp.minimum(lax.stop_gradient(m.h), _LONGEST)
     t = m.t + h
     if recorded:
@@ -285,7 +285,7 @@ class _Sight(eqx.Module):
 
 
 def _look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) -> _Sight:
-    """The first wall crossing of a step, the crest of a contact before it, or a second turning of the velocity.
+    """Find the first wall crossing of a step, the crest of a contact before it, or a second turning of the velocity.
 
     A velocity that changes sign between the ends turns once; the position is monotone up to there and from there on,
     so each crossing is bracketed, and of two the earlier is found. Where the acceleration changes sign (at most once,
@@ -354,7 +354,7 @@ def _ratio(change: Scalar, speed: Scalar) -> Scalar:
 
 
 def _meet(m: Motion, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, landing: _Landing) -> Point:
-    """The state at the event that a step has met (at its end, if none), in the coordinates of the spell after it."""
+    """Find the state at the event that a step has met (at its end, if none), in coordinates of the spell after it."""
     onset, exits, crest, delay, speed = landing.onset, landing.exits, landing.crest, landing.delay, landing.speed
     y = jax.tree.map(lambda value, slope: value + delay * slope, trial.y, trial.f)
     top = y.x + 0.5 * delay * delay * trial.f.z
@@ -371,7 +371,7 @@ def _meet(m: Motion, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, land
 
 
 def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, moved: Flag, shut: Flag):
-    """Length of the next step, the one to go on with after a cut one, and the one for after the next change of mode.
+    """Say how long the next step is, the one to go on with after a cut one, and the one after the next change of mode.
 
     A change of mode changes the scale of time: each mode goes on with the length that it had.
     """
@@ -383,7 +383,7 @@ def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, m
 
 
 def _passage(m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[Array, ""], speed: Scalar) -> Passage:
-    """The impact that ends at (t, n) with the ball leaving at a speed."""
+    """Record the impact that ends at (t, n) with the ball leaving at a speed."""
     zero, v_out = jnp.zeros_like(half), -side * speed
     impact = Impact(
         n=m.onset_n,

@@ -19,7 +19,7 @@ _QUARTER = 0.25 * EXP_REACH
 
 
 def _economised(series: list[float], low: float, high: float, terms: int) -> tuple[float, ...]:
-    """The polynomial of few terms that interpolates a power series at the Chebyshev points of [low, high]."""
+    """Find the polynomial of few terms that interpolates a power series at the Chebyshev points of [low, high]."""
     nodes = 0.5 * (low + high) + 0.5 * (high - low) * np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
     values = np.polynomial.polynomial.polyval(nodes, series)
     fit = np.polynomial.chebyshev.Chebyshev.fit(nodes, values, terms - 1, domain=[low, high])
@@ -27,7 +27,7 @@ def _economised(series: list[float], low: float, high: float, terms: int) -> tup
 
 
 def _alternating(start: int) -> list[float]:
-    """Coefficients (-1)^k/(start + 2k)! of the tail of a sine or cosine in x^2."""
+    """Compute the coefficients (-1)^k/(start + 2k)! of the tail of a sine or cosine in x^2."""
     return [(-1.0) ** k / math.factorial(start + 2 * k) for k in range(16)]
 
 
@@ -62,7 +62,7 @@ def _of(x: Lane) -> _Tables:
 @once
 @shared
 def sine_cosine(x: Lane) -> tuple[Lane, Lane]:
-    """sin and cos on |x| <= REACH."""
+    """Compute sin and cos on |x| <= REACH."""
     square = x * x
     sine = x - x * square * horner(_of(x).sine, square)
     return sine, 1 - square * (0.5 - square * horner(_of(x).cosine, square))
@@ -70,7 +70,7 @@ def sine_cosine(x: Lane) -> tuple[Lane, Lane]:
 
 @once
 def exp(x: Lane) -> Lane:
-    """exp on |x| <= EXP_REACH."""
+    """Compute exp on |x| <= EXP_REACH."""
     quarter = 0.25 * x
     quarter = 1 + quarter * (1 + quarter * horner(_of(x).exp, quarter))
     half = quarter * quarter
@@ -79,7 +79,7 @@ def exp(x: Lane) -> Lane:
 
 @once
 def phase(t: Lane) -> tuple[Lane, Lane]:
-    """sin(pi t) and cos(pi t) for t in [0, 2]."""
+    """Compute sin(pi t) and cos(pi t) for t in [0, 2]."""
     quadrant = jnp.round(2 * t)
     sine, cosine = sine_cosine(PI * (t - 0.5 * quadrant))
     odd, back = (quadrant == 1) | (quadrant == 3), (quadrant == 2) | (quadrant == 3)
@@ -88,7 +88,7 @@ def phase(t: Lane) -> tuple[Lane, Lane]:
 
 
 def arcsine(x: Lane) -> Lane:
-    """asin on [-1, 1], by asin(x) = pi/2 - 2 asin(sqrt((1 - x)/2)) beyond 1/2."""
+    """Compute asin on [-1, 1], by asin(x) = pi/2 - 2 asin(sqrt((1 - x)/2)) beyond 1/2."""
     size = jnp.abs(x)
     outer = size > 0.5
     square = jnp.where(outer, 0.5 * (1 - size), size * size)

@@ -17,7 +17,7 @@ from vijax.model import energy
 
 
 def through(contact: tuple[Lane, ...], elapsed: Lane) -> tuple[Lane, Lane, Lane, Lane]:
-    """Tangent map (row by row) of a flight and the contact after it."""
+    """Compute the tangent map (row by row) of a flight and the contact after it."""
     a, b, c, d = contact
     return a, a * elapsed + b, c, c * elapsed + d
 
@@ -54,7 +54,7 @@ class _Exit(NamedTuple):
 
 
 def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool) -> _Exit:
-    """From a rigid wall, at once."""
+    """Leave a rigid wall, at once."""
     out = wall.r * flight.speed
     # In the frame of the wall the acceleration there is -sine.
     contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * flight.sine / flight.speed, -wall.r)
@@ -65,7 +65,7 @@ def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool) -> _Exi
 
 
 def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: Lane) -> _Exit:
-    """From a membrane, after a contact."""
+    """Leave a membrane, after a contact."""
     left, depth, sure = touch(wall, flight, deep)
     duration, out = left.duration, left.speed
     leave = onset.t + duration
@@ -81,7 +81,7 @@ def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: L
 
 
 def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tangent: bool = False) -> Quick:
-    """One impact of every lane by the regular path; gamma must be 0.
+    """Take every lane one impact on by the regular path; gamma must be 0.
 
     Args:
         deep: Also find the greatest depth and the work given to the membrane.

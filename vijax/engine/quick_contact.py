@@ -61,7 +61,7 @@ Wall = RigidWall | SoftWall
 
 
 def prepare(pair: ImpactPair) -> Wall:
-    """Constants of the quick step for every cell.
+    """Compute the constants of the quick step for every cell.
 
     The size certificates, for a forcing of at most 1: while v h'(s) > h(s), up to half the free time of greatest depth
     s_a, w' stays positive (Duhamel with h' > 0), and once kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From
@@ -140,7 +140,7 @@ class _Course(eqx.Module):
 
 @once
 def _motion(wall: SoftWall, course: _Course, s: Lane) -> _Motion:
-    """The contact at time s from the course's reference."""
+    """Compute the contact at time s from the course's reference."""
     sine, cosine = sine_cosine(wall.omega1 * s)
     drive_sine, drive_cosine = sine_cosine(PI * s)
     decay = course.decay * exp(-wall.zeta * s)
@@ -162,7 +162,7 @@ def _derivatives(wall: SoftWall, w, rate, force, drive, sine, cosine, decay) -> 
 
 
 def _at_reference(wall: SoftWall, course: _Course) -> _Motion:
-    """The contact at the course's reference: no sine and no exponential is needed there."""
+    """Give the contact at the course's reference: no sine and no exponential is needed there."""
     one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
     w = course.steady_cos + course.decay * course.free_cos
     rate = PI * course.steady_sin + course.decay * (wall.omega1 * course.free_sin - wall.zeta * course.free_cos)
@@ -170,12 +170,12 @@ def _at_reference(wall: SoftWall, course: _Course) -> _Motion:
 
 
 def _in_reach(wall: SoftWall, s: Lane) -> Bool[Array, "lane"]:
-    """Whether the polynomials of `_motion` hold at s."""
+    """Say whether the polynomials of `_motion` hold at s."""
     return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
 
 
 def _course(parts: tuple[Lane, ...], cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> _Course:
-    """The contact rotated to a reference time with the given cos and sin of pi s; `free` is its free part there."""
+    """Rotate the contact to a reference time of given cos and sin of pi s; `free` is its free part there."""
     steady_cos, steady_sin, force_cos, force_sin = parts
     return _Course(
         steady_cos * cosine + steady_sin * sine,
@@ -188,7 +188,7 @@ def _course(parts: tuple[Lane, ...], cosine: Lane, sine: Lane, free: tuple[Lane,
 
 
 def _taylor(derivatives: tuple[Lane, ...], order: int, s: Lane) -> Lane:
-    """Sum of derivatives[k] s^k/(k + order)!."""
+    """Sum derivatives[k] s^k/(k + order)!."""
     return horner(tuple(d * (1 / math.factorial(k + order)) for k, d in enumerate(derivatives)), s)
 
 
@@ -220,13 +220,16 @@ class _Entry(eqx.Module):
 
     @property
     def parts(self) -> tuple[Lane, ...]:
-        """What `_course` rotates."""
+        """Give what `_course` rotates."""
         return self.steady_cos, self.steady_sin, self.force_cos, self.force_sin
 
 
 @shared
 def _entry(wall: SoftWall, flight: Flight) -> _Entry:
-    """The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin."""
+    """Find forcing and steady response as the contact begins.
+
+    The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin.
+    """
     force_cos, force_sin = -flight.sine, flight.cosine
     steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
     steady_sin = wall.gain_out * force_cos - wall.gain_in * force_sin
@@ -244,7 +247,7 @@ class _Guess(eqx.Module):
 
 @shared
 def _guess(wall: SoftWall, entry: _Entry) -> _Guess:
-    """From the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
+    """Guess from the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
     speed, square = entry.speed, wall.kappa * wall.kappa
     push = entry.force_cos - 2 * wall.zeta * speed
     jerk = -PI * entry.force_sin - 2 * wall.zeta * push - square * speed
@@ -265,7 +268,7 @@ def _guess(wall: SoftWall, entry: _Entry) -> _Guess:
 
 @shared
 def touch(wall: SoftWall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
-    """Exit of the contact, its greatest depth if asked for, and certainty that w rises once and falls once until then.
+    """Find the exit, the greatest depth if asked for, and whether w rises once and falls once until then for certain.
 
     The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
     nothing has to be evaluated there; that of a slow entry against the forcing, from the root of its cubic Taylor
@@ -308,7 +311,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None
 
 @shared
 def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: _Course) -> tuple[Lane, Bool[Array, "lane"]]:
-    """Time of the exit from the course's reference in single precision, and whether the polynomials held on the way."""
+    """Find the exit from the course's reference in single precision, and whether the polynomials held on the way."""
     free = _at_reference(wall, course)
     near = guess.hop - 0.5 * wall.span
     s = share(jnp.where(guess.short, near, householder(free.w, free.rate, free.push, free.jerk)))
@@ -322,14 +325,14 @@ def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: _Course) -
 
 @shared
 def _crest_course(wall: SoftWall, entry: _Entry) -> _Course:
-    """The contact rotated to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
+    """Rotate the contact to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
     cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
     return _course(entry.parts, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
 
 
 def _snap(wall: SoftWall, at: _Motion) -> Lane:
-    """Fourth derivative of w."""
+    """Compute the fourth derivative of w."""
     return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
 
 
@@ -337,7 +340,7 @@ def _snap(wall: SoftWall, at: _Motion) -> Lane:
 def _rough_crest(
     wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]
 ) -> tuple[Lane, Bool[Array, "lane"]]:
-    """Time of greatest depth from the free contact's, and certainty that w has no other extremum before the exit.
+    """Find when w is largest, from the free contact's time, and whether it has no other extremum before the exit.
 
     In single precision, with what is close called uncertain. `end` holds the duration and f' and f at the exit.
 
@@ -374,7 +377,7 @@ def _rough_crest(
 
 
 def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
-    """Greatest depth, and whether `crest`, its rough time from the free contact's, was close enough to tell."""
+    """Find the greatest depth, and whether `crest`, its rough time from the free contact's, was close enough for it."""
     at = share(_motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
     fourth = _snap(wall, at)
     step = share(householder(at.rate, at.push, at.jerk, fourth))

@@ -17,7 +17,7 @@ _NEAR = 64  # roundings within which an extremum may be on either side of a wall
 
 
 def _kepler(slope: Lane, goal: Lane) -> tuple[Lane, Lane, Lane, Lane]:
-    """Root y of sin y + slope y = goal nearest 0, the last step towards it, and sin and cos of y before that step."""
+    """Find the root y of sin y + slope y = goal nearest 0, the last step to it, and sin and cos of y before that."""
     p, g = single((slope, goal))
     y = jnp.clip(g / (1 + p), -2.6, 2.6)
     for _ in range(_ROUNDS):
@@ -31,7 +31,7 @@ def _kepler(slope: Lane, goal: Lane) -> tuple[Lane, Lane, Lane, Lane]:
 
 @shared
 def _reflected(y: Lane) -> tuple[Lane, Lane]:
-    """sin and cos on |y| <= pi + 0.08."""
+    """Compute sin and cos on |y| <= pi + 0.08."""
     size = jnp.abs(y)
     beyond = size > 0.5 * PI
     sine, cosine = sine_cosine(jnp.where(beyond, PI - size, size))
@@ -60,7 +60,7 @@ class _Stretch(NamedTuple):
 
 
 def _stretch(half: Lane, u: Lane, p: Lane, ahead: Lane, cosine: Lane) -> _Stretch:
-    """By comparing extrema with the walls, in single precision: what is closer than that can tell is in doubt.
+    """Find the stretch by comparing extrema with the walls, in single precision: what is closer than that is in doubt.
 
     The centre of the first stretch is a time `ahead`.
     """
@@ -90,7 +90,7 @@ def _stretch(half: Lane, u: Lane, p: Lane, ahead: Lane, cosine: Lane) -> _Stretc
 
 @shared
 def fly(half: Lane, lane: Ball) -> Flight:
-    """First wall crossing without gravity: pick the one monotone stretch that holds it, then Kepler's equation.
+    """Find the first wall crossing without gravity: pick the monotone stretch that holds it, then Kepler's equation.
 
     u' = (p + sin pi t)/pi. For |p| < 1 the extrema are closed-form, and each period lifts them by 2p/pi, so comparing
     two of them with the walls and one division give the crossing's stretch. About the centre of a stretch the crossing

@@ -62,7 +62,7 @@ class Rk4(Method[Motion]):
 
     @property
     def arithmetic(self) -> bool:
-        """Whether a step calls no library: it does not."""
+        """Say whether a step calls no library: it does not."""
         return True
 
     def most_steps(self, periods: int, max_impacts: int) -> int:
@@ -133,7 +133,7 @@ class Rk4(Method[Motion]):
 
 
 def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Motion) -> Motion:
-    """The next sample and the tangent map up to it; what the contact has seen is still that of the last one."""
+    """Compute the next sample and the tangent map up to it; what the contact has seen is still that of the last one."""
     h = 2 / steps
     move = partial(_runge_kutta, pair, wall, m.offset + m.k * h, h)
     u, v = share(move(m.u, m.v))
@@ -149,7 +149,7 @@ def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Motion) -> Motion:
 
 
 def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Real, u: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
-    """One classical step; every stage is in contact if it lies beyond the wall."""
+    """Take one classical step; every stage is in contact if it lies beyond the wall."""
 
     def push(forcing, u, v):
         side = jnp.where(u < 0, -1.0, 1.0)
@@ -166,14 +166,14 @@ def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Real, u: Scalar, v:
 
 
 def _power(pair: ImpactPair, wall: Wall, u: Scalar, v: Scalar) -> Scalar:
-    """Power into the membrane at a sample inside; 0 at one outside."""
+    """Compute the power into the membrane at a sample inside; 0 at one outside."""
     along = jnp.where(u < 0, -v, v)
     depth = jnp.abs(u) - 0.5 * pair.d
     return jnp.where(depth >= 0, -wall(depth, along) * along, 0.0)
 
 
 def _passage(m: Motion, side: Int[Array, ""], t: Scalar) -> Passage:
-    """The impact on a wall that ends with this sample, the first one outside, at a time t."""
+    """Record the impact on a wall that ends with this sample, the first one outside, at a time t."""
     impact = Impact(
         n=m.onset_n,
         t=m.onset_t,

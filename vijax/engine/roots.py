@@ -16,7 +16,7 @@ _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def implicit_root(residual: Callable, root: Scalar, args: Any) -> Scalar:
-    """`root` as a function of `args` by residual(root, args) = 0: value unchanged, derivatives of every order right.
+    """Make `root` a function of `args` by residual(root, args) = 0: value unchanged, derivatives of every order right.
 
     The tangent rule calls itself on the root, so second derivatives are right too (one Newton step would not do).
     """
@@ -33,7 +33,7 @@ def _implicit_root_jvp(residual, primals, tangents):
 
 
 def bracketed_root(function: Callable, low: Scalar, high: Scalar, guess: Scalar, wanted: Flag) -> Scalar:
-    """The root in [low, high] of a function positive at low, not positive at high: Newton inside a bracket.
+    """Find the root in [low, high] of a function positive at low, not positive at high: Newton inside a bracket.
 
     A Newton step that leaves the bracket, or a bracket that does not halve in two rounds, falls back to bisection.
     `function(x)` returns value and derivative. `low` itself may be a root (a flight or contact begins there).
@@ -65,19 +65,19 @@ def bracketed_root(function: Callable, low: Scalar, high: Scalar, guess: Scalar,
 
 
 def converged_step(eps: Any) -> float:
-    """Largest last step, times the stiffness, after which a fourth-order iteration is off by eps."""
+    """Give the largest last step, times the stiffness, after which a fourth-order iteration is off by eps."""
     return float(eps) ** 0.25
 
 
 def householder(f: Values, f1: Values, f2: Values, f3: Values) -> Values:
-    """Step of the fourth-order root iteration from f and its first three derivatives; one division."""
+    """Compute the step of the fourth-order root iteration from f and its first three derivatives; one division."""
     slope, bent = f1 * f1, f * f2
     return -f * (6 * slope - 3 * bent) / (6 * f1 * (slope - bent) + f * f * f3)
 
 
 @shared
 def single(tree: Any) -> Any:
-    """Floating leaves in single precision.
+    """Turn floating leaves to single precision.
 
     An iteration of fourth order needs double precision in the last one alone: the others cost a quarter as much.
     """

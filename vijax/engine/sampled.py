@@ -60,7 +60,7 @@ class _Pass(NamedTuple):
 
 
 def _powers(re: Rows, im: Rows) -> tuple[Powers, Powers]:
-    """Powers 1 to _SAMPLES of a complex number per lane, by doubling."""
+    """Compute powers 1 to _SAMPLES of a complex number per lane, by doubling."""
     real, imaginary = re[None], im[None]
     while real.shape[0] < _SAMPLES:
         more = (real * re - imaginary * im, real * im + imaginary * re)
@@ -71,12 +71,12 @@ def _powers(re: Rows, im: Rows) -> tuple[Powers, Powers]:
 
 @shared
 def _least(samples: Samples) -> Lane:
-    """Smallest of each lane: a chain over whole rows is one vector loop, XLA's reduction a scalar one."""
+    """Find the smallest of each lane: a chain over whole rows is one vector loop, XLA's reduction a scalar one."""
     return reduce(jnp.minimum, samples)
 
 
 def _safe(gap: Lane, rate: Lane, bend: Lane) -> Lane:
-    """Time before which a positive gap that changes at `rate` cannot close if its second derivative is above -bend."""
+    """Find a time before which a gap that changes at `rate` cannot close if its second derivative is above -bend."""
     return (rate + jnp.sqrt(jnp.maximum(rate * rate + 2 * bend * gap, 0.0))) / bend
 
 
@@ -88,13 +88,13 @@ class _Crossing(NamedTuple):
 
 
 def _curb(bend: Samples, fourth: Lane, h: Lane) -> Float[Array, "interval lane"]:
-    """h^2/2 times a bound of |g"| between samples of g", by their chord and a bound of its second derivative."""
+    """Bound h^2/2 |g"| between samples of g", by their chord and a bound of its second derivative."""
     size = jnp.abs(bend)
     return 0.5 * h * h * (jnp.maximum(size[:-1], size[1:]) + 0.125 * h * h * fourth)
 
 
 def _first_crossing(gap: Samples, curb: Float[Array, "interval lane"], slack: Lane) -> _Crossing:
-    """`slack` is the rounding of a sample."""
+    """Find the first crossing among samples; `slack` is the rounding of one."""
     order = jnp.arange(_SAMPLES - 1, dtype=gap.dtype)[:, None]
     root = share(jnp.sqrt(jnp.maximum(gap - slack, 0.0)))
     clear = root[:-1] + root[1:] > jnp.sqrt(curb)
@@ -123,7 +123,7 @@ def _search(advance: Callable[[_Pass], _Pass], like: Lane) -> _Pass:
 
 
 def _next(at: _Pass, s: Samples, h: Lane, crossing: _Crossing, side: Lane, gap: Samples, crest: _Crest) -> _Pass:
-    """The record after a pass: at the crossing, or at the first doubt, or at the end; crossings found are kept."""
+    """Note a pass: the record stands at the crossing, the first doubt, or the end; crossings found are kept."""
     index = jnp.minimum(crossing.closes, crossing.doubt)
     doubtful = crossing.doubt < crossing.closes
     zoom = jnp.where(doubtful, at.zoom * _ZOOM, jnp.minimum(at.zoom / _ZOOM, 1.0))
@@ -201,7 +201,7 @@ def _contact(m: Membrane, force: Force, speed: Lane) -> _Contact:
 
 @shared
 def _turned(c: _Contact, s: Rows) -> tuple[Rows, Rows, Force]:
-    """Free part and steady response of the contact with their clocks started at s."""
+    """Start the clocks of the contact's free part and steady response at s."""
     decay, turn = jnp.exp(-c.m.zeta * s), c.m.omega1 * s
     cosine, sine = share((decay * jnp.cos(turn), decay * jnp.sin(turn)))
     along, across = c.free_cos * cosine + c.free_sin * sine, c.free_sin * cosine - c.free_cos * sine
@@ -217,7 +217,7 @@ def _state(c: _Contact, turned: tuple[Rows, Rows, Force]) -> tuple[Rows, Rows]:
 
 @shared
 def _step(c: _Contact, s: Zeros, w: Zeros, z: Zeros) -> tuple[Zeros, tuple[Zeros, ...]]:
-    """Fourth-order step towards a zero of w (first row) or w' (second row), and the derivatives it is made of."""
+    """Compute the fourth-order step towards a zero of w (first row) or w' (second row), and the derivatives in it."""
     later, square = c.force.later(s), c.m.kappa * c.m.kappa
     push = later.c - later.g - c.m.mu * z - square * w
     jerk = -PI * later.q - c.m.mu * push - square * z
@@ -229,7 +229,7 @@ def _step(c: _Contact, s: Zeros, w: Zeros, z: Zeros) -> tuple[Zeros, tuple[Zeros
 
 
 def _polish(c: _Contact, s: Zeros) -> tuple[Zeros, Zeros, tuple[Zeros, ...]]:
-    """The exit, a zero of w, near the first row of s, and the crest, a zero of w', near its second, if it has one.
+    """Find the exit, a zero of w, near the first row of s, and the crest, a zero of w', near its second, if any.
 
     With the last step towards each, and the derivatives of w before that step. The second iteration's closed form is
     the careful one, which loses nothing in short contacts and at resonance.
@@ -242,7 +242,7 @@ def _polish(c: _Contact, s: Zeros) -> tuple[Zeros, Zeros, tuple[Zeros, ...]]:
 
 
 def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, Lane, Lane | None, Mask]:
-    """Duration of the contact, outward speed, greatest depth if asked for, and certainty."""
+    """Find duration of the contact, outward speed, greatest depth if asked for, and certainty."""
     eps = jnp.finfo(speed.dtype).eps
     c = _contact(m, force, speed)
     free_size, steady_size = jnp.hypot(c.free_cos, c.free_sin), jnp.hypot(c.steady.c, c.steady.q)
@@ -293,13 +293,13 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
 
 
 def _higher_of(one: tuple[Lane, Lane], other: tuple[Lane, Lane]) -> tuple[Lane, Lane]:
-    """The higher of two samples with its time, the first of equals: heights may differ in rounding where they recur."""
+    """Take the higher of two samples with its time, the first of equals: heights that recur may differ in rounding."""
     return jax.tree.map(partial(jnp.where, other[0] > one[0]), other, one)
 
 
 @shared
 def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: Lane, last: Lane) -> _Crest:
-    """The highest sample so far.
+    """Find the highest sample so far.
 
     Where w" < 0 the samples around the highest hold one maximum, its own. `change` bounds that of w" over a step.
     """
@@ -320,7 +320,7 @@ def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: L
 def sampled_step(
     pair: ImpactPair, lane: Ball, arrival: Arrival | None = None, *, deep: bool = False, tangent: bool = False
 ) -> tuple[Hit, Mask]:
-    """One impact of every lane by certified sampling.
+    """Take every lane one impact on by certified sampling.
 
     Args:
         arrival: The end of the flight, where a cheaper way to it is known.

@@ -76,24 +76,24 @@ class Harvester(eqx.Module):
     @property
     @door
     def k(self) -> Real:
-        """Stiffness of the membrane, m_b omega0^2 [N/m]."""
+        """Compute the stiffness of the membrane, m_b omega0^2 [N/m]."""
         return self.m_b * self.omega0**2
 
     @property
     @door
     def length_unit(self) -> Real:
-        """Metres per unit of u: A pi^2/omega^2."""
+        """Compute metres per unit of u: A pi^2/omega^2."""
         return self.A * (math.pi / self.omega) ** 2
 
     @property
     @door
     def speed_unit(self) -> Real:
-        """Metres per second per unit of u': A pi/omega."""
+        """Compute metres per second per unit of u': A pi/omega."""
         return self.A * (math.pi / self.omega)
 
     @property
     def depth_limit(self) -> Real:
-        """Largest admissible penetration [m]."""
+        """Compute the largest admissible penetration [m]."""
         return self.R0 if self.penetration_limit is None else self.penetration_limit
 
     @door

@@ -38,7 +38,7 @@ class Membrane(eqx.Module):
 
     @property
     def mu(self) -> Values:
-        """Damping mu = 2 zeta of w'' + mu w' + kappa^2 w = f."""
+        """Compute the damping mu = 2 zeta of w'' + mu w' + kappa^2 w = f."""
         return 2 * self.zeta
 
 

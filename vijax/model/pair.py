@@ -40,25 +40,28 @@ class ImpactPair(eqx.Module):
 
     @property
     def rigid(self) -> bool:
-        """Whether the walls are rigid: a static choice, which no compiled program asks twice."""
+        """Say whether the walls are rigid: a static choice, which no compiled program asks twice."""
         return self.kappa is None
 
     @property
     @door
     def mu(self) -> Float[AnyArray, "..."]:
-        """Damping of w'' + mu w' + kappa^2 w = f, by the calibration of Eq. (19)."""
+        """Compute the damping of w'' + mu w' + kappa^2 w = f, by the calibration of Eq. (19)."""
         return 2 * self.zeta
 
     @property
     @door
     def zeta(self) -> Float[AnyArray, "..."]:
-        """Decay rate mu/2 of a free contact."""
+        """Compute the decay rate mu/2 of a free contact."""
         return self._soft_kappa() * damping_ratio(self.r)
 
     @property
     @door
     def omega1(self) -> Float[AnyArray, "..."]:
-        """Damped frequency sqrt(kappa^2 - zeta^2) = kappa pi/sqrt(pi^2 + ln^2 r): from r, as the difference cancels."""
+        """Compute the damped frequency sqrt(kappa^2 - zeta^2).
+
+        It comes from r, as kappa pi/sqrt(pi^2 + ln^2 r): the difference would cancel.
+        """
         return self._soft_kappa() * math.pi / jnp.sqrt(math.pi**2 + jnp.log(self.r) ** 2)
 
     def _soft_kappa(self) -> Float[AnyArray, "..."]:
@@ -97,13 +100,13 @@ class MembranePair(eqx.Module):
     @property
     @door
     def length_unit(self) -> Float[AnyArray, "..."]:
-        """Units of u per unit of x: d."""
+        """Give units of u per unit of x: d."""
         return (self.omega_star / math.pi) ** 2 / self.A_star
 
     @property
     @door
     def time_unit(self) -> Float[AnyArray, "..."]:
-        """Units of t per unit of t*: 1/kappa."""
+        """Compute units of t per unit of t*: 1/kappa."""
         return self.omega_star / math.pi
 
 

@@ -53,29 +53,29 @@ class Quantity:
 
     @property
     def constant(self) -> str:
-        """The constant of the device that it decides."""
+        """Name the constant of the device that it decides."""
         return self.alias_of or self.name
 
     @property
     def long_name(self) -> str:
-        """What it is, with the formula."""
+        """Say what it is, with the formula."""
         return f"{self.text}, {self.formula}" if self.formula else self.text
 
     @property
     def cf(self) -> str:
-        """The unit as datasets write it: m s-2."""
+        """Write the unit as datasets do: m s-2."""
         above, _, below = (self.unit or "1").partition("/")
         unit, _, power = below.partition("^")
         return f"{above} {unit}-{power or 1}" if below else above
 
     @property
     def attributes(self) -> dict[str, str]:
-        """Attributes of a coordinate of a dataset."""
+        """Name the attributes of a coordinate of a dataset."""
         return {"units": self.cf, "long_name": self.long_name, "symbol": self.symbol or self.name}
 
     @property
     def remedy(self) -> str:
-        """What an error says to do about a value that it cannot have."""
+        """Say, as an error does, what to do about a value that it cannot have."""
         return self.advice or f"it is the {self.text} in {self.unit}"
 
 
@@ -239,7 +239,7 @@ class Measured(NamedTuple):
 
     @property
     def attributes(self) -> dict[str, str]:
-        """Attributes of a variable of a dataset."""
+        """Name the attributes of a variable of a dataset."""
         return {"units": self.units, "long_name": self.text}
 
 

@@ -29,7 +29,7 @@ class Status(enum.IntEnum):
 
     @property
     def advice(self) -> str:
-        """What to do about it, in a sentence."""
+        """Say what to do about it, in a sentence."""
         return _ADVICE[self]
 
     def __repr__(self) -> str:

@@ -63,17 +63,17 @@ class Arc(eqx.Module):
     max_corrections: int = eqx.field(static=True)
 
     def at(self, x: Values) -> ImpactPair:
-        """The pair at a value of the parameter."""
+        """Give the pair at a value of the parameter."""
         return moved(self.pair, self.along, x, self.start, self.steepest)
 
 
 def unpack(arc: Arc, y):
-    """Knots and parameter of a point of the curve, or of many along leading axes."""
+    """Split a point of the curve, or many along leading axes, into knots and parameter."""
     return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (arc.high - arc.low)
 
 
 def _equations(arc: Arc, y) -> shooting.Linear:
-    """Gap and its derivatives in knots and parameter."""
+    """Compute the gap and its derivatives in knots and parameter."""
     knots, x = unpack(arc, y)
     pair, moved = jax.jvp(arc.at, (x,), (arc.high - arc.low,))
     return shooting.linearise(pair, arc.sequence, knots, moved)
@@ -89,7 +89,7 @@ class _Arrival(NamedTuple):
 
 
 def _correct(arc: Arc, guess, former) -> _Arrival:
-    """Newton in the plane across the former tangent, and the tangent there."""
+    """Correct by Newton in the plane across the former tangent, and find the tangent there."""
     ahead = jnp.zeros_like(guess).at[-1].set(1.0)
 
     def once(at: _Arrival) -> _Arrival:
@@ -148,7 +148,7 @@ def _compiled(arcs: Arc, y, tangent, length):
 
 
 def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> Place:
-    """From points of branches on by an arclength each: the compiled program behind every step and every search."""
+    """Go on from points of branches by an arclength each: the compiled program behind every step and every search."""
     parts = []
     for tile in tiles.tiles(y.shape[0], _BATCHES):
         rows = jax.tree.map(lambda leaf, rows=tile.rows: np.asarray(leaf)[rows], (arcs, y, tangent, length))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @door
 def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Dataset":
-    """Branches as one dataset: what every orbit is, and what was met, padded with NaN.
+    """Make one dataset of branches: what every orbit is, and what was met, padded with NaN.
 
     Args:
         branches: Along one parameter.
@@ -62,7 +62,7 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
 
 
 def _constants(branch: Branch) -> "dict[str, tuple]":
-    """The parameters that do not move."""
+    """Name the parameters that do not move."""
     still = [name for name in ("d", "kappa", "r", "gamma") if name not in MOVED[branch.along]]
     pair = {name: getattr(branch.orbit.pair, name) for name in still}
     return {name: ((), float(values[0]), AXES[name].attributes) for name, values in pair.items() if values is not None}
@@ -80,7 +80,7 @@ _ABOUT = {
 
 
 def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
-    """What the dataset holds of a branch, a row a point."""
+    """Lay out what the dataset holds of a branch, a row a point."""
     if branch.along not in ImpactPair.__dataclass_fields__:
         device = with_constants(device, **{branch.along: tiles.arrays(branch.values[:, None])})
     hits, label = orbit_properties.impacts(branch.orbit), orbit_properties.counts(branch.orbit)
@@ -104,14 +104,14 @@ def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
 
 
 def _places(branch: Branch) -> np.ndarray:
-    """Index of the orbit nearest to each thing met: on the right sheet, where a fold has made several."""
+    """Find the orbit nearest to each thing met: on the right sheet, where a fold has made several."""
     passed = np.column_stack([np.asarray(orbit_properties.marks(branch.orbit)), branch.values])
     met = [np.append(np.asarray(orbit_properties.marks(point.orbit))[0], point.value) for point in branch.points]
     return np.array([np.abs(passed - traits).sum(axis=1).argmin() for traits in met], dtype=float)
 
 
 def _padded(rows: list[np.ndarray]) -> np.ndarray:
-    """Arrays of several shapes as one, NaN beyond each."""
+    """Stack arrays of several shapes, NaN beyond each."""
     shape = np.max([row.shape for row in rows], axis=0)
     table = np.full((len(rows), *shape), np.nan)
     for index, row in enumerate(rows):

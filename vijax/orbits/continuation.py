@@ -45,7 +45,7 @@ class Branch(NamedTuple):
 
     @property
     def stable(self) -> np.ndarray:
-        """Whether each orbit attracts."""
+        """Say whether each orbit attracts."""
         return np.abs(np.asarray(self.orbit.multipliers)).max(axis=1) < 1
 
 
@@ -93,7 +93,7 @@ def follow(
 def set_out(
     orbit: Orbit, along: str, within: tuple[float, float], device: Harvester | None, settings: ContinuationSettings
 ):
-    """Arcs and unknowns of the starts; what cannot be followed is refused."""
+    """Make arcs and unknowns of the starts; refuse what cannot be followed."""
     if not len(check_orbit(orbit)):
         raise ValueError("orbit must hold an orbit to follow; got none; search with more guesses")
     if (np.asarray(orbit.status) != Status.OK).any():
@@ -128,14 +128,14 @@ def set_out(
 
 
 def heading(place: Place, sign: float) -> Place:
-    """The place, facing the other way where the sign is negative; the fold's test function turns with it."""
+    """Turn the place the other way where the sign is negative; the fold's test function turns with it."""
     tests = place.tests.copy()
     tests[:, FOLD] *= sign
     return place._replace(tangent=sign * place.tangent, tests=tests)
 
 
 def follow_arcs(arcs: Arc, first: Place, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
-    """One way from every start: all lanes together until none goes on; a step that does not do is halved."""
+    """Follow one way from every start: all lanes together until none goes on; a step that does not do is halved."""
     lanes, bend = first.y.shape[0], 1 - settings.min_cosine
     passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]
     y, tangent, tests = first.y, first.tangent, first.tests
@@ -168,7 +168,7 @@ def follow_arcs(arcs: Arc, first: Place, along: str, points: int, settings: Cont
 
 
 def _branch(arc: Arc, rows: list[tuple], along: str, end: str, settings: ContinuationSettings) -> Branch:
-    """A lane's record as a branch: what was met between its points, and where it ends."""
+    """Make a branch of a lane's record: what was met between its points, and where it ends."""
     y, tangent, tests, lengths = (np.array(column) for column in zip(*rows, strict=True))
     last, met, ys = len(rows), [], y
     found = events(arc, y, tangent, tests, lengths, settings)
@@ -186,7 +186,7 @@ def _branch(arc: Arc, rows: list[tuple], along: str, end: str, settings: Continu
 
 
 def _joined(down: Branch, up: Branch) -> Branch:
-    """Two ways from one start as one branch, from end to end; where it closes one way is all of it."""
+    """Join two ways from one start to one branch, from end to end; where it closes one way is all of it."""
     if down.ends[1] == "closed":
         return down
     orbit = periodic.concatenate([down.orbit[::-1], up.orbit[1:]])

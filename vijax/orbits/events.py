@@ -32,12 +32,12 @@ class Point(NamedTuple):
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Which test functions change sign."""
+    """Say which test functions change sign."""
     return np.sign(before) * np.sign(after) < 0
 
 
 def happenings(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """How many things happen between two points; a multiplier that passes +1 at a fold is one of them."""
+    """Count what happens between two points; a multiplier that passes +1 at a fold is one such thing."""
     passed = Tests(*changed(before, after).T)
     ends = np.any(passed[FIRST_END:], axis=0)
     return (passed.fold | passed.plus).astype(int) + passed.minus + ends
@@ -53,7 +53,7 @@ class _Event(NamedTuple):
 
 
 def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings) -> list[_Event]:
-    """What happens between neighbours, up to the first thing that ends the branch."""
+    """Find what happens between neighbours, up to the first thing that ends the branch."""
     index, test = np.nonzero(changed(tests[:-1], tests[1:]))
     if not index.size:
         return []
@@ -78,7 +78,7 @@ def _locate(
     low_f: np.ndarray,
     settings: ContinuationSettings,
 ):
-    """Arclengths from points of a branch at which test functions vanish, the points, and which are zeros, no poles."""
+    """Find arclengths from points of a branch at which test functions vanish, the points, and which are no poles."""
     rows = np.arange(test.size)
     arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
 
@@ -108,7 +108,7 @@ def _locate(
 
 
 def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray, settings: ContinuationSettings) -> str:
-    """What a sign change means for this orbit."""
+    """Say what a sign change means for this orbit."""
     test = event.test
     if test in _GRAZING:
         return f"grazing {_GRAZING[test]}"
@@ -124,7 +124,7 @@ def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray, settings: Continuat
 
 
 def orbits_at(arc: Arc, ys: np.ndarray) -> Orbit:
-    """Points of a branch as orbits, verified."""
+    """Make orbits of points of a branch, verified."""
     wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), arc)
     knots, x = unpack(wide, ys)
     return periodic.proven(wide.at(x), wide.sequence, knots)

@@ -35,7 +35,7 @@ class _Flight(eqx.Module):
 
 
 def _flight_room(pair: ImpactPair, side, speed, t, length, real):
-    """Least distance from a wall at a turning point of the flight that follows a contact.
+    """Find the least distance from a wall at a turning point of the flight that follows a contact.
 
     Between zeros of the acceleration the velocity is monotone, so that no turning point is missed.
     """
@@ -61,7 +61,7 @@ class Between(NamedTuple):
 
 
 def _contact(pair: ImpactPair, side, knot, real):
-    """When a contact is deepest, and its least penetration at a minimum inside where there is one."""
+    """Find when a contact is deepest, and its least penetration at a minimum inside where there is one."""
     t, speed, stay = knot
     zero, wanted = jnp.zeros_like(t), real & (stay > 0)
     force = flow.contact_force(pair.gamma, side, t)
@@ -72,7 +72,7 @@ def _contact(pair: ImpactPair, side, knot, real):
 
 
 def between(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Between:
-    """The motion of an orbit between its onsets; clearances are the least over its impacts, NaN if they are not known.
+    """Find the motion of an orbit between its onsets; clearances are the least of all impacts, NaN if not known.
 
     Every turning point is visited, as the engine does it: of the hundreds in a long contact samples would miss the one
     that decides.

@@ -26,7 +26,7 @@ class Curve(NamedTuple):
 
 @door
 def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48) -> Curve:
-    """The motion from the first of successive impacts to the end of the last, in closed form.
+    """Lay the motion from the first of successive impacts to the end of the last on a curve, in closed form.
 
     Args:
         pair: The cell, every field a scalar.
@@ -54,7 +54,7 @@ def curve(pair: ImpactPair, t, side, v_in, v_out, duration, *, samples: int = 48
 
 @door
 def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
+    """Compute displacement and velocity at times `when`, of the impacts that `curve` takes; NaN before the first."""
     check_pair(pair)
     when = checks.numbers("when", when)
     if when.ndim != 1:
@@ -68,7 +68,7 @@ def states(pair: ImpactPair, t, side, v_in, v_out, duration, *, when) -> tuple[n
 
 
 def _padded(**given) -> tuple[list[np.ndarray], int]:
-    """Rows without what is not there, repeated to a power of two, as every new length would compile anew."""
+    """Leave out what is not there; repeat rows to a power of two, as every new length would compile anew."""
     shape = checks.numbers("t", given["t"], some=False).shape
     rows = [_row(name, row, shape) for name, row in given.items()]
     there = np.isfinite(rows[0])
@@ -78,7 +78,7 @@ def _padded(**given) -> tuple[list[np.ndarray], int]:
 
 
 def _row(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """One number an impact; there may be none."""
+    """Take one number an impact; there may be none."""
     row = checks.numbers(name, values, some=False).astype(float)
     if row.ndim != 1 or row.shape != shape:
         raise ValueError(f"{name} must be a 1-D array of as many numbers as t; got shape {row.shape}")
@@ -87,7 +87,7 @@ def _row(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 @jax.jit
 def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, Array]:
-    """The ball a time after each impact."""
+    """Compute where the ball is a time after each impact."""
     inside = when - t <= duration
     u, v = jax.vmap(partial(_contact, pair))(t, side, v_in, jnp.where(inside, when - t, 0.0))
     rise, speed = flow.flight(pair.gamma, t + duration, v_out, jnp.where(inside, 0.0, when - t - duration))
@@ -96,7 +96,7 @@ def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, 
 
 @partial(jax.jit, static_argnames="samples")
 def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int) -> tuple[Array, ...]:
-    """(t, u, v) [impact, 2 samples] in each contact and in the flight after it, up to the time `until`."""
+    """Compute (t, u, v) [impact, 2 samples] in each contact and in the flight after it, up to the time `until`."""
     parts = jnp.linspace(0.0, 1.0, samples)
     held, aloft = duration[:, None] * parts, (until - t - duration)[:, None] * parts
     over_parts = jax.vmap(partial(_contact, pair), in_axes=(None, None, None, 0))
@@ -108,7 +108,7 @@ def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int
 
 
 def _contact(pair: ImpactPair, t, side, v_in, s) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Displacement and velocity a time s after an onset; on a rigid wall, where only sticking lasts, at rest."""
+    """Compute displacement and velocity a time s after an onset; at rest on a rigid wall, where only sticking lasts."""
     if pair.rigid:
         return 0.5 * side * pair.d, jnp.where(s > 0, 0.0, v_in)
     w, z = flow.oscillate(

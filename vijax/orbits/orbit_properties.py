@@ -32,7 +32,7 @@ class Counts(NamedTuple):
 
 @door
 def counts(orbit: Orbit) -> Counts:
-    """What is in the label of each orbit, over the smallest whole number of periods after which it recurs."""
+    """Count what is in the label of each orbit, over the fewest whole periods after which it recurs."""
     full = jax.tree.map(np.asarray, unfolded(orbit))
     side, number = full.sequence.side, full.count
     period = np.round(0.5 * full.sequence.span).astype(int)
@@ -52,20 +52,20 @@ def counts(orbit: Orbit) -> Counts:
 
 @door
 def labels(orbit: Orbit) -> np.ndarray:
-    """Names n:m/pT of orbits."""
+    """Name orbits n:m/pT."""
     found = counts(orbit)
     return label(found.period, found.left, found.right)
 
 
 @door
 def impacts(orbit: Orbit) -> Impact:
-    """The impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
+    """List the impacts of the full orbits in order, along the last axis; NaN and side 0 where padded."""
     return tiles.arrays(tiles.map_tiles(_hits, unfolded(orbit), TILES))
 
 
 @jax.jit
 def _hits(full: Orbit) -> Impact:
-    """The impacts of orbits that are in full."""
+    """Compute the impacts of orbits that are in full."""
     passage = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots)
     side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
     phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
@@ -84,7 +84,7 @@ def _hits(full: Orbit) -> Impact:
 
 @door
 def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
-    """Energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
+    """Compute the energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
 
     Args:
         device: Gives A and omega (the unit of length), omega0 where walls are rigid, and the electrical constants.
@@ -100,7 +100,7 @@ def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
 
 @door
 def depth_unit(orbit: Orbit, device: Harvester) -> Any:
-    """Metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
+    """Give the metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
     if orbit.pair.rigid:
         return device.length_unit * device.omega / (flow.PI * device.omega0)
     return device.length_unit
@@ -108,7 +108,7 @@ def depth_unit(orbit: Orbit, device: Harvester) -> Any:
 
 @door
 def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The motion of full orbits to draw: `samples` instants of every contact and of every flight.
+    """Compute the motion of full orbits to draw: `samples` instants of every contact and of every flight.
 
     Returns:
         Time, displacement and velocity, each [orbit, instant], in order; NaN where padded. Velocity jumps at a rigid
@@ -124,7 +124,7 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
 
 @partial(jax.jit, static_argnames="samples")
 def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
-    """(t, u, v) [orbit, impact, instant] of orbits that are in full."""
+    """Compute (t, u, v) [orbit, impact, instant] of orbits that are in full."""
     until = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots).next_t
     hits, t = _hits(full), full.knots[..., 0]
     side = hits.side.astype(t.dtype)
@@ -133,7 +133,7 @@ def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
 
 @door
 def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
-    """Sums over the impacts that tell orbits of one pair apart, mirror images too."""
+    """Sum over the impacts what tells orbits of one pair apart, mirror images too."""
     t, speed, stay = np.moveaxis(np.asarray(orbit.knots), -1, 0)
     signed = np.asarray(orbit.sequence.side) * speed
     # Odd harmonics are alike for mirror images, (side, t) -> (-side, t + 1); even ones change sign.

@@ -27,7 +27,7 @@ _MOST_IMPACTS, _MOST_SEQUENCES, _MOST_GUESSES = 64, 10_000, 10**7
 def from_state(
     pair: ImpactPair, u: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, *, period: int = 1, settle: int = 0
 ) -> Orbit:
-    """Periodic orbits near some states: each is flown once around to learn its impacts, then corrected by Newton.
+    """Find periodic orbits near states: each is flown once around to learn its impacts, then corrected by Newton.
 
     Args:
         pair: One cell, or one a state.
@@ -71,7 +71,7 @@ def from_state(
 
 @door
 def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
-    """Every orbit found with a given impact sequence, stable or unstable, from random guesses.
+    """Search every orbit with a given impact sequence, stable or unstable, from random guesses.
 
     Args:
         pair: One cell.
@@ -105,7 +105,7 @@ def check_guesses(guesses: Any, sequences: int) -> None:
 
 
 def sequences(impacts: str, period: int | None = None) -> tuple[list[tuple[int, ...]], int]:
-    """Cyclically distinct sequences of walls that a text asks for, and the period; see `search`."""
+    """List the cyclically distinct sequences of walls that a text asks for, and the period; see `search`."""
     walls = {"L": -1, "R": 1}
     match = (
         re.fullmatch(r"[LRlr]+|([0-9]+):([0-9]+)(?:/([1-9][0-9]*)T)?", impacts) if isinstance(impacts, str) else None
@@ -126,7 +126,7 @@ def sequences(impacts: str, period: int | None = None) -> tuple[list[tuple[int, 
 
 
 def _number(impacts: str, digits: str) -> int:
-    """A number of a label; thousands of digits are more than Python takes for one."""
+    """Read a number of a label; thousands of digits are more than Python takes for one."""
     return checks.whole(f"impacts {checks.shown(impacts)}: each number", int(digits[:10]), 0, _MOST_PERIOD)
 
 
@@ -140,7 +140,7 @@ def _check_count(impacts: str, count: int, orders: int) -> None:
 
 
 def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int, draw: np.random.Generator) -> Orbit:
-    """Orbits of one sequence from random guesses: times in any proportion, speeds up to what the forcing can give."""
+    """Search orbits of one sequence: random times in any proportion, speeds up to what the forcing can give."""
     count = len(walls)
     gaps = draw.dirichlet(np.ones(count), guesses) * 2 * period
     t = draw.uniform(0, 2, (guesses, 1)) + np.cumsum(gaps, axis=1) - gaps[:, :1]
@@ -154,7 +154,7 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
 
 @door
 def distinct(orbit: Orbit) -> Orbit:
-    """The orbits that are there, each once whichever impact it was begun with."""
+    """Keep the orbits that are there, each once whichever impact it was begun with."""
     good = np.flatnonzero(np.asarray(check_orbit(orbit).status) == Status.OK)
     rounded = np.round(np.asarray(marks(orbit))[good] / SAME)
     _, first = np.unique(rounded, axis=0, return_index=True)

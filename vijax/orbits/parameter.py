@@ -32,7 +32,7 @@ MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("
 
 
 def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Values) -> ImpactPair:
-    """A pair where a parameter, which was `start` there, is x; `steepest` is g/A, gamma of a vertical tube."""
+    """Move a parameter of a pair from `start` to x; `steepest` is g/A, gamma of a vertical tube."""
     fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
     if along == "beta":
         fields["gamma"] = steepest * tiles.library((pair, x)).sin(x)
@@ -45,7 +45,7 @@ def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Valu
 
 
 def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
-    """The parameter's value where a device, by that parameter, has a pair."""
+    """Find the parameter's value where a device, by that parameter, has a pair."""
     of, by = jax.tree.map(np.asarray, (pair, device))
 
     def omega0() -> np.ndarray:
@@ -64,14 +64,14 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
 
 @door
 def pair_at(pair: ImpactPair, along: str, value: float, device: Harvester) -> ImpactPair:
-    """The pair where the parameter has another value, all else of the device as it is."""
+    """Give the pair where the parameter has another value, all else of the device as it is."""
     pair, x, steepest = tiles.arrays(jax.tree.map(np.asarray, (pair, value, device.g / device.A)))
     begun: Any = value_at(pair, along, device)
     return moved(pair, along, x, begun, steepest)
 
 
 def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> np.ndarray:
-    """The parameter's value at a pair, or ValueError unless it can be followed from there within the bounds."""
+    """Find the parameter's value at a pair; raise ValueError unless it can be followed from there within the bounds."""
     low, high = bounds = check_along(pair, along, within)
     x = value_at(pair, along, device)
     if not ((x >= low) & (x <= high)).all():
@@ -80,7 +80,7 @@ def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], devi
 
 
 def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tuple[float, float]:
-    """Bounds of a parameter, or ValueError unless branches of a pair with such walls can be followed between them."""
+    """Take the bounds of a parameter; raise ValueError unless branches of such a pair can be followed between them."""
     stiff = [name for name, several in MOVED.items() if several == ("kappa",) and pair.rigid]
     hint = f"a rigid wall has no {' or '.join(stiff)}" if stiff else ""
     checks.choice("along", along, [name for name in MOVED if name not in stiff], hint)
@@ -91,5 +91,5 @@ def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tu
 
 
 def tilts(along: str) -> bool:
-    """Whether gravity along the axis moves alone, and with it the symmetry of the walls goes."""
+    """Say whether gravity along the axis moves alone, and with it the symmetry of the walls goes."""
     return along in ("gamma", "beta")

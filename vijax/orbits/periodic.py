@@ -48,12 +48,12 @@ class Orbit(WithStatus):
 
     @property
     def count(self) -> Int[AnyArray, "orbit"]:
-        """Impacts until it closes (half of all where it closes onto its mirror image)."""
+        """Count the impacts until it closes (half of all where it closes onto its mirror image)."""
         return self.sequence.real.sum(axis=-1, dtype=jnp.int32)
 
     @door
     def __getitem__(self, index: Any) -> "Orbit":
-        """Some of the orbits, by an index array, a mask or a slice."""
+        """Pick some of the orbits, by an index array, a mask or a slice."""
         # Not by JAX, which compiles a program for every slice and every number of orbits.
         return tiles.arrays(jax.tree.map(lambda leaf: np.asarray(leaf)[index], self))
 
@@ -62,7 +62,7 @@ class Orbit(WithStatus):
 
 
 def check_orbit(orbit: Any) -> Orbit:
-    """The orbits, if they are some, along a leading axis.
+    """Pass the orbits, if they are some, along a leading axis.
 
     Raises:
         ValueError: Anything else; a single one without its axis, too.
@@ -75,7 +75,7 @@ def check_orbit(orbit: Any) -> Orbit:
 
 @door
 def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Orbit:
-    """The periodic orbits near some guesses, thousands in one call, on every core.
+    """Find the periodic orbits near some guesses, thousands in one call, on every core.
 
     Args:
         pair: One cell an orbit.
@@ -99,20 +99,20 @@ def solved(pair: ImpactPair, sequence: Sequence, knots: Any) -> Orbit:
 
 
 def guessed(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.ndarray) -> tuple[Sequence, Array]:
-    """Sequences and knots as `solve` takes them."""
+    """Make sequences and knots as `solve` takes them."""
     *walls, near = tiles.arrays((side, span, mirrored, knots))
     return Sequence(*walls), near
 
 
 @door
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Orbit:
-    """Orbits from knots that solve the equations already, even where Newton is singular: points of a branch."""
+    """Make orbits of knots that solve the equations already, even where Newton is singular: points of a branch."""
     return _by_tiles(partial(_tile, _compiled(_measured), _level(pair)), (pair, sequence, knots))
 
 
 @door
 def concatenate(found: list[Orbit]) -> Orbit:
-    """Orbits of one number of impacts as one batch."""
+    """Join orbits of one number of impacts to one batch."""
     return tiles.arrays(jax.tree.map(lambda *leaves: np.concatenate(leaves), *found))
 
 
@@ -121,7 +121,7 @@ def _level(pair: ImpactPair) -> bool:
 
 
 def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
-    """The work on every row, in padded tiles of few sizes so that few programs are compiled, a thread a core."""
+    """Do the work on every row, in padded tiles of few sizes so that few programs are compiled, a thread a core."""
     # Rows are cut and joined by numpy: an eager JAX operation costs more than what it does to a tile.
     rows = jax.tree.map(np.asarray, rows)
 
@@ -180,7 +180,7 @@ def _tile(solved: Callable[..., _Claim], level: bool, rows: tuple) -> Orbit:
 
 @jax.jit
 def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) -> Orbit:
-    """What the flights say of the claims."""
+    """Judge the claims by what the flights say of them."""
     real, passage = sequence.real, claim.passage
     found = jnp.isfinite(claim.residual) & real.any(axis=1)
     miss = jnp.abs(flown.t + 2 * claim.periods - passage.next_t)

@@ -43,7 +43,7 @@ class Sequence(eqx.Module):
 
     @property
     def real(self) -> Bool[AnyArray, "*orbit impact"]:
-        """Which impacts are there."""
+        """Say which impacts are there."""
         return self.side != 0
 
 
@@ -64,7 +64,7 @@ class _Contact(NamedTuple):
 
 
 def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
-    """A contact and its derivatives: all of them follow from the free response and the forcing at both ends.
+    """Compute a contact and its derivatives: all follow from the free response and the forcing at both ends.
 
     An onset moved at the same length moves the whole motion, less the free motion of what the state at the onset gains.
     Automatic derivatives would run a tangent of the closed form for every unknown, at five times the cost.
@@ -89,7 +89,7 @@ def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
 
 
 def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Float[Array, "3"], Float[Array, "3 5"]]:
-    """Equations of one contact and the flight after it to the wall `onward`, and their derivatives in the knot.
+    """Compute the equations of one contact and the flight after it to the wall `onward`, and their derivatives.
 
     `knot` ends with the next time and speed. Divided by the contact's length, and by the flight's where it returns to
     its wall: no trivial root at length zero.
@@ -113,7 +113,7 @@ def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Fl
 
 
 def _following(sequence: Sequence):
-    """Index of the impact after each, its wall, and whether the orbit closes there."""
+    """Find the impact after each, its wall, and whether the orbit closes there."""
     width = sequence.side.shape[0]
     index = jnp.arange(width, dtype=jnp.int32)
     closes = index == sequence.real.sum(dtype=jnp.int32) - 1
@@ -123,7 +123,7 @@ def _following(sequence: Sequence):
 
 
 def _joined(sequence: Sequence, knots: Knots):
-    """Wall, next wall and joint knots of every impact; harmless numbers where there is none."""
+    """Give wall, next wall and joint knots of every impact; harmless numbers where there is none."""
     after, wall, closes = _following(sequence)
     later = jnp.where(closes, sequence.span, 0.0)
     joined = jnp.concatenate([knots, (knots[after, 0] + later)[:, None], knots[after, 1:2]], axis=1)
@@ -134,14 +134,14 @@ def _joined(sequence: Sequence, knots: Knots):
 
 
 def gap(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "3*impact"]:
-    """What is missing to an orbit: zero at one, and where there is no impact."""
+    """Compute what is missing to an orbit: zero at one, and where there is no impact."""
     side, wall, joined = _joined(sequence, knots)
     pieces, _ = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
 
 def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactPair | None = None) -> Linear:
-    """The equations and their derivatives in the knots, block by block: each involves two neighbours only.
+    """Compute the equations and their derivatives in the knots, block by block: each involves two neighbours only.
 
     Args:
         moved: Change of the pair along a parameter, whose derivative becomes the last column.
@@ -183,7 +183,7 @@ class Passage(NamedTuple):
 
 
 def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
-    """How each contact ends, and where the flight after it is to lead."""
+    """Say how each contact ends, and where the flight after it is to lead."""
     side, wall, joined = _joined(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
     rate = jax.vmap(lambda side, knot: _contact(pair, side, knot).rate)(side, joined)
@@ -192,7 +192,7 @@ def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
 
 
 def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, ""]:
-    """Whether every speed, contact and flight is longer than nothing."""
+    """Say whether every speed, contact and flight is longer than nothing."""
     _, _, joined = _joined(sequence, knots)
     t, speed, stay, next_t, _ = joined.T
     touches = jnp.ones_like(speed, bool) if pair.rigid else stay > 0
@@ -213,7 +213,7 @@ class _Descent(eqx.Module):
 def newton(
     pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"], max_iterations: int = _MOST_ITERATIONS
 ) -> tuple[Float[Array, "orbit impact 3"], Float[Array, "orbit"]]:
-    """Damped Newton on a batch of orbits: a step that does not shorten what is missing is halved.
+    """Search a batch of orbits by damped Newton: a step that does not shorten what is missing is halved.
 
     Args:
         max_iterations: That a search may take, one evaluation each; the batch takes as many as its slowest search.
@@ -260,7 +260,7 @@ def newton(
 
 
 def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "2 2"]:
-    """Tangent map once around in (du, du'), from the end of the last contact; onto the mirror image where it closes so.
+    """Compute the tangent map once around in (du, du'), from the last contact's end; onto a mirror image where need be.
 
     Saltations included; its determinant is exp(-mu (contact time)), or r^(2 impacts) at rigid walls.
     """
@@ -283,7 +283,7 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
 
 
 def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
-    """Eigenvalues of 2 x 2 monodromy matrices, the larger modulus first; squared where the orbit is closed half way.
+    """Find the eigenvalues of monodromy matrices, the larger modulus first; squared where an orbit closes half way.
 
     The smaller of two real ones is the determinant over the larger: their difference would cancel.
     """

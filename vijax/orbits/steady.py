@@ -70,7 +70,7 @@ class Steady(WithStatus):
 
 @jax.custom_jvp
 def _follows(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Knots:
-    """`knots` as a function of the pair by the orbit's equations: value unchanged, derivatives of every order right."""
+    """Make `knots` a function of the pair by the orbit's equations: value unchanged, derivatives of any order right."""
     return knots
 
 
@@ -87,7 +87,7 @@ def _follows_jvp(primals, tangents):
 
 @door
 def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -> Steady:
-    """The steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
+    """Find the steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
 
     Args:
         device: Constants, scalars; those under differentiation traced.
@@ -114,7 +114,7 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
 
 @partial(jax.jit, static_argnames="wall")
 def _near(device: Harvester, pair: ImpactPair | None, sequence: Sequence, guess: Knots, wall: str) -> Steady:
-    """The steady state near a guess.
+    """Find the steady state near a guess.
 
     Compiled once, and so are its derivatives and batches: as one call they are known by its identity, while loops run
     one by one would be compiled for every call, as each makes their bodies anew.
@@ -138,7 +138,7 @@ def _check(device: Any, orbit: Any, pair: Any) -> None:
 
 
 def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Float[Array, ""]]:
-    """Knots of the orbit near a guess and their residual, constants of differentiation."""
+    """Find the knots of the orbit near a guess and their residual, constants of differentiation."""
     batch = jax.tree.map(lambda x: lax.stop_gradient(x)[None], (pair, sequence, guess))
     knots, residual = shooting.newton(*batch)
     return lax.stop_gradient(knots[0]), lax.stop_gradient(residual[0])
@@ -147,7 +147,7 @@ def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Flo
 def response(
     device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]
 ) -> Steady:
-    """What the orbit with the given knots yields; the knots follow device and pair under differentiation."""
+    """Compute what the orbit with the given knots yields; these follow device and pair under differentiation."""
     frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
     status, multiplier, condition, (room, deepest) = _validity(*frozen)
     # Harmless numbers where there is no orbit: what is computed from them is thrown away.
@@ -198,7 +198,7 @@ def _validity(pair: ImpactPair, sequence: Sequence, knots: Knots, residual):
 
 
 def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):
-    """Depth [m], harvested energy [J] and energy given to the membrane [J] of every impact."""
+    """Compute depth [m], harvested energy [J] and energy given to the membrane [J] of every impact."""
     real = sequence.real
     t, speed, stay = knots.T
     if pair.rigid:
@@ -216,7 +216,7 @@ def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Kno
 
 
 def _depths(pair: ImpactPair, side, knots: Knots, deepest) -> Float[Array, "impact"]:
-    """Largest penetration of each contact on a soft wall: that of its deepest turning point, which moves along."""
+    """Find the depth of each contact on a soft wall: that of its deepest turning point, which moves along."""
     wall = flow.membrane(pair, rolled=True)
 
     def one(side, knot, when):

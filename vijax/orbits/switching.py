@@ -64,7 +64,7 @@ def switch(
 
 
 def _begins(point: Point) -> bool:
-    """Whether another branch begins there that `switch` can find."""
+    """Say whether another branch begins there that `switch` can find."""
     return point.kind == "flip" or (point.kind == "pitchfork" and bool(point.orbit.sequence.mirrored[0]))
 
 
@@ -79,7 +79,7 @@ def family(
     points: int = 4000,
     settings: ContinuationSettings = DEFAULT,
 ) -> list[Branch]:
-    """The branches of some orbits, and those that bifurcate from them at flips and pitchforks, and so on.
+    """Follow the branches of some orbits, and those that bifurcate from them at flips and pitchforks, and so on.
 
     Args:
         orbit, along, within, device, points, settings: As in `follow`; symmetric orbits are closed half way.
@@ -110,7 +110,7 @@ def family(
 
 
 def _new(found: list[Branch], known: list[Branch], settings: ContinuationSettings) -> list[Branch]:
-    """Branches that met something which no known one has met: the same points lie on the same branch."""
+    """Keep branches that met something which no known one has met: the same points lie on the same branch."""
     old = [(point.kind, _traits(point)) for branch in known for point in branch.points]
     new = []
     for branch in found:
@@ -123,5 +123,5 @@ def _new(found: list[Branch], known: list[Branch], settings: ContinuationSetting
 
 
 def _traits(point: Point) -> np.ndarray:
-    """Numbers that tell orbits apart, whichever impact they begin with."""
+    """Give numbers that tell orbits apart, whichever impact they begin with."""
     return np.append(np.asarray(orbit_properties.marks(symmetry.unfolded(point.orbit)))[0], point.value)

@@ -11,7 +11,7 @@ from vijax.runtime.context import door
 
 @door
 def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"]:
-    """Whether each orbit, run through once, is its own mirror image half a span later."""
+    """Say whether each orbit, run through once, is its own mirror image half a span later."""
     host, tolerance = jax.tree.map(np.asarray, check_orbit(orbit)), checks.positive("tolerance", tolerance)
     count = host.count
     index = np.arange(host.knots.shape[1])
@@ -26,7 +26,7 @@ def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"
 
 @door
 def halved(orbit: Orbit) -> Orbit:
-    """Symmetric orbits closed half way, onto their mirror image: half the impacts, and a pitchfork becomes a flip.
+    """Close symmetric orbits half way, onto their mirror image: half the impacts, and a pitchfork becomes a flip.
 
     Raises:
         ValueError: An orbit that is not symmetric.
@@ -47,19 +47,19 @@ def halved(orbit: Orbit) -> Orbit:
 
 @door
 def doubled(orbit: Orbit) -> Orbit:
-    """Orbits run through twice, or in full where they were closed half way."""
+    """Run through orbits twice, or in full where they were closed half way."""
     return _unfolded(check_orbit(orbit), np.ones(len(orbit), bool))
 
 
 @door
 def unfolded(orbit: Orbit) -> Orbit:
-    """Orbits in full, those closed half way too."""
+    """Give orbits in full, those closed half way too."""
     mirrored = np.asarray(check_orbit(orbit).sequence.mirrored)
     return _unfolded(orbit, mirrored) if mirrored.any() else orbit
 
 
 def _unfolded(orbit: Orbit, twice: Bool[np.ndarray, "orbit"]) -> Orbit:
-    """The second turn appended to the first where asked."""
+    """Append the second turn to the first where asked."""
     host = jax.tree.map(np.asarray, orbit)
     count, width = host.count[:, None], host.knots.shape[1]
     index = np.arange(2 * width)

@@ -178,7 +178,7 @@ class Cells:
 
     @property
     def count(self) -> int:
-        """Number of simulations."""
+        """Count the simulations."""
         return math.prod(self.sizes[dim] for dim in self.dynamic)
 
     def flat(self, quantity: "xr.Variable", index: np.ndarray) -> np.ndarray:

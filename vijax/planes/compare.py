@@ -59,7 +59,7 @@ class Comparison:
 
     @property
     def count(self) -> int:
-        """Number of simulations, of both kinds of wall."""
+        """Count the simulations, of both kinds of wall."""
         return self.soft.cells.count + self.rigid.cells.count
 
 

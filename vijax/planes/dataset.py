@@ -55,12 +55,12 @@ class Plan:
 
     @property
     def count(self) -> int:
-        """Number of simulations."""
+        """Count the simulations."""
         return self.cells.count
 
     @property
     def size(self) -> int:
-        """Bytes of the variables wanted, at eight a number; a store compresses them."""
+        """Count the bytes of the variables wanted, at eight a number; a store compresses them."""
         of = self.cells
         variants = math.prod(of.sizes[dim] for dim in of.variant)
         varied = sum(bool(_VARIED & set(OUTPUTS[name].needs)) for name in self.outputs)
@@ -68,7 +68,7 @@ class Plan:
 
     @property
     def needs(self) -> frozenset[str]:
-        """Fields of `Summary` that the outputs are made of."""
+        """Name the fields of `Summary` that the outputs are made of."""
         return frozenset(need for name in self.outputs for need in OUTPUTS[name].needs)
 
     def cut(self, block: Mapping[str, slice]) -> "Plan":

@@ -45,7 +45,7 @@ class Estimate(NamedTuple):
 
     @property
     def long(self) -> bool:
-        """Whether somebody should agree before it begins: an hour, or 10 GB."""
+        """Say whether somebody should agree before it begins: an hour, or 10 GB."""
         return self.seconds > _HOUR or self.size > _GIGABYTES
 
     def __str__(self) -> str:

@@ -130,34 +130,34 @@ class Diagram:
 
     @property
     def ways(self) -> tuple[str, ...]:
-        """Directions in which the axis is gone along."""
+        """Name the directions in which the axis is gone along."""
         return _WAYS[self.settings.direction]
 
     @property
     def dims(self) -> dict[str, int]:
-        """Sizes of all dimensions but that of impacts, in order."""
+        """Give the sizes of all dimensions but that of impacts, in order."""
         others = {dim: size for dim, size in self.planned.cells.sizes.items() if dim != self.along}
         both = {"direction": len(self.ways)} if len(self.ways) > 1 else {}
         return {**both, **others, self.along: self.points}
 
     @property
     def points(self) -> int:
-        """Points of a chain."""
+        """Count the points of a chain."""
         return self.planned.cells.sizes[self.along]
 
     @property
     def count(self) -> int:
-        """Points in all."""
+        """Count the points in all."""
         return math.prod(self.dims.values())
 
     @property
     def expected(self) -> estimate.Estimate:
-        """What it asks of the machine."""
+        """Estimate what it asks of the machine."""
         return estimate.of_recorded(self.count, self.settings.periods, self.size)
 
     @property
     def size(self) -> int:
-        """Bytes of the dataset where there are two impacts a period."""
+        """Count the bytes of the dataset where there are two impacts a period."""
         return 8 * self.count * (self.settings.keep * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
 
 

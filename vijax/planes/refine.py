@@ -62,7 +62,7 @@ class Mesh:
 
     @cached_property
     def shape(self) -> tuple[int, ...]:
-        """Cells along each axis."""
+        """Count the cells along each axis."""
         return tuple(axis.size for axis in self.axes)
 
     @cached_property

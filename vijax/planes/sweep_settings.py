@@ -95,7 +95,7 @@ class SweepSettings:
 
     @property
     def told(self) -> dict[str, Any]:
-        """The settings by name, as attributes of a dataset; `engine.method_choice.record` has what a method is told."""
+        """Name the settings, as attributes of a dataset; `engine.method_choice.record` has what a method is told."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _OPTIONS}
 
     def only(self, of: str, *names: str) -> None:
@@ -131,7 +131,7 @@ class DiagramSettings(SweepSettings):
 
     @property
     def told(self) -> dict[str, Any]:
-        """The settings that a diagram reads by name, as attributes of a dataset."""
+        """Name the settings that a diagram reads, as attributes of a dataset."""
         return {name: getattr(self, name) for name in _OF_DIAGRAMS}
 
 

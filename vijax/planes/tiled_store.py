@@ -63,18 +63,18 @@ class Study:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Number of tiles along every dynamic dimension."""
+        """Count the tiles along every dynamic dimension."""
         sizes = self.planned.cells.sizes
         return tuple(-(-sizes[dim] // extent) for dim, extent in self.extents.items())
 
     @property
     def tiles(self) -> range:
-        """The tiles by number, the last dimension running first."""
+        """Number the tiles, the last dimension running first."""
         return range(math.prod(self.counts))
 
     @property
     def most(self) -> int:
-        """Cells of the largest tile."""
+        """Count the cells of the largest tile."""
         return math.prod(self.extents.values())
 
     def place(self, tile: int) -> dict[str, int]:

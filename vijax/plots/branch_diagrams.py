@@ -22,7 +22,7 @@ _STABLE, _UNSTABLE = "black", "red"
 
 @styled
 def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
-    """Branches of orbits over their parameter: stable black, unstable red, with what they met on the way.
+    """Draw branches of orbits over their parameter: stable black, unstable red, with what they met on the way.
 
     Args:
         dataset: What `vijax.orbits.branch_dataset.dataset` returned.
@@ -65,7 +65,7 @@ def _mark(kind: str, label: str | None = None) -> Line2D:
 
 
 def _mark_events(axes: Axes, one: "xr.Dataset", quantity: str) -> None:
-    """What one branch met, on the curves of its quantity."""
+    """Mark what one branch met, on the curves of its quantity."""
     values = one[quantity].values.reshape(one.sizes["point"], -1)
     events = (one["event"].values, one["event_value"].values, one["event_point"].values)
     for kind, value, place in zip(*events, strict=True):

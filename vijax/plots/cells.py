@@ -22,7 +22,7 @@ VEIL: dict[str, Any] = {"facecolor": (1, 1, 1, 0.55), "edgecolor": "0.3", "hatch
 
 
 def panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple[Axes, xr.Dataset]]]":
-    """A figure of empty panels with titles and labels, and what belongs into each, ascending and [y, x]."""
+    """Make a figure of empty panels with titles and labels, and what belongs into each, ascending and [y, x]."""
     rows, columns = layout({dim: dataset.sizes[dim] for dim in dims})
     size = (5.2, 4.6) if rows * columns == 1 else (1.6 + 2.1 * columns, 1.6 + 1.9 * rows)
     figure = Figure(figsize=size, layout="constrained")
@@ -48,7 +48,7 @@ def panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple[
 
 
 def edges(values: np.ndarray) -> tuple[np.ndarray, str]:
-    """Edges of the cells around ascending values, and the scale on which these are evenly spaced."""
+    """Find the edges of the cells around ascending values, and the scale on which these are evenly spaced."""
     log = values.size > 2 and values[0] > 0 and np.ptp(np.diff(np.log(values))) < _EVEN * np.log(values[-1] / values[0])
     points = np.log(values) if log else values
     middle = 0.5 * (points[1:] + points[:-1])
@@ -68,7 +68,7 @@ def veil(axes: Axes, across: np.ndarray, up: np.ndarray, mask: np.ndarray) -> No
 
 
 def borders(across: np.ndarray, up: np.ndarray, mask: np.ndarray) -> list[Any]:
-    """The edges between cells in the mask and cells outside it."""
+    """Find the edges between cells in the mask and cells outside it."""
     segments = []
     for i, j in np.argwhere(mask[:, 1:] != mask[:, :-1]):
         segments.append([(across[j + 1], up[i]), (across[j + 1], up[i + 1])])
@@ -78,12 +78,12 @@ def borders(across: np.ndarray, up: np.ndarray, mask: np.ndarray) -> list[Any]:
 
 
 def runs(mask: np.ndarray) -> np.ndarray:
-    """First and one past the last index of every run of true values."""
+    """Find first and one past the last index of every run of true values."""
     return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
 
 
 def marked_places(mask: np.ndarray, x: np.ndarray, y: np.ndarray, *, most: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the cells in the mask; on a fine map, of the blocks of which most cells, or any, are in it."""
+    """Place marks at cells in the mask; on a fine map, at blocks of which most cells, or any, are in it."""
     step = max(math.ceil(size / MOST_MARKS) for size in mask.shape)
     starts = [np.arange(0, size, step) for size in mask.shape]
     share = np.add.reduceat(np.add.reduceat(mask.astype(int), starts[0], axis=0), starts[1], axis=1)

@@ -42,7 +42,7 @@ _ERRORS = 3  # standard errors, half the height of the band of an average
 
 @styled
 def design(diagram: "xr.Dataset", report: dict[str, Any]) -> Figure:
-    """P along an axis, falling and rising, under the ascent, the optimum, its tolerance band and what is not physical.
+    """Draw P along an axis, falling and rising, under the ascent, the optimum, its tolerances and what is not physical.
 
     Args:
         diagram: `vijax.orbit_diagram` in both directions, at the optimum.
@@ -68,7 +68,7 @@ def design(diagram: "xr.Dataset", report: dict[str, Any]) -> Figure:
 
 
 def close_view(along: str, here: float) -> tuple[float, float]:
-    """Ends of the part of an axis about an optimum that a picture shows closer by."""
+    """Find the ends of the part of an axis about an optimum that a picture shows closer by."""
     return (here - _TILT, here + _TILT) if along in LINEAR else (here * (1 - _NEAR), here * (1 + _NEAR))
 
 
@@ -86,7 +86,7 @@ def _draw(axes: Axes, diagram: "xr.Dataset", report: dict[str, Any]) -> None:
 
 
 def _whole(axes: Axes, diagram: "xr.Dataset") -> None:
-    """Limits and scales that show all of a diagram."""
+    """Set limits and scales that show all of a diagram."""
     x, power = diagram[diagram.attrs["along"]].values, diagram["P"]
     most, least = float(power.max()), float(power.where(power > 0).min())
     axes.set(yscale="log", xlim=(x.min(), x.max()), ylabel="$P$ [J per half period]")
@@ -97,7 +97,7 @@ def _whole(axes: Axes, diagram: "xr.Dataset") -> None:
 
 
 def _ranges(x: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
-    """Ends of the stretches of `which`, half way to the points beside them."""
+    """Find the ends of the stretches of `which`, half way to the points beside them."""
     order = np.argsort(x)
     x, which = x[order], which[order]
     borders = np.concatenate([x[:1], 0.5 * (x[1:] + x[:-1]), x[-1:]])
@@ -116,7 +116,7 @@ def _curves(axes: Axes, diagram: "xr.Dataset", x: np.ndarray) -> None:
 
 
 def _averages(axes: Axes, diagram: "xr.Dataset", x: np.ndarray) -> None:
-    """Averages of admissible chaos over its orbits' dots, each with the band of its standard error."""
+    """Draw averages of admissible chaos over its orbits' dots, each with the band of its standard error."""
     if "P_stderr" not in diagram:
         return
     chaotic = ((diagram["period"] == 0) & diagram["admissible"]).values
@@ -135,7 +135,7 @@ def _unconstrained(axes: Axes, report: dict[str, Any]) -> None:
 
 
 def _mark(axes: Axes, report: dict[str, Any], along: str) -> None:
-    """The optimum, how it was reached, how far it may be off, where its orbit ends."""
+    """Mark the optimum, how it was reached, how far it may be off, where its orbit ends."""
     best = report["best"]
     here = _here(best, along)
     band = factors(along, report["tolerances"])
@@ -151,7 +151,7 @@ def _mark(axes: Axes, report: dict[str, Any], along: str) -> None:
 
 
 def _ends(axes: Axes, extents: list[dict[str, Any]], here: float, along: str) -> None:
-    """How far off the quantity may be before the motion is another one."""
+    """Show how far off the quantity may be before the motion is another one."""
     for one in extents:
         if one["name"] == along and not (one["below"]["lasts"] and one["above"]["lasts"]):
             low, high = (0.01 * one[side]["percent"] * sign for side, sign in (("below", -1), ("above", 1)))
@@ -160,7 +160,7 @@ def _ends(axes: Axes, extents: list[dict[str, Any]], here: float, along: str) ->
 
 
 def _edges(axes: Axes, around: dict[str, Any], omega0: float, here: float, along: str) -> None:
-    """Where the optimum's orbit meets its first bifurcations."""
+    """Show where the optimum's orbit meets its first bifurcations."""
     for side in ("below", "above"):
         edge = around[side]
         if edge and constant(along) == "omega0" and edge["kind"] != "none":
@@ -169,7 +169,7 @@ def _edges(axes: Axes, around: dict[str, Any], omega0: float, here: float, along
 
 
 def _here(best: dict[str, Any], along: str) -> float:
-    """Where the optimum is on an axis."""
+    """Find where the optimum is on an axis."""
     known = best["values"] | best["pair"] | best["device"]
     return float(known[along] if along in known else known["m_b"] * known["omega0"] ** 2)
 
@@ -199,7 +199,7 @@ _HELD = {  # what holds a design, by the words it begins with
 
 @styled
 def design_map(report: dict[str, Any]) -> Figure:
-    """The best designs along an axis: what the first tuned quantity should be, and P; coloured by what holds them.
+    """Draw the best designs along an axis: the first tuned quantity, and P; coloured by what holds them.
 
     Args:
         report: `over` (name and values of the axis) and `designs`, one of `vijax.design.report.describe` for

@@ -42,7 +42,7 @@ class _Category(NamedTuple):
 
 @styled
 def label_map(dataset: "xr.Dataset") -> Figure:
-    """The plane coloured by attractor, n:m/pT; aperiodic cells are shaded by their Lyapunov exponent.
+    """Draw the plane coloured by attractor, n:m/pT; aperiodic cells are shaded by their Lyapunov exponent.
 
     The commonest labels have a colour and a name each, the others are one group. Without gravity mirror images count as
     one, by the smaller count first. Aperiodic means: without a period within the periods that were run.
@@ -67,7 +67,7 @@ def label_map(dataset: "xr.Dataset") -> Figure:
 
 @styled
 def basin_map(dataset: "xr.Dataset") -> Figure:
-    """The (u0, v0) plane coloured by the attractor on which each start ends, with a table of them beside it.
+    """Draw the (u0, v0) plane coloured by the attractor on which each start ends, with a table of them beside it.
 
     Args:
         dataset: What `basins` returned for arrays u0 and v0; further axes make panels, each with a table of its own.
@@ -84,7 +84,7 @@ def basin_map(dataset: "xr.Dataset") -> Figure:
 
 @styled
 def multistability_map(dataset: "xr.Dataset") -> Figure:
-    """The plane of parameters coloured by the number of coexisting attractors.
+    """Draw the plane of parameters coloured by the number of coexisting attractors.
 
     Args:
         dataset: What `basin_fractions` returned; dimensions as in `power_map`, two at least.
@@ -117,7 +117,7 @@ def basins(dataset: "xr.Dataset") -> Figure:
 
 
 def of_flags(dataset: "xr.Dataset", name: str) -> "tuple[xr.Dataset, list[_Category]]":
-    """A variable of flags as places among categories, those that occur."""
+    """Turn a variable of flags into places among categories, those that occur."""
     variable = dataset[name]
     if variable.dtype == bool:
         words = {0: "no", 1: "yes"}
@@ -131,7 +131,7 @@ def of_flags(dataset: "xr.Dataset", name: str) -> "tuple[xr.Dataset, list[_Categ
 
 
 def coded(dataset: "xr.Dataset", categories: list[_Category] | None) -> Figure:
-    """A map of kinds, by their places `code` among the categories; those of every panel's own table if there are none.
+    """Draw kinds by their places `code` among the categories; those of every panel's own table if there are none.
 
     Where it is `aperiodic`, the Lyapunov exponent shades it.
     """
@@ -157,7 +157,7 @@ def coded(dataset: "xr.Dataset", categories: list[_Category] | None) -> Figure:
 
 
 def _shade(figure: Figure, dataset: "xr.Dataset", filled: "list[tuple[Axes, xr.Dataset]]", dims: list[str]) -> None:
-    """Aperiodic cells in greys, the darker the faster they forget their start."""
+    """Shade aperiodic cells in greys, the darker the faster they forget their start."""
     exponents = dataset["lyapunov"].where(dataset["aperiodic"])
     scale = Normalize(0.0, float(exponents.max()))
     for axes, panel in filled:
@@ -168,7 +168,7 @@ def _shade(figure: Figure, dataset: "xr.Dataset", filled: "list[tuple[Axes, xr.D
 
 
 def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]]:
-    """Every word's place among the categories, and these: the commonest labels, the others, and what is no orbit."""
+    """Place every word among the categories, and name these: the commonest labels, the others, and what is no orbit."""
     kinds, which, counts = np.unique(words, return_inverse=True, return_counts=True)
     orbits = [place for place in np.argsort(-counts, kind="stable") if kinds[place] not in _NO_ORBIT]
     ranked = [[place] for place in orbits[:_MOST_NAMED]] + [orbits[_MOST_NAMED:]]
@@ -187,7 +187,7 @@ def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]
 
 
 def _table_categories(panel: "xr.Dataset") -> list[_Category]:
-    """The attractors of one table, the commonest by name."""
+    """Name the attractors of one table, the commonest by name."""
     found = panel.isel(attractor=panel["starts"].values > 0)
     colours = iter(_COLOURS)
     categories = []

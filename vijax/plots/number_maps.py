@@ -70,7 +70,7 @@ class _Kind(NamedTuple):
 
 @styled
 def power_map(dataset: "xr.Dataset") -> Figure:
-    """P on a log colour scale, with all that tells where to believe it.
+    """Draw P on a log colour scale, with all that tells where to believe it.
 
     Inadmissible cells are veiled and hatched, the border of the period-1 region is a line, aperiodic cells carry dots
     and undecided ones crosses, and a star stands on the largest admissible P. The colours span the admissible cells if
@@ -88,7 +88,7 @@ def power_map(dataset: "xr.Dataset") -> Figure:
 
 @styled
 def variable_map(dataset: "xr.Dataset", name: str) -> Figure:
-    """Any variable of a map, with the marks of `power_map` for as much as the map holds.
+    """Draw any variable of a map, with the marks of `power_map` for as much as the map holds.
 
     Numbers are coloured, on a log scale where they are positive and span a factor of 30; what is a kind, such as
     `status` or `admissible`, has a colour each. Cells without a value are grey.
@@ -116,7 +116,7 @@ def variable_map(dataset: "xr.Dataset", name: str) -> Figure:
 
 @styled
 def difference_map(dataset: "xr.Dataset") -> Figure:
-    """The relative difference in P between rigid and soft walls on a log colour scale.
+    """Draw the relative difference in P between rigid and soft walls on a log colour scale.
 
     A line parts cells whose labels differ from the others; another one, where the comparison was given a tolerance,
     goes around the cells where the rigid model is enough, and crosses stand on those without a verdict.
@@ -165,7 +165,7 @@ def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: N
 
 
 def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
-    """The coloured variable over a single axis, with the marks of a map."""
+    """Draw the coloured variable over a single axis, with the marks of a map."""
     (x,) = (str(dim) for dim in dataset[kind.coloured].dims)
     dataset = dataset.sortby(x)
     places, values = dataset[x].values, dataset[kind.coloured].values
@@ -214,12 +214,12 @@ def _mark_curve(axes: Axes, marks: list[_Mark], places: np.ndarray, across: np.n
 
 
 def _drawn(values: np.ndarray, norm: Normalize) -> np.ndarray:
-    """Which values have a colour."""
+    """Say which values have a colour."""
     return values > 0 if isinstance(norm, LogNorm) else ~np.isnan(values)
 
 
 def _spanned(dataset: "xr.Dataset", values: np.ndarray) -> tuple[np.ndarray, int]:
-    """What colours span, over how many decades at most: admissible cells, outside which formulas may give any number.
+    """Find what colours span, over how many decades at most: admissible cells, as outside formulas may give any number.
 
     Where these are few, all that is shown: or the colours would tell nothing of what is around them.
     """
@@ -239,7 +239,7 @@ def _power_colours(dataset: "xr.Dataset") -> LogNorm:
 
 
 def _common_marks(dataset: "xr.Dataset") -> list[_Mark]:
-    """Marks of what a map holds besides what is coloured."""
+    """Make marks of what a map holds besides what is coloured."""
     marks = []
     if "admissible" in dataset:
         marks.append(_Mark(~dataset["admissible"].values, "veil", VEIL, "inadmissible"))
@@ -273,7 +273,7 @@ def _number_marks(name: str, dataset: "xr.Dataset") -> list[_Mark]:
 
 
 def _difference_colours(_: "xr.Dataset") -> LogNorm:
-    """One scale for all maps: beyond 1 it matters no more by how much."""
+    """Set one scale for all maps: beyond 1 it matters no more by how much."""
     return LogNorm(10.0**-_DECADES, 1.0)
 
 
@@ -304,7 +304,7 @@ _DIFFERENCE = _Kind(
 
 
 def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataArray | None") -> None:
-    """What the map holds constant above it, what its marks mean below; only the marks that it has."""
+    """Explain above what the map holds constant, below what its marks mean; only the marks that it has."""
     figure.suptitle(title(dataset), fontsize="medium")
     shown = [(_handle(mark), mark.text) for mark in kind.marks(dataset) if mark.mask.any()]
     if peak is not None:

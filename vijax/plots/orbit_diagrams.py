@@ -27,7 +27,7 @@ _LOGARITHMIC, _DECADES = ("depth", "E", "P"), 8
 
 @styled
 def orbit_diagram(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
-    """A quantity of every kept impact against the axis swept, a colour for each value of the other axis.
+    """Draw a quantity of every kept impact against the axis swept, a colour for each value of the other axis.
 
     Of a diagram in both directions each has its panel, the other one's points in grey behind its own: grey that shows
     is another attractor.
@@ -73,7 +73,7 @@ def check_quantity(quantity: str) -> None:
 
 
 def check_layout(along: str, sizes: Mapping[str, int]) -> list[str]:
-    """The axis that colours stand for, if there is one.
+    """Find the axis that colours stand for, if there is one.
 
     Raises:
         ValueError: If there are several, or more values than colours.
@@ -92,7 +92,7 @@ def _way(dataset: "xr.Dataset", way: str) -> "xr.Dataset":
 
 
 def _cloud(axes: Axes, dataset: "xr.Dataset", quantity: str, others: list[str], colour: str | None = None) -> None:
-    """The points of one direction, in one colour or in those of the other axis."""
+    """Draw the points of one direction, in one colour or in those of the other axis."""
     along = dataset.attrs["along"]
     single = [dim for dim in dataset["P"].dims if dim != along and dim not in others]
     found = dataset[quantity].squeeze(single).transpose(*others, along, ...)
@@ -105,12 +105,12 @@ def _cloud(axes: Axes, dataset: "xr.Dataset", quantity: str, others: list[str], 
 
 
 def _size(columns: int) -> float:
-    """Size of a point among so many columns of points."""
+    """Choose the size of a point among so many columns of points."""
     return float(np.clip(300 / columns, 1.4, 2.8))
 
 
 def _explain(figure: Figure, dataset: "xr.Dataset", others: list[str], ways: list[str]) -> None:
-    """Which colour stands for what, below the panels."""
+    """Explain which colour stands for what, below the panels."""
     colours: list[str] = []
     texts: list[str] = []
     for name in others:

@@ -53,31 +53,31 @@ def is_drawn(path: Path) -> bool:
 
 
 def title(dataset: "xr.Dataset", further: tuple[str, ...] = ()) -> str:
-    """What a dataset holds constant: its wall, its scalar parameters, and `further` ones where they are given."""
+    """Say what a dataset holds constant: its wall, its scalar parameters, and `further` ones where they are given."""
     names = [name for name in (*CONSTANTS, *further) if name in dataset.coords and not dataset[name].ndim]
     wall = [f"{dataset.attrs['wall']} walls"] if "wall" in dataset.attrs else []
     return ", ".join([*wall, equations(dataset, names)])
 
 
 def axis_label(coordinate: "xr.DataArray") -> str:
-    """Symbol and units of a coordinate: omega [rad/s]."""
+    """Write symbol and units of a coordinate: omega [rad/s]."""
     written = units(coordinate)
     return symbol(coordinate) + (f" [{written}]" if written else "")
 
 
 def symbol(coordinate: "xr.DataArray") -> str:
-    """Symbol of a coordinate, or its name."""
+    """Give the symbol of a coordinate, or its name."""
     return f"${coordinate.attrs.get('symbol', coordinate.name)}$"
 
 
 def equations(dataset: "xr.Dataset", names: list[str]) -> str:
-    """The values of scalar coordinates: r = 0.5, omega = 3.14 rad/s."""
+    """Write the values of scalar coordinates: r = 0.5, omega = 3.14 rad/s."""
     scalars = [dataset[name] for name in names]
     return ", ".join(f"{symbol(scalar)} = {float(scalar):.4g} {units(scalar)}".strip() for scalar in scalars)
 
 
 def units(coordinate: "xr.DataArray") -> str:
-    """Units of a coordinate for print; none of a pure number."""
+    """Give the units of a coordinate for print; none of a pure number."""
     plain = coordinate.attrs.get("units", "1")
     return "" if plain == "1" else re.sub(r"(-?\d+)", r"$^{\1}$", plain)
 
@@ -88,7 +88,7 @@ MOST_PANELS = 36
 
 
 def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
-    """Rows and columns of panels for a map whose dimensions are, in order, x, y, columns and rows.
+    """Lay panels in rows and columns for a map whose dimensions are, in order, x, y, columns and rows.
 
     Args:
         sizes: Length of every dimension of P; those of length one are not drawn.
@@ -111,7 +111,7 @@ def layout(sizes: Mapping[str, int]) -> tuple[int, int]:
 
 
 def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
-    """`layout` for a map of labels or basins, which a curve cannot show."""
+    """Lay panels as `layout` does, for a map of labels or basins, which a curve cannot show."""
     drawn = [dim for dim, size in sizes.items() if size > 1]
     if len(drawn) == 1:
         raise ValueError(f"plot must have two axes of more than one value; got {drawn[0]} alone")
@@ -119,7 +119,7 @@ def layout_of_kinds(sizes: Mapping[str, int]) -> tuple[int, int]:
 
 
 def is_kind(variable: Any) -> bool:
-    """Whether a variable says of what kind a cell is, and not how much there is of something."""
+    """Say whether a variable tells of what kind a cell is, and not how much there is of something."""
     return variable.dtype == bool or "flag_values" in variable.attrs
 
 

@@ -27,14 +27,14 @@ _WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 60
 
 
 def shown(value: Any) -> str:
-    """A value as an error quotes it: on one line, and never long."""
+    """Quote a value as an error does: on one line, and never long."""
     # Python writes no number of thousands of digits.
     text = f"{value.bit_length()} bits" if isinstance(value, int) and value.bit_length() > 500 else _WORDS.repr(value)
     return " ".join(text.split())
 
 
 def _array(value: Any) -> np.ndarray:
-    """The value as an array, of objects where it is none of numbers."""
+    """Make the value an array, of objects where it is none of numbers."""
     try:
         return np.asarray(value)
     except ValueError:  # a list of lists of several lengths
@@ -42,12 +42,12 @@ def _array(value: Any) -> np.ndarray:
 
 
 def is_concrete(*values: Any) -> bool:
-    """Whether nothing in the values is traced, so that they may be looked at."""
+    """Say whether nothing in the values is traced, so that they may be looked at."""
     return not any(isinstance(leaf, jax.core.Tracer) for value in values for leaf in jax.tree.leaves(value))
 
 
 def known(name: str, value: T) -> T:
-    """The value, unless JAX traces it, or a part of it, where nothing is differentiated."""
+    """Pass the value, unless JAX traces it, or a part of it, where nothing is differentiated."""
     if not is_concrete(value):
         raise ValueError(
             f"{name} must not be traced, as this is not differentiated; got {shown(value)}; "
@@ -57,7 +57,7 @@ def known(name: str, value: T) -> T:
 
 
 def whole(name: str, value: Any, least: int, most: int = MOST) -> int:
-    """The value as an int between two bounds; True and 3.0 are no whole numbers."""
+    """Take the value as an int between two bounds; True and 3.0 are no whole numbers."""
     known(name, value)
     number = np.asarray(value) if isinstance(value, int | np.integer | np.ndarray | jax.Array) else np.asarray(None)
     if number.ndim or not _integral(number) or number < least:
@@ -73,12 +73,12 @@ def _integral(number: np.ndarray) -> bool:
 
 
 def seed(value: Any) -> int | None:
-    """The seed of a random generator, or None."""
+    """Take the seed of a random generator, or None."""
     return None if value is None else whole("seed", value, 0, MOST_SEED)
 
 
 def real(name: str, value: Any, must: str, holds: Callable[[float], bool]) -> float:
-    """The value as a float for which something holds.
+    """Take the value as a float for which something holds.
 
     Args:
         name: Of the argument.
@@ -94,12 +94,12 @@ def real(name: str, value: Any, must: str, holds: Callable[[float], bool]) -> fl
 
 
 def positive(name: str, value: Any) -> float:
-    """The value as a positive finite float."""
+    """Take the value as a positive finite float."""
     return real(name, value, "a positive finite number", lambda x: 0 < x < math.inf)
 
 
 def numbers(name: str, value: Any, advice: str = "", *, some: bool = True) -> np.ndarray:
-    """The value as an array of real numbers, NaN and infinity among them; of at least one unless not `some`."""
+    """Take the value as an array of real numbers, NaN and infinity too; of at least one unless not `some`."""
     known(name, value)
     array = _array(value)
     hint = advice and f"; {advice}"
@@ -111,7 +111,7 @@ def numbers(name: str, value: Any, advice: str = "", *, some: bool = True) -> np
 
 
 def bounds(name: str, value: Any) -> tuple[float, float]:
-    """The value as two finite numbers, the lower first."""
+    """Take the value as two finite numbers, the lower first."""
     try:
         low, high = map(float, finite(name, value))
     except (TypeError, ValueError):
@@ -122,7 +122,7 @@ def bounds(name: str, value: Any) -> tuple[float, float]:
 
 
 def finite(name: str, value: Any) -> np.ndarray:
-    """The value as an array of at least one finite real number."""
+    """Take the value as an array of at least one finite real number."""
     array = numbers(name, value)
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite; got {first(array, np.isfinite(array))}")
@@ -130,7 +130,7 @@ def finite(name: str, value: Any) -> np.ndarray:
 
 
 def first(values: Any, good: Any) -> str:
-    """The first element that is not good, with its index where there is one."""
+    """Show the first element that is not good, with its index where there is one."""
     values, good = np.asarray(values), np.asarray(good)
     index = tuple(int(i) for i in np.argwhere(~good)[0])
     where = f" at index {index if len(index) > 1 else index[0]}" if index else ""
@@ -138,7 +138,7 @@ def first(values: Any, good: Any) -> str:
 
 
 def shapes(**arrays: Any) -> tuple[int, ...]:
-    """The shape to which arrays broadcast."""
+    """Find the shape to which arrays broadcast."""
     each = {name: np.shape(array) for name, array in arrays.items()}
     try:
         return np.broadcast_shapes(*each.values())
@@ -148,13 +148,13 @@ def shapes(**arrays: Any) -> tuple[int, ...]:
 
 
 def joined(names: Iterable[str]) -> str:
-    """Names in a sentence: d, kappa and r."""
+    """Join names in a sentence: d, kappa and r."""
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last
 
 
 def choice(name: str, value: Any, allowed: Collection[str], hint: str = "") -> str:
-    """The value, if it is one of some words."""
+    """Pass the value, if it is one of some words."""
     if not isinstance(value, str) or value not in allowed:
         listed = " or ".join(f'"{word}"' for word in allowed) if len(allowed) < 4 else f"among {', '.join(allowed)}"
         raise ValueError(f"{name} must be {listed}; got {shown(value)}{hint and f'; {hint}'}")
@@ -162,7 +162,7 @@ def choice(name: str, value: Any, allowed: Collection[str], hint: str = "") -> s
 
 
 def words(name: str, value: Any, allowed: Collection[str]) -> tuple[str, ...]:
-    """The value as a tuple of words of which each is allowed; a single one need not stand in a list."""
+    """Take the value as a tuple of words of which each is allowed; a single one need not stand in a list."""
     listed = (value,) if isinstance(value, str) else sequence(name, value, str, "names")
     if not listed:
         raise ValueError(f"{name} must name at least one of {', '.join(allowed)}; got none")
@@ -170,7 +170,7 @@ def words(name: str, value: Any, allowed: Collection[str]) -> tuple[str, ...]:
 
 
 def sequence(name: str, value: Any, kind: type[T], what: str) -> list[T]:
-    """The value as a list of records of a kind; `what` they are, in words."""
+    """Take the value as a list of records of a kind; `what` they are, in words."""
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise ValueError(f"{name} must be a list of {what}; got {shown(value)}")
     listed = list(value)
@@ -181,7 +181,7 @@ def sequence(name: str, value: Any, kind: type[T], what: str) -> list[T]:
 
 
 def instance(name: str, value: Any, kind: type[T], made: str) -> T:
-    """The value, if it is a record of a kind.
+    """Pass the value, if it is a record of a kind.
 
     Args:
         name: Of the argument.
@@ -195,7 +195,7 @@ def instance(name: str, value: Any, kind: type[T], made: str) -> T:
 
 
 def variables(name: str, value: Any, needed: Iterable[str], made: str, hint: str = "") -> Any:
-    """The value, if it is a dataset that holds some variables; `made` is the function that returns such."""
+    """Pass the value, if it is a dataset that holds some variables; `made` is the function that returns such."""
     import xarray as xr  # here, as importing vijax must not load it
 
     if not isinstance(value, xr.Dataset):
@@ -208,7 +208,7 @@ def variables(name: str, value: Any, needed: Iterable[str], made: str, hint: str
 
 
 def record(name: str, value: Any, needed: Iterable[str], made: str) -> dict[str, Any]:
-    """The value, if it is a dict that holds some entries; `made` is what returns such."""
+    """Pass the value, if it is a dict that holds some entries; `made` is what returns such."""
     missing = list(needed) if not isinstance(value, dict) else [one for one in needed if one not in value]
     if missing:
         raise ValueError(f"{name} must be a dict with {joined(missing)}, as {made} gives it; got {shown(value)}")
@@ -216,21 +216,21 @@ def record(name: str, value: Any, needed: Iterable[str], made: str) -> dict[str,
 
 
 def flag(name: str, value: Any) -> bool:
-    """The value, if it is True or False."""
+    """Pass the value, if it is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False; got {shown(value)}")
     return bool(value)
 
 
 def function(name: str, value: Any) -> Any:
-    """The value, if it can be called, or None."""
+    """Pass the value, if it can be called, or None."""
     if value is not None and not callable(value):
         raise ValueError(f"{name} must be a function, or left out; got {shown(value)}")
     return value
 
 
 def path(name: str, value: Any) -> Path:
-    """The value as a path."""
+    """Take the value as a path."""
     if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
         raise ValueError(f"{name} must be a path, as text or a pathlib.Path; got {shown(value)}")
     return Path(value)
@@ -253,13 +253,13 @@ def fits(names: Iterable[str], size: float, what: str, hint: str = "") -> None:
 
 
 def gigabytes(size: float) -> str:
-    """Bytes in words."""
+    """Put bytes in words."""
     return f"{size / 1e9:,.3g} GB" if size < 1e14 else f"{size / 1e12:,.0f} TB"
 
 
 @cache
 def memory() -> float:
-    """Bytes of memory that this process may have: the machine's, or those of its control group where it has fewer."""
+    """Find how much memory [bytes] this process may have: the machine's, or less where its control group has less."""
     try:
         most = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     except (AttributeError, OSError, ValueError):  # not on every system

@@ -28,7 +28,7 @@ _HELD: dict[str, tuple[Callable[[Any], Any], Any]] = {
 
 
 def door(function: Callable[P, T]) -> Callable[P, T]:
-    """A public function: it runs under the settings that vijax stands on, where JAX can run at all."""
+    """Make a function public: it runs under the settings that vijax stands on, where JAX can run at all."""
 
     @functools.wraps(function)
     def through(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -48,12 +48,12 @@ def door(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that work under these settings: JAX's are those of one thread."""
+    """Make threads that work under these settings: JAX's are those of one thread."""
     return ThreadPoolExecutor(threads, initializer=lambda: _held().__enter__())
 
 
 def _held(*given: Any) -> ExitStack:
-    """The settings that differ from those of the program, which come back at the end."""
+    """Set the settings that differ from those of the program, which come back at the end."""
     stack = ExitStack()
     for name, (setting, value) in _HELD.items():
         if getattr(jax.config, name) != value:

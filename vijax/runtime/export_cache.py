@@ -53,7 +53,7 @@ class Program:
         self._lock = Lock()
 
     def __call__(self, *args: Any) -> jax.Array:
-        """What the function returns, by the program for arguments of these shapes."""
+        """Call the function, by the program for arguments of these shapes."""
         leaves, tree = jax.tree.flatten(args)
         platform = next(iter(leaves[0].devices())).platform
         shapes = tuple((np.shape(x), str(x.dtype)) for x in leaves)
@@ -79,14 +79,14 @@ class Program:
 
 
 def cache_folder() -> Path | None:
-    """Where compiled programs are kept, if they are, on a disk."""
+    """Say where compiled programs are kept, if they are, on a disk."""
     asked = jax.config.values
     folder = asked["jax_compilation_cache_dir"] if asked["jax_enable_compilation_cache"] else None
     return Path(folder) if folder and "://" not in folder else None
 
 
 def _ours(tree: Any) -> bool:
-    """Whether no record in a tree of arguments is somebody else's, whose sources the digest does not see."""
+    """Say whether no record in a tree of arguments is somebody else's, whose sources the digest does not see."""
     node = tree.node_data()
     known = node is None or node[0].__module__.split(".")[0] in ("builtins", _PACKAGE.name)
     return known and all(map(_ours, tree.children()))
@@ -94,7 +94,7 @@ def _ours(tree: Any) -> bool:
 
 @lru_cache(maxsize=1)
 def source_digest(package: Path = _PACKAGE) -> str:
-    """Digest of what tracing depends on: this package with all its folders, and those that trace it."""
+    """Digest what tracing depends on: this package with all its folders, and those that trace it."""
     digest = _DIGEST(" ".join(map(version, TRACED_BY)).encode())
     for path in sorted(package.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -102,7 +102,7 @@ def source_digest(package: Path = _PACKAGE) -> str:
 
 
 def _read(path: Path) -> export.Exported | None:
-    """The program there, if it is there and whole."""
+    """Read the program there, if it is there and whole."""
     try:
         content = path.read_bytes()
     except OSError:

@@ -125,7 +125,7 @@ def recover(path: Path) -> None:
 
 
 def _is_other(process: int) -> bool:
-    """Whether another process of this number lives."""
+    """Say whether another process of this number lives."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):

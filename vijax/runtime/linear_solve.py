@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 
 def solve(matrix: Float[Array, "row row"], right: Float[Array, "row"]) -> Float[Array, "row"]:
-    """Solution of matrix x = right; differentiable in both, every order, forward and reverse.
+    """Solve matrix x = right; differentiable in both, every order, forward and reverse.
 
     Gauss and Jordan's elimination with partial pivoting; not finite where the matrix is singular.
     """
@@ -28,7 +28,7 @@ def _eliminated(matrix: Float[Array, "row row"], right: Float[Array, "row"]) -> 
     wide = jnp.concatenate([matrix, right[:, None]], axis=1)
 
     def clear(k, carry):
-        """Column k is cleared from all rows but the one that becomes its pivot; rows stay where they are."""
+        """Clear column k from all rows but the one that becomes its pivot; rows stay where they are."""
         wide, pivots = carry
         column = lax.dynamic_index_in_dim(wide, k, axis=1, keepdims=False)
         chosen = index == jnp.where(pivots < 0, jnp.abs(column), -1.0).argmax().astype(jnp.int32)

@@ -11,12 +11,12 @@ import numpy as np
 
 
 def workers() -> int:
-    """Threads that call programs on different tiles: one a core of a CPU, one for an accelerator."""
+    """Count the threads that call programs on different tiles: one a core of a CPU, one for an accelerator."""
     return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
 
 
 def places() -> list[jax.Device]:
-    """A device for every tile that is run at once: all of this process, and a CPU's as often as its cores want.
+    """List a device for every tile that is run at once: all of this process, a CPU's as often as its cores want.
 
     If one was chosen as JAX's default, that one alone. No tile is spread over several devices: XLA parts such a program
     before it optimises, and rounds otherwise than on one.
@@ -34,7 +34,7 @@ class Tile(NamedTuple):
 
 
 def tiles(count: int, sizes: tuple[int, ...]) -> list[Tile]:
-    """`count` rows in calls of few sizes, ascending, so that few programs are compiled for every number of rows.
+    """Cut `count` rows into calls of few sizes, ascending, so that few programs are compiled for every number of rows.
 
     The largest size at which at most every other row is padding, which costs as much as any.
     """
@@ -44,22 +44,22 @@ def tiles(count: int, sizes: tuple[int, ...]) -> list[Tile]:
 
 
 def padded(count: int) -> int:
-    """So many or some more: the next power of two, so that few programs are compiled for every number."""
+    """Round up to the next power of two, so that few programs are compiled for every number."""
     return 1 << max(count - 1, 0).bit_length()
 
 
 def library(tree: Any) -> Any:
-    """What cuts and joins arrays: NumPy, as JAX compiles a program for every size; JAX where something is traced."""
+    """Choose what cuts and joins arrays: NumPy, as JAX compiles for every size; JAX where something is traced."""
     return jnp if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)) else np
 
 
 def arrays(tree: Any) -> Any:
-    """The same with JAX's arrays for NumPy's: not by `jnp.asarray`, which compiles a program for every shape."""
+    """Turn NumPy's arrays into JAX's: not by `jnp.asarray`, which compiles a program for every shape."""
     return tree if library(tree) is jnp else jax.device_put(tree)
 
 
 def map_tiles(work: Callable[[Any], Any], rows: Any, sizes: tuple[int, ...]) -> Any:
-    """What the work makes of any number of rows, in padded tiles of few sizes; in one call where they are traced."""
+    """Do the work on any number of rows, in padded tiles of few sizes; in one call where they are traced."""
     if library(rows) is jnp:
         return work(rows)
     parts = []
@@ -71,7 +71,7 @@ def map_tiles(work: Callable[[Any], Any], rows: Any, sizes: tuple[int, ...]) -> 
 
 
 def elementwise(work: Callable[..., Any], *args: Any) -> Any:
-    """What the work makes of arrays that broadcast, padded to a power of two; in their shape where they are traced."""
+    """Do the work on arrays that broadcast, padded to a power of two; in their shape where they are traced."""
     shape = np.broadcast_shapes(*(np.shape(leaf) for leaf in jax.tree.leaves(args)))
     if not shape or library(args) is jnp:
         return work(*args)

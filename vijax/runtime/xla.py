@@ -43,7 +43,7 @@ before a program compiles to a third. XLA sees through it."""
 
 
 def _asked_for() -> bool:
-    """Whether the environment leaves kernels on.
+    """Say whether the environment leaves kernels on.
 
     Raises:
         ValueError: It says what is neither 0 nor 1.
@@ -67,7 +67,7 @@ def _in_kernels() -> bool:
 
 
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` of programs for the backend that JAX will use; what XLA_FLAGS says comes first."""
+    """Choose the options of `jax.jit` for the backend that JAX will use; what XLA_FLAGS says comes first."""
     said = os.environ.get("XLA_FLAGS", "")
     return {name: value for name, value in _CPU_OPTIONS.items() if name not in said} if _on_cpu() else {}
 
@@ -83,7 +83,7 @@ def _kept(value: Any) -> Any:
 
 
 def share(value: Any) -> Any:
-    """Store a value that several results need: XLA on CPU fuses one result at a time, and would compute it for each.
+    """Keep a value that several results need: XLA on CPU fuses one result at a time, and would compute it for each.
 
     A call that does nothing and stays a call. (A barrier is taken away before fusion, and no kernel may contain one;
     without kernels, and on accelerators, it is what JAX offers.)
@@ -102,7 +102,7 @@ def shared(work: Callable[P, T]) -> Callable[P, T]:
 
 
 def kernel(work: Callable[P, T]) -> Callable[P, T]:
-    """The function as one kernel: arithmetic, gathers, reductions and loops, no scatter, sort or library call."""
+    """Make one kernel of a function: arithmetic, gathers, reductions and loops, no scatter, sort or library call."""
     if not _in_kernels():
         return work
 
@@ -120,12 +120,12 @@ def kernel(work: Callable[P, T]) -> Callable[P, T]:
 
 
 def whole_blocks(count: int) -> int:
-    """So many lanes or some more: what `in_blocks` parts evenly."""
+    """Round lanes up to what `in_blocks` parts evenly."""
     return -(-count // _BLOCK) * _BLOCK if _in_kernels() else count
 
 
 def in_blocks(work: Callable[[T], T], lanes: T) -> T:
-    """`work` on all lanes, on the CPU block by block: lanes of one block do not wait for those of another."""
+    """Do `work` on all lanes, on the CPU block by block: lanes of one block do not wait for those of another."""
     count = jax.tree.leaves(lanes)[0].shape[0]
     if not _in_kernels() or count <= _BLOCK:
         return work(lanes)
@@ -134,7 +134,7 @@ def in_blocks(work: Callable[[T], T], lanes: T) -> T:
 
 
 def put(lanes: T, part: T, rows: Int[Array, "row"], count: Int[Array, ""]) -> T:
-    """`lanes` with the first `count` of these rows replaced by those of `part`.
+    """Replace the first `count` of these rows of `lanes` by those of `part`.
 
     On the CPU one after another: a scatter cannot be in a kernel, and what is merged otherwise is read in every lane.
     """
