@@ -30,13 +30,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import derivatives
 import jax
 import jax.numpy as jnp
 import numpy as np
-import yardstick
 
 import vijax
+from benchmarks import derivatives, yardstick
 from vijax.batch import simulate
 from vijax.batch.simulate import Starts
 from vijax.design import survey

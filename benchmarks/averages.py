@@ -32,12 +32,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import charts
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import vijax
+from benchmarks import charts
 from vijax.batch.simulate import Starts
 from vijax.design.survey import survey
 from vijax.design.variables import tuned, value_of

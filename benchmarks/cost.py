@@ -33,9 +33,9 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from speed import HERE, U0, V0, R, Row, axes
 
 import vijax
+from benchmarks.speed import HERE, U0, V0, R, Row, axes
 
 FREQUENCIES = 8
 LEVEL, INCLINED = 0.0, 0.1

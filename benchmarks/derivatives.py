@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
-from yardstick import DIGITS, mp_march
 
 import vijax
+from benchmarks.yardstick import DIGITS, mp_march
 from vijax.model.pair import ImpactPair
 from vijax.runtime.xla import compiler_options
 

@@ -26,13 +26,11 @@ from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-import malformed
-import malformed_lines
-from malformed import Case
+from benchmarks import malformed, malformed_lines
+from benchmarks.malformed import Case
 
 TABLES: dict[str, Callable[[], Iterator[Case]]] = {"calls": malformed.calls, "lines": malformed_lines.lines}
 MOST_UNCLEAR = 0.01
-_SCRIPTS = Path(__file__).parent.parent / "scripts"
 _MEMORY = 16  # GiB of addresses, most of which nobody touches
 _LONGEST = 400  # characters of a line that can be read at a glance
 _HERE = (Path(malformed.__file__).parent, Path(malformed.vijax.__file__).parent)
@@ -85,7 +83,6 @@ def _either(name: str) -> str:
 
 def _serve(table: str, ours: Connection) -> None:
     """Try the cases whose numbers come in, in a process of its own."""
-    sys.path.insert(0, str(_SCRIPTS))  # before benchmarks, one of which is called as a script is
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY << 30, _MEMORY << 30))
     # What a door lets through writes here, and what XLA says of it is not asked for.
     os.chdir(tempfile.mkdtemp())

@@ -31,15 +31,14 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import charts
 import jax
 import jax.numpy as jnp
 import mpmath
-import naive
 import numpy as np
-from peers import rk4
 
 import vijax
+from benchmarks import charts, naive
+from benchmarks.peers import rk4
 from vijax.batch.run_records import Trajectory
 from vijax.engine import exact
 from vijax.engine.ode import Ode

@@ -41,8 +41,7 @@ SCRIPT = Path(__file__).parent.parent / "scripts" / "grid.py"
 WRAPPER = (
     "import logging, runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "logging.basicConfig(format='%(message)s'); logging.getLogger('vijax').setLevel(logging.INFO); "
-    "sys.argv = sys.argv[1:]; "
-    "sys.path[0] = sys.argv[0].rpartition('/')[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
+    "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
 )
 _WARM = 182  # the least side whose tiles are as large as any, so that they are compiled
 _REACH = 0.6  # of a tile's time past the first tile, up to which moments are drawn: most kills find none done

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from functools import partial
 from importlib import import_module
 
-from malformed import HUGE, Case
+from benchmarks.malformed import HUGE, Case
 
 # Texts of an axis that are none, and of axes that run away.
 VALUES = (
@@ -284,5 +284,5 @@ def _run(script: str, arguments: tuple[str, ...]) -> int:
 
     if script == "vijax":
         return main.main(list(arguments))
-    module = import_module(_MODULES.get(script, script))
+    module = import_module(f"scripts.{_MODULES.get(script, script)}")
     return process.run(getattr(module, script), list(arguments))

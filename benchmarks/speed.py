@@ -80,7 +80,9 @@ def sweep(side: int, periods: int, outputs: tuple[str, ...] = ("impacts_per_peri
 
 def peer(side: int, periods: int) -> np.ndarray:
     """Count the plane's impacts per period by RK4."""
-    from peers import rk4_impacts_per_period  # here: --scaling and --large do without numba, in time and memory
+    from benchmarks.peers import (
+        rk4_impacts_per_period,  # here: --scaling and --large do without numba, in time and memory
+    )
 
     return rk4_impacts_per_period(*cells(side), R, U0, V0, periods, PEER_STEPS)
 
@@ -135,7 +137,7 @@ def against_peer(quick: bool) -> Iterator[Row]:
 
 def accuracy(side: int) -> None:
     """Print the peer's error on the plane, and that of vijax on the stored impacts of 50 digits."""
-    from peers import rk4
+    from benchmarks.peers import rk4
 
     d, kappa = cells(side)
     _, u, v = rk4(d, kappa, R, U0, V0, ACCURACY_PERIODS, PEER_STEPS)
@@ -199,7 +201,7 @@ def large(quick: bool) -> Iterator[Row]:
 
 def ode(quick: bool) -> Iterator[Row]:
     """Time the ode engine and a plain diffrax restart chain, warm, and tell how wrong either is after some periods."""
-    from peers import diffrax_chain
+    from benchmarks.peers import diffrax_chain
 
     side, periods, chained, repeats = (24, 10, 2, 1) if quick else (64, 100, ACCURACY_PERIODS, 3)
     d, kappa = cells(side)

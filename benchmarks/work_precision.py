@@ -29,11 +29,10 @@ import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
-import peers
-import yardstick
-from charts import work_precision
 
 import vijax
+from benchmarks import peers, yardstick
+from benchmarks.charts import work_precision
 
 HERE = Path(__file__).parent
 CHART = HERE.parent / "scripts" / "gallery" / "work_precision.png"

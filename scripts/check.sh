@@ -11,7 +11,7 @@ ruff check .
 ruff format --check .
 lint-imports
 # Types are checked beside the tests, which leave a core idle as they begin and end; what mypy says comes last.
-(mypy && mypy benchmarks) >.venv/types.txt 2>&1 &
+mypy >.venv/types.txt 2>&1 &
 types=$!
 failed=0
 # A file to a process: the programs that its tests share are compiled once.

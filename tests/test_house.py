@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
-import house
 import pytest
+
+from scripts import house
 
 ROOT = Path(__file__).parent.parent
 FOLDERS = ("vijax", "scripts", "benchmarks", "tests")

@@ -13,12 +13,12 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
-import house
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import vijax
+from scripts import house
 
 ROOT = Path(__file__).parent.parent
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]

@@ -13,9 +13,6 @@ from pathlib import Path
 
 import click
 
-if not __package__:  # run as a folder: it is on the path itself, and not what stands beside it
-    sys.path[0] = str(Path(__file__).resolve().parent.parent)
-
 from vijax.cli import process
 
 _STARTED = time.perf_counter()
@@ -48,7 +45,7 @@ def paper(figure: str | None, claims: bool, into: str, overwrite: bool) -> None:
 
 
 def _numbers(text: str) -> list[int]:
-    from paper.captions import FIGURES
+    from scripts.paper.captions import FIGURES
 
     if text == "all":
         return list(FIGURES)
@@ -65,8 +62,8 @@ def _target(folder: str, name: str, overwrite: bool) -> Path:
 
 
 def _draw(number: int, file: Path) -> None:
-    from paper import figures
-    from paper.captions import FIGURES
+    from scripts.paper import figures
+    from scripts.paper.captions import FIGURES
 
     began = time.perf_counter()
     figures.draw(number, file)
@@ -76,7 +73,7 @@ def _draw(number: int, file: Path) -> None:
 
 
 def _check(file: Path) -> None:
-    from paper import claims
+    from scripts.paper import claims
     from vijax.runtime.files import replacing
 
     rows = []

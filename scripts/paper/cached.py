@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from paper.captions import GAP_IN_METRES, Run
+from scripts.paper.captions import GAP_IN_METRES, Run
 from vijax.model.device import Harvester
 from vijax.model.pair import impact_pair
 from vijax.orbits import continuation, orbit_search, periodic

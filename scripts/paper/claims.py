@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from paper import evidence
-from paper.cached import branches, diagram, orbits
-from paper.captions import (
+from scripts.paper import evidence
+from scripts.paper.cached import branches, diagram, orbits
+from scripts.paper.captions import (
     BRANCHES_FROM,
     BRANCHES_WITHIN,
     BY_FREQUENCY,

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from paper.cached import diagram
-from paper.captions import GAP_IN_METRES, Run
+from scripts.paper.cached import diagram
+from scripts.paper.captions import GAP_IN_METRES, Run
 from vijax.model.device import Harvester
 from vijax.model.label import label
 from vijax.orbits.continuation import Branch

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from paper.cached import branches, diagram, orbits
-from paper.captions import BRANCHES_FROM, BRANCHES_WITHIN, FIGURES, PaperFigure, Run, Source, View
-from paper.portrait import Layer, Panel, phase_plane, small_multiples, time_series
+from scripts.paper.cached import branches, diagram, orbits
+from scripts.paper.captions import BRANCHES_FROM, BRANCHES_WITHIN, FIGURES, PaperFigure, Run, Source, View
+from scripts.paper.portrait import Layer, Panel, phase_plane, small_multiples, time_series
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.quantities import AXES
 from vijax.orbits.motion import Curve, curve, states

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from yardstick import TILE, march, pairs, start
 
+from benchmarks.yardstick import TILE, march, pairs, start
 from vijax.batch.impact_map import next_impacts
 from vijax.model.pair import impact_pair
 

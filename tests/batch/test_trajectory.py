@@ -5,9 +5,9 @@ import math
 import jax
 import numpy as np
 import pytest
-from derivatives import derivatives, differences, events, relative
 
 import vijax
+from benchmarks.derivatives import derivatives, differences, events, relative
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Status
 

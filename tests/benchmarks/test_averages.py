@@ -1,9 +1,9 @@
 """What `benchmarks/averages.py` keeps and says of its rows."""
 
-import averages
-import charts
 import numpy as np
 import pytest
+
+from benchmarks import averages, charts
 
 ROWS = [
     averages.Row("cells", "0", "ensemble", "kappa", 4096, -2.01, 0.02, -2.0, 0.01, "smooth"),

@@ -3,11 +3,11 @@
 import math
 from functools import cache
 
-import charts
-import failures
 import matplotlib.image
 import numpy as np
 import pytest
+
+from benchmarks import charts, failures
 
 
 @cache

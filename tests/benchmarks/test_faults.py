@@ -12,13 +12,13 @@ import sys
 import time
 from pathlib import Path
 
-import grid as script
 import jax
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import SCRIPTS, stand_in
 
+from scripts import grid as script
+from tests.helpers import stand_in
 from vijax import plots
 from vijax.batch import simulate
 from vijax.cli import process
@@ -60,7 +60,7 @@ def is_undisturbed(path):
     assert not list(Path(path).rglob("*.part*"))
 
 
-CHILD = "import sys; sys.path[:0] = sys.argv[1:4]; import test_faults; test_faults.child(sys.argv[4:])"
+CHILD = "import sys; from tests.benchmarks import test_faults; test_faults.child(sys.argv[1:])"
 
 
 def child(arguments):
@@ -71,9 +71,8 @@ def child(arguments):
 
 
 def started(folder):
-    paths = [str(SCRIPTS), *map(str, Path(__file__).parents[:2])]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([sys.executable, "-c", CHILD, *paths, *ARGUMENTS], cwd=folder, **pipes)
+    return subprocess.Popen([sys.executable, "-c", CHILD, *ARGUMENTS], cwd=folder, **pipes)
 
 
 def wait_for_tiles(folder, process, number):

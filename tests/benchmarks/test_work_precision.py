@@ -7,8 +7,9 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-import work_precision as tool
-from charts import work_precision
+
+from benchmarks import work_precision as tool
+from benchmarks.charts import work_precision
 
 EXACT = 1e-14  # worst measured: 2e-16
 PER_STEP = 5.0  # least gain of a hundredth of the tolerance

@@ -2,10 +2,10 @@
 
 import re
 
-import basins as script
 import numpy as np
 import pytest
 
+from scripts import basins as script
 from vijax.cli import process
 from vijax.planes import sweep
 

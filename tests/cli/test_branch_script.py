@@ -1,9 +1,9 @@
 """`scripts/branch.py`: where its branches begin, and nothing at all after bad input."""
 
-import branch as script
 import pytest
 
 import vijax
+from scripts import branch as script
 
 SHAKEN = ["--wall", "rigid", "--A", "100", "--guesses", "32", "--generations", "0"]
 

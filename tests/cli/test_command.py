@@ -10,9 +10,10 @@ from importlib import import_module
 
 import click
 import pytest
-from helpers import SCRIPTS
 
 import vijax
+from scripts import grid
+from tests.helpers import SCRIPTS
 from vijax.cli import main as command
 from vijax.cli import process
 from vijax.engine.method_choice import choose, record
@@ -81,7 +82,7 @@ def test_the_command_and_the_script_write_and_say_the_same(folder, capsys, monke
     ends = []
     for place, run in (
         ("command", lambda: command.main([name, *arguments])),
-        ("script", lambda: import_module(script).main(given)),
+        ("script", lambda: import_module(f"scripts.{script}").main(given)),
     ):
         (folder / place).mkdir()
         monkeypatch.chdir(folder / place)
@@ -97,7 +98,7 @@ def test_the_command_and_the_script_write_and_say_the_same(folder, capsys, monke
 @pytest.mark.parametrize("script", DOORS.values())
 def test_a_script_and_its_subcommand_have_the_same_options(script):
     name = next(page for page, door in DOORS.items() if door == script)
-    theirs = {option.name: option.opts for option in getattr(import_module(script), script).params}
+    theirs = {option.name: option.opts for option in getattr(import_module(f"scripts.{script}"), script).params}
     ours = {option.name: option.opts for option in page(name).params}
     more = {"compare", "tolerance"} if name == "sweep" else set()
     assert theirs == ours | {option: [f"--{option}"] for option in more}
@@ -188,12 +189,11 @@ def test_help_has_every_option_in_one_section_and_ends_with_the_examples(capsys,
 
 def test_help_needs_no_jax():
     code = (
-        "import sys; from vijax.cli.main import main; import grid; "
+        "import sys; from vijax.cli.main import main; from scripts import grid; "
         f"codes = [main([*page, '--help']) for page in ([], *([name] for name in {PAGES}))]; "
         "print(codes, grid.main(['--help']), {'jax', 'numpy', 'xarray', 'matplotlib'} & set(sys.modules))"
     )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout.splitlines()[-1] == "[0, 0, 0, 0, 0, 0, 0] 0 set()"
 
 
@@ -229,10 +229,10 @@ def test_examples_pass_all_doors(begun, line):
         command.main(shlex.split(line))
 
 
-@pytest.mark.parametrize("line", import_module("grid").grid.examples)
+@pytest.mark.parametrize("line", grid.grid.examples)
 def test_examples_of_the_script_pass_all_doors(begun, line):
     with pytest.raises(BegunError):
-        import_module("grid").main(shlex.split(line))
+        grid.main(shlex.split(line))
 
 
 # --- completion ------------------------------------------------------------------------------------------------------

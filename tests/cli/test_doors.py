@@ -5,16 +5,15 @@ from functools import partial
 from io import StringIO
 from itertools import islice
 
-import doors
-import grid as script
 import jax
 import jax.numpy as jnp
-import malformed
 import numpy as np
 import pytest
-from helpers import stand_in
 
 import vijax
+from benchmarks import doors, malformed
+from scripts import grid as script
+from tests.helpers import stand_in
 from vijax.batch import simulate
 from vijax.cli import arguments, process
 from vijax.planes import estimate, sweep

@@ -8,12 +8,12 @@ import subprocess
 import sys
 import time
 
-import grid as script
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import SCRIPTS
 
+from scripts import grid as script
+from tests.helpers import SCRIPTS
 from vijax.cli import closing, process, progress
 from vijax.model.records import Status
 from vijax.planes import dataset, sweep
@@ -31,9 +31,8 @@ def folder(tmp_path, monkeypatch):
 
 # A background job of a shell ignores SIGINT, and so would its children.
 INTERRUPTIBLE = (
-    "import os, runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "sys.argv = sys.argv[1:]; sys.path[0] = os.path.dirname(sys.argv[0]); "
-    "runpy.run_path(sys.argv[0], run_name='__main__')"
+    "import runpy, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0], run_name='__main__')"
 )
 
 

@@ -1,10 +1,10 @@
 """`scripts/orbit_diagram.py`: from its arguments to a store and a picture, and nothing at all after bad input."""
 
 import numpy as np
-import orbit_diagram as script
 import pytest
 
 import vijax
+from scripts import orbit_diagram as script
 
 TINY = ["--along", "d=0.3:0.2:3", "--kappa", "40,400", "--periods", "120", "--keep", "2"]
 

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from yardstick import reference_rows
 
+from benchmarks.yardstick import reference_rows
 from vijax.batch import lanes, perturbed, rows, simulate, summary
 from vijax.design.average import Smoothness, average
 from vijax.model.device import CONSTANTS, Harvester

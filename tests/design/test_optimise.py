@@ -7,13 +7,13 @@ import dataclasses
 import json
 import math
 
-import design as script
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import vijax
+from scripts import design as script
 from vijax.cli import design as page
 from vijax.cli import process
 from vijax.design import objective, off_design, optimise

@@ -4,7 +4,8 @@ import jax
 import mpmath as mp
 import numpy as np
 import pytest
-from yardstick import (
+
+from benchmarks.yardstick import (
     DIGITS,
     EPS,
     RIGID,
@@ -26,7 +27,6 @@ from yardstick import (
     sensitive,
     start,
 )
-
 from vijax.engine import contact_search
 from vijax.model import flow
 from vijax.model.records import State

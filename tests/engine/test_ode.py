@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from yardstick import reference_trajectories
 
 import vijax
+from benchmarks.yardstick import reference_trajectories
 from vijax.engine import dense_output, ode
 from vijax.engine.ode import Ode
 from vijax.engine.rk4 import Rk4

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from yardstick import EPS, HORIZON, TILE, both_ways, march, pairs, start
 
+from benchmarks.yardstick import EPS, HORIZON, TILE, both_ways, march, pairs, start
 from vijax.engine import contact_search, exact, quick, quick_contact
 from vijax.engine.impact import Ball
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from yardstick import DIGITS, EPS, mp_flight, mp_oscillate
 
+from benchmarks.yardstick import DIGITS, EPS, mp_flight, mp_oscillate
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 

@@ -3,11 +3,11 @@
 import math
 
 import numpy as np
-import orbit_diagram as diagram_script
 import pint
 import pytest
 
 import vijax
+from scripts import orbit_diagram as diagram_script
 from vijax.design import variables
 from vijax.model import quantities, units
 from vijax.model.device import CONSTANTS, Harvester, with_constants

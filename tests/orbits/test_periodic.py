@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from yardstick import reference_orbits, reference_rows
 
+from benchmarks.yardstick import reference_orbits, reference_rows
 from vijax.model.device import Harvester
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status

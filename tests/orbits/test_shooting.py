@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from yardstick import reference_orbits
 
+from benchmarks.yardstick import reference_orbits
 from vijax.model.pair import impact_pair
 from vijax.orbits import shooting
 from vijax.orbits.shooting import Sequence

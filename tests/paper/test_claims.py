@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from paper import claims, evidence, figures
-from paper.cached import diagram
-from paper.captions import RIGID, Source
+
+from scripts.paper import claims, evidence, figures
+from scripts.paper.cached import diagram
+from scripts.paper.captions import RIGID, Source
 
 REFERENCE = {c["id"]: c for c in json.loads((Path(__file__).parents[1] / "data" / "claims.json").read_text())}
 

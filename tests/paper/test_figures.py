@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from paper import captions
-from paper.captions import FIGURES
+
+from scripts.paper import captions
+from scripts.paper.captions import FIGURES
 
 NUMBERS = range(3, 17)
 

@@ -1,10 +1,9 @@
 """`scripts/paper`: which figures it draws and where, the table of claims, and nothing at all after bad input."""
 
-import helpers  # noqa: F401, as it puts the scripts on the path
 import pytest
-from paper import __main__ as script
-from paper import claims, figures
 
+from scripts.paper import __main__ as script
+from scripts.paper import claims, figures
 from vijax.cli import process
 
 

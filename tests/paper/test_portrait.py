@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from paper.portrait import Layer, Panel, _wrapped, phase_plane, small_multiples, time_series
 
+from scripts.paper.portrait import Layer, Panel, _wrapped, phase_plane, small_multiples, time_series
 from vijax.orbits.motion import Curve
 
 CIRCLE = np.linspace(0, 2 * np.pi, 50)

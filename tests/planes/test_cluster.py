@@ -17,8 +17,8 @@ import distributed
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import stand_in
 
+from tests.helpers import stand_in
 from vijax.batch import simulate
 from vijax.planes import cluster, tiled_store
 from vijax.planes import sweep as sweeps

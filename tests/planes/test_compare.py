@@ -2,11 +2,11 @@
 
 import math
 
-import grid as script
 import numpy as np
 import pytest
 import xarray as xr
 
+from scripts import grid as script
 from vijax import plots
 from vijax.cli import process
 from vijax.model.records import Status

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import stand_in
 
+from tests.helpers import stand_in
 from vijax.batch import simulate
 from vijax.model.device import Harvester
 from vijax.model.membrane import HuntCrossley

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from helpers import stand_in
 
+from tests.helpers import stand_in
 from vijax.batch import simulate
 from vijax.model.device import Harvester
 from vijax.model.records import Status
