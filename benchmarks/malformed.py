@@ -451,7 +451,13 @@ CALLS: Table = {
     "weighted": (
         weighted,
         {"design": a_design()},
-        {"design": (3, None, "best"), "starts": COUNT, "reach": (*REAL, 0, -1, 2.0), "seed": SEED},
+        {
+            "design": (3, None, "best"),
+            "starts": COUNT,
+            "reach": (*REAL, 0, -1, 2.0),
+            "points": (*COUNT, 2),
+            "seed": SEED,
+        },
     ),
     "report.describe": (
         report.describe,

@@ -175,6 +175,8 @@ LINES: Lines = {
             "survey-points survey_points": (*COUNTS, "1", "10000000000"),
             "starts": (*COUNTS, "10000000000"),
             "max-impacts max_impacts": (*COUNTS, "10000000000"),
+            "diagram-points diagram_points": (*COUNTS, "1", "10000000000"),
+            "basin-starts basin_starts": (*COUNTS, "10000000000"),
             "over": ("", "d", "r", "r=", "r=x", "r=0", "=1", "omega0=20:40:3", "mass=1", "u0=0.1", "d=0.1:0.2:3"),
             "d": ("0", "0.1,0.2", "x"),
             "set": ("=1", "V=x"),

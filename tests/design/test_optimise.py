@@ -14,7 +14,6 @@ import pytest
 
 import vijax
 from scripts import design as script
-from vijax.cli import design as page
 from vijax.cli import process
 from vijax.design import objective, off_design, optimise
 from vijax.design import report as reports
@@ -204,10 +203,9 @@ def test_devices_that_cannot_be_designed_are_told():
         optimise.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
 
 
-def test_weighing_basins_moves_away_from_where_few_starts_lead(found, monkeypatch):
-    monkeypatch.setattr(around, "_POINTS", 5)
+def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
     nominal = found[0].best
-    best = around.weighted(found[0], starts=16)
+    best = around.weighted(found[0], starts=16, points=5)
     assert best.height >= float(nominal.state.P) * around.surroundings(nominal, starts=16).share
     assert best.height <= float(best.state.P) * (1 + 1e-9)
     assert int(best.orbit.status[0]) == Status.OK
@@ -219,6 +217,7 @@ def test_weighing_basins_moves_away_from_where_few_starts_lead(found, monkeypatc
 # --- the script ------------------------------------------------------------------------------------------------------
 
 FEW = ["--survey-points", "128", "--starts", "1", "--max-impacts", "2"]
+SHOWN = ["--diagram-points", "12", "--basin-starts", "100"]
 SMALL = ["--r", "0.5", "--A", "3", "--omega", "10pi", "--set", "V=1700"]
 
 BAD = [
@@ -239,6 +238,9 @@ BAD = [
     (["--starts", "0"], "starts must be a whole number of at least 1; got 0"),
     (["--survey-points", "1"], "survey_points must be a whole number of at least 2; got 1"),
     (["--max-impacts", "0"], "max_impacts must be a whole number of at least 1; got 0"),
+    (["--diagram-points", "1"], "diagram_points must be a whole number of at least 2; got 1"),
+    (["--diagram-points", "1000000"], "diagram_points must be a whole number of at most 100,000; got 1000000"),
+    (["--basin-starts", "0"], "basin_starts must be a whole number of at least 1; got 0"),
     (["--over", "d"], "over must be NAME=VALUES"),
     (["--over", "u0=0:0.1:3"], "over must be NAME=VALUES"),
     (["--over", "d=0.1:0.2:3", "--d", "0.2"], "over must name an axis that is not given besides"),
@@ -285,11 +287,8 @@ def test_a_report_is_strict_json_whole_or_not_at_all(folder):
     assert [path.name for path in folder.iterdir()] == ["one.json"]
 
 
-def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys, monkeypatch):
-    monkeypatch.setattr(page, "_POINTS", 12)
-    monkeypatch.setattr(page, "_NEAR", 8)
-    monkeypatch.setattr(page, "_BASINS", 100)
-    assert script.main(["--d", "0.2", *SMALL, *FEW, "--tolerance", "omega0=5%"]) == 0
+def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys):
+    assert script.main(["--d", "0.2", *SMALL, *FEW, *SHOWN, "--tolerance", "omega0=5%"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["design.json", "design.png"]
     report, said = strict(folder / "design.json"), capsys.readouterr().out
     best = report["best"]
@@ -343,11 +342,8 @@ def test_designs_along_an_axis(folder, capsys):
     assert max(int(left) + int(right) for left, right in found) > 2
 
 
-def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder, capsys, monkeypatch):
-    monkeypatch.setattr(page, "_POINTS", 24)
-    monkeypatch.setattr(page, "_NEAR", 8)
-    monkeypatch.setattr(page, "_BASINS", 100)
-    assert script.main(["--d", "0.2", "--out", "paper.json", *FEW]) == 0
+def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder, capsys):
+    assert script.main(["--d", "0.2", "--out", "paper.json", *FEW, *SHOWN]) == 0
     report, said = strict(folder / "paper.json"), capsys.readouterr().out
     assert max(report["best"]["penetration"]) == pytest.approx(report["best"]["penetration_limit"], rel=1e-6)
     assert "held by: penetration limit" in said
@@ -357,12 +353,9 @@ def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder
     assert not (folder / "design.png").exists()
 
 
-def test_chaos_is_a_design_with_its_standard_error(folder, capsys, monkeypatch):
-    monkeypatch.setattr(page, "_POINTS", 8)
-    monkeypatch.setattr(page, "_NEAR", 8)
-    monkeypatch.setattr(page, "_BASINS", 100)
+def test_chaos_is_a_design_with_its_standard_error(folder, capsys):
     chaos = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--survey-points", "4", "--starts", "2"]
-    assert script.main([*chaos, "--max-impacts", "2"]) == 0
+    assert script.main([*chaos, *SHOWN, "--max-impacts", "2"]) == 0
     said, report = capsys.readouterr().out, strict(folder / "design.json")
     best = report["best"]
     assert (best["label"], best["active"]) == ("aperiodic", ["lower bound of kappa"])
@@ -379,10 +372,10 @@ def test_chaos_is_a_design_with_its_standard_error(folder, capsys, monkeypatch):
     assert (folder / "design.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_where_no_motion_keeps_the_limits_the_report_says_which_stands(folder, capsys, monkeypatch):
-    monkeypatch.setattr(page, "_POINTS", 8)
+def test_where_no_motion_keeps_the_limits_the_report_says_which_stands(folder, capsys):
     shallow = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--survey-points", "4", "--starts", "2"]
-    assert script.main([*shallow, "--max-impacts", "2", "--set", "penetration_limit=1e-6", "--out", "none.json"]) == 0
+    shallow += ["--max-impacts", "2", "--set", "penetration_limit=1e-6", "--out", "none.json"]
+    assert script.main([*shallow, *SHOWN]) == 0
     said, met = capsys.readouterr().out, strict(folder / "none.json")["survey"]
     assert strict(folder / "none.json")["best"] is None
     assert met["limit"] == "penetration limit"

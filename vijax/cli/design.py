@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from vijax.model.device import Harvester
 
 _FILES = ("design.json", "design.png")
-_POINTS, _NEAR = 320, 160  # the picture shows P at so many points, its close view at so many more
 _OVER_TOLERANCES = ("mean", "worst", "expected")
-_BASINS = 2000  # starts that show what attracts at the optimum
+_MOST_POINTS = 100_000  # of the picture, which is computed at each
 _STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the last
 
 
@@ -40,12 +39,16 @@ class Asked:
         devices: One, or one for each value of the axis `over`.
         over: The axis along which designs are wanted, and its values.
         tolerances: By how much constants may be off.
+        diagram_points: Values at which the picture shows P, half as many more close by the best design.
+        basin_starts: Starts that show what attracts there.
         search: Of the arguments of `optimise_all` all the others.
     """
 
     devices: "list[Harvester]"
     over: "tuple[str, np.ndarray] | None"
     tolerances: "tuple[Tolerance, ...]"
+    diagram_points: int
+    basin_starts: int
     search: dict[str, Any]
 
 
@@ -85,9 +88,13 @@ def _asked(
     survey_points: int,
     starts: int,
     max_impacts: int,
+    diagram_points: int,
+    basin_starts: int,
     **given: Any,
 ) -> Asked:
     from vijax.design import optimise
+    from vijax.planes.basins import MOST_STARTS
+    from vijax.runtime import checks
 
     names = tuple(name.strip() for name in tune.split(","))
     along, devices = _devices(over, take_axes(given, {}), device(constants), names)
@@ -98,9 +105,10 @@ def _asked(
     share = optimise.check_motion(motion, objective, part("reliability", reliability))
     search: dict[str, Any] = {"tune": names, "bounds": within, "objective": objective, "tolerances": weighed}
     search |= {"motion": motion, "reliability": share}
-    return Asked(
-        devices, along, scatter, search | {"survey_points": survey_points, "starts": starts, "max_impacts": max_impacts}
-    )
+    search |= {"survey_points": survey_points, "starts": starts, "max_impacts": max_impacts}
+    points = checks.whole("diagram_points", diagram_points, 2, _MOST_POINTS)
+    balls = checks.whole("basin_starts", basin_starts, 1, MOST_STARTS)
+    return Asked(devices, along, scatter, points, balls, search)
 
 
 def _agree(asked: Asked, yes: bool) -> None:
@@ -124,10 +132,10 @@ def _run(asked: Asked) -> "tuple[dict[str, Any], xr.Dataset | None, str]":
         show(1, stages)
         if alone:
             waiting("orbit diagram")
-            diagram = _diagram(found[0], asked.devices[0])
+            diagram = _diagram(found[0], asked.devices[0], asked.diagram_points)
             show(2, stages)
         waiting("surroundings and tolerances")
-        told = [report.describe(one, diagram=diagram, **_judged(one, asked.tolerances, alone)) for one in found]
+        told = [report.describe(one, diagram=diagram, **_judged(one, asked, alone)) for one in found]
         show(stages, stages)
     climbed = f"{sum(one.ascents for one in found):,} ascents in {seconds:.1f} s"
     if asked.over is None:
@@ -207,7 +215,7 @@ def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
         return check_tolerances(found)
 
 
-def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
+def _diagram(found: "Design", device: "Harvester", points: int) -> "xr.Dataset":
     """Compute P up and down along the first tuned axis, closer by about the best design, all else as there."""
     import numpy as np
 
@@ -218,25 +226,26 @@ def _diagram(found: "Design", device: "Harvester") -> "xr.Dataset":
     along = next((name for name in found.tune if name in PARAMETERS), "omega0")
     device = found.best.device if found.best else device
     low, high = limits((along,), {along: found.bounds[along]} if along in found.bounds else {}, device)[:, 0]
-    values = (np.linspace if along in LINEAR else np.geomspace)(low, high, _POINTS)
+    values = (np.linspace if along in LINEAR else np.geomspace)(low, high, points)
     if found.best is not None and along in found.best.values:
         first, last = close_view(along, found.best.values[along])
-        near = np.linspace(max(first, low), min(last, high), _NEAR)
+        near = np.linspace(max(first, low), min(last, high), points // 2)
         values = np.unique(np.concatenate([values, near]))
     return orbit_diagram(along=along, values=values, direction="both", device=device)
 
 
-def _judged(found: "Design", scatter: "tuple[Tolerance, ...]", alone: bool) -> dict[str, Any]:
+def _judged(found: "Design", asked: Asked, alone: bool) -> dict[str, Any]:
     """Find what becomes of the best design over the tolerances; what lies around it, where it is the only one."""
     from vijax.design.off_design import arrival, extents
     from vijax.design.optimise import under
     from vijax.design.robustness import surroundings
 
+    scatter = asked.tolerances
     if found.best is None:
         return {"tolerances": scatter}
     judged: dict[str, Any] = {"tolerances": scatter, "spread": under(found.best, scatter) if scatter else None}
     if alone:
-        judged["surroundings"] = surroundings(found.best, starts=_BASINS)
+        judged["surroundings"] = surroundings(found.best, starts=asked.basin_starts)
         judged |= {"extents": extents(found.best), "arrival": arrival(found.best)}
     return judged
 
@@ -271,6 +280,10 @@ def _sections() -> Sections:
             ),
             click.Option(["--starts"], type=Whole(1), default=8, help="starts of the survey at each of them", **shown),
             click.Option(["--max-impacts"], type=Whole(1), default=16, help="most impacts of an orbit", **shown),
+        ],
+        "Report": [
+            click.Option(["--diagram-points"], type=Whole(2), default=320, help="values at which P is shown", **shown),
+            click.Option(["--basin-starts"], type=Whole(1), default=2000, help="balls that show basins", **shown),
         ],
         "Device": [*options.axis_options(PARAMETERS), *options.device_options()],
         "Files": options.file_options(".json", "report"),

@@ -21,7 +21,7 @@ from vijax.runtime import checks
 from vijax.runtime.context import door
 
 _SAME = 1e-6  # relative difference of P within which an attractor is the optimum's own orbit
-_POINTS = 17  # a line search looks at so many, first coarsely, then finely
+_MOST_POINTS = 10_000  # of a line search, which flies `starts` balls at each
 _STEPS = 8  # an orbit follows its device in so many steps
 
 
@@ -121,7 +121,9 @@ def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
 
 
 @door
-def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int | None = None) -> Optimum | None:
+def weighted(
+    design: Design, *, starts: int = 500, reach: float = 0.2, points: int = 17, seed: int | None = None
+) -> Optimum | None:
     """Find the design of most P times basin share, by line searches from the optima along each tuned quantity in turn.
 
     Shares come from simulated starts: they have no gradient.
@@ -130,6 +132,7 @@ def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int
         design: Whose optima are set out from, those that P alone cannot put ahead left out.
         starts: Of balls at every point.
         reach: How far a search goes, in parts of the quantity.
+        points: Values at which a search looks, first coarsely, then as many about the best of these.
         seed: Of starts drawn at random.
 
     Returns:
@@ -140,15 +143,16 @@ def weighted(design: Design, *, starts: int = 500, reach: float = 0.2, seed: int
     """
     checks.instance("design", design, Design, "vijax.optimise(...)")
     starts, reach, seed = checks.whole("starts", starts, 1, MOST_STARTS), _checked(reach), checks.seed(seed)
+    points = checks.whole("points", points, 3, _MOST_POINTS)
     best: Optimum | None = None
     for one in design.optima:
         if isinstance(one, Optimum) and (best is None or best.height < one.P):
-            found = _searched(design, one, starts, reach, seed)
+            found = _searched(design, one, starts, reach, points, seed)
             best = found if best is None or found.height > best.height else best
     return best
 
 
-def _searched(design: Design, optimum: Optimum, starts: int, reach: float, seed: int | None) -> Optimum:
+def _searched(design: Design, optimum: Optimum, starts: int, reach: float, points: int, seed: int | None) -> Optimum:
     names = design.tune
     low, high = (variables(names, [design.bounds[name][side] for name in names]) for side in (0, 1))
     z = variables(names, [optimum.values[name] for name in names])
@@ -159,9 +163,9 @@ def _searched(design: Design, optimum: Optimum, starts: int, reach: float, seed:
 
     height = score(z)
     for index in range(len(names)):
-        for span in (reach, 2 * reach / (_POINTS - 1)):
-            line = np.tile(z, (_POINTS, 1))
-            line[:, index] += span * np.linspace(-1, 1, _POINTS)
+        for span in (reach, 2 * reach / (points - 1)):
+            line = np.tile(z, (points, 1))
+            line[:, index] += span * np.linspace(-1, 1, points)
             line = np.unique(np.clip(line, low, high), axis=0)
             scores = [score(point) for point in line]
             if max(scores) > height:
