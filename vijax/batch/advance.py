@@ -16,8 +16,11 @@ from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
 
-QUIET = 64  # periods beyond the last one in which the end of a flight is still looked for
-_FOR_EVER = 1e7  # half periods
+# Forcing periods beyond the last one in which the end of a flight is still looked for. With fewer, a slow ball that has
+# a wall ahead of it is told to meet none.
+QUIET = 64
+# Half periods of the forcing that a ball which only drifts takes to cross the gap if it is to count as meeting no wall.
+_FOR_EVER = 1e7
 
 
 def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:

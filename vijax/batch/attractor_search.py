@@ -16,8 +16,12 @@ from vijax.model.records import Status
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
 
-MAX_PERIOD = 32  # longest recurrence, in forcing periods, that counts as periodic
-_ROUNDS = 8  # Newton rounds on one candidate
+# Longest recurrence, in forcing periods, that counts as periodic; what takes longer is chaos, or undecided. With a
+# larger one chaos comes back by chance more often, and each time costs a search.
+MAX_PERIOD = 32
+# Newton rounds on one candidate, each an orbit long. The digits double in each: what has none after so many is no
+# orbit.
+_ROUNDS = 8
 _SHORT = 8  # longest period, in forcing periods, of an orbit whose surroundings are taken to be wide
 # Solving for Newton's step multiplies rounding. A step that stalls has arrived for that reason up to this multiple of
 # the tolerance, and above it for another.

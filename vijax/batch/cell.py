@@ -20,9 +20,15 @@ from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import AnyArray, Lane, Mask, Values
 
-TRANSIENT_SHARE = 0.25  # a cell without an orbit leaves this share of its periods out of its averages
-BATCHES = 24  # batch means behind a standard error
-TANGENT_SCALE = 2.0**40  # the tangent map is kept between 1/TANGENT_SCALE and this, the rest in an exponent
+# Share of its periods that a cell without an orbit leaves out of its averages. Less keeps more of the way to the
+# attractor in them, more leaves fewer periods to average.
+TRANSIENT_SHARE = 0.25
+# Batch means behind a standard error, which is itself uncertain by 1/sqrt(2 x 23), 15 %. With more of them a batch is
+# shorter, and motion that remembers for longer than a batch has too small an error.
+BATCHES = 24
+# The tangent map is kept between 1/TANGENT_SCALE and this, the rest in an exponent. A power of two, so that scaling
+# rounds nothing; products of two maps stay far from where float32 ends, 2**128.
+TANGENT_SCALE = 2.0**40
 
 
 class Plan(eqx.Module):

@@ -14,10 +14,9 @@ from vijax.batch.lanes import choose
 from vijax.engine.impact import Ball, Hit
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
+from vijax.model.quantities import START_REACH
 from vijax.model.records import Status
 from vijax.runtime.arrays import present
-
-_START_REACH = 0.49  # a start outside a rigid gap is put at this part of it
 
 
 class Handover(eqx.Module):
@@ -113,4 +112,4 @@ def resting(pair: ImpactPair, end: Lane) -> Ball:
 
 def within(pair: ImpactPair, u: Lane) -> Lane:
     """Put a start that the gap of a rigid wall does not hold back into it; give the displacement."""
-    return jnp.clip(u, -_START_REACH * pair.d, _START_REACH * pair.d) if pair.rigid else u
+    return jnp.clip(u, -START_REACH * pair.d, START_REACH * pair.d) if pair.rigid else u

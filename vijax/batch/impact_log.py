@@ -14,9 +14,9 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import State
 from vijax.runtime import tiles, xla
 
-_TILE = 256  # balls that fly together
-_STROBES = 4096  # balls at phase 0 that are found together
-_STEPS = 16  # impacts of each until those that have arrived make room
+# No result depends on these: how many balls fly together, how many at phase 0 are found together, and after how many
+# impacts of each those that have arrived make room. Fewer are more calls, more are more rows that nobody needs.
+_TILE, _STROBES, _STEPS = 256, 4096, 16
 
 
 class Record(NamedTuple):

@@ -19,7 +19,9 @@ from vijax.model.pair import ImpactPair
 from vijax.runtime import tiles, xla
 from vijax.runtime.arrays import AnyArray
 
-_HORIZON = 64.0  # periods in which an impact must come
+# Forcing periods in which an impact must come; the map tells of none that comes later, and no orbit may have such a
+# flight.
+_HORIZON = 64.0
 _TILES = (64, 512, 4096)  # balls of one compiled call: a few sizes, so that few programs are compiled
 
 

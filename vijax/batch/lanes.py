@@ -24,8 +24,10 @@ T = TypeVar("T")
 Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
 
-STEPS = 8  # quick steps between two rounds of serving, reviewing and refilling
-_CHAIN_STEPS = 4  # likewise, where lanes are few and a lane that waits holds up its chain
+# Quick steps between two rounds of serving, reviewing and refilling: with fewer, the rounds cost more than the steps,
+# with more, lanes that wait stand idle. Of chains there are few lanes, and one that waits holds up its chain. No result
+# depends on them.
+STEPS, _CHAIN_STEPS = 8, 4
 _SHARE, _FEWEST = 32, 16  # one lane in so many is served or refilled together: a larger batch keeps slow cells waiting
 
 

@@ -18,7 +18,9 @@ from vijax.model.records import State, Status
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
 
-_STEPS = 20_000  # steps per period before a cell is stopped, where the method chooses them
+# Steps per forcing period after which a cell is stopped (EVENT_BUDGET), where the method chooses them: with a tolerance
+# that rounding does not let it meet, it would go on for ever.
+_STEPS = 20_000
 
 
 def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane) -> Course:

@@ -13,7 +13,9 @@ from vijax.engine.impact import Ball
 from vijax.model.records import Status
 from vijax.runtime.arrays import AnyArray, Values, present
 
-_CHAOS = 7.0  # growth of the tangent map, in powers of e, that a transient of a periodic orbit does not reach
+# Growth of the tangent map over a cell's window, in powers of e, from which motion without an orbit is chaos. A smaller
+# one takes slow transients of periodic orbits for it, a larger one leaves weak chaos undecided in short windows.
+_CHAOS = 7.0
 
 
 class Summary(eqx.Module):

@@ -27,7 +27,9 @@ from vijax.model.records import Status
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
 
-_BUDGET = 512  # impacts per period before a cell is stopped
+# Impacts per forcing period after which a cell is stopped (EVENT_BUDGET): a chatter without end would hold its lane for
+# ever.
+_BUDGET = 512
 
 
 def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:

@@ -21,7 +21,7 @@ from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
-_IMPACT, _STATE = 56, 32  # bytes of a record
+_IMPACT, _STATE = 56, 32  # bytes of a record: what a run asks of memory is told from them before it begins
 # Starts fly together in calls of few sizes, so that few programs are compiled.
 _TILES = (1, 8, 64, 512, 4096)
 

@@ -28,7 +28,7 @@ from vijax.runtime.arrays import present
 from vijax.runtime.context import door
 from vijax.runtime.lattice import lattice
 
-_LEAST_BALLS = 32
+_LEAST_BALLS = 32  # fewer give no standard error that could be trusted
 _MOST_BALLS = 2**20
 _WIDEST = 0.2  # spread of a neighbourhood that a quadratic may describe
 _BALLS_A_TERM = 6  # terms of second order are fitted where there are so many balls for every coefficient
@@ -37,7 +37,7 @@ _BALLS_A_TERM = 6  # terms of second order are fitted where there are so many ba
 _STEP = 1e-7
 _ELECTRICAL = "C_T", "R0", "V", "eps_M", "r_b", "w0"
 # What is not smooth, see `Smoothness`.
-_INNER = 0.8
+_INNER = 0.8  # part of the neighbourhood
 _STRAY = 0.01  # share of balls
 _APART = 4.0  # variance between balls over that within them
 _ROUGH = 1e-4  # relative difference of P between balls below which they are not told apart

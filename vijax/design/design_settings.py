@@ -6,7 +6,7 @@ from typing import Any
 
 from vijax.runtime import checks
 
-_MOST_COUNT = 10**6
+_MOST_COUNT = 10**6  # larger ones are mistyped
 _MOST_PERIOD = 1000  # forcing periods of an orbit
 
 Rule = tuple[str, Callable[[float], bool]]

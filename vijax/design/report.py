@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15}
 _TIE = 1e-6  # optima whose objectives differ by less, relative, are a tie
-_MOST_ROWS = 12
-_NARROW = 1.0  # percent
+_MOST_ROWS = 12  # attractors, motions or optima that a report lists
+_NARROW = 1.0  # percent: a motion that lasts for less of a quantity than this is called narrow
 _LOSSES = {"lost": "lose the motion", "inadmissible": "are inadmissible"}
 
 

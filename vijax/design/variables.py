@@ -21,9 +21,11 @@ from vijax.runtime.context import door
 # Other names of what a constant decides: each is applied after the constants.
 _ALIASES = {name: axis.alias_of for name, axis in PARAMETERS.items() if axis.alias_of}
 LINEAR = ("beta", "gamma")  # may be zero or negative: their variable is the value, that of others its logarithm
+# Bounds unless given: of kappa, and so of what decides it, the range of README's planes; of r what keeps clear of 0,
+# where no speed is left, and of 1, where nothing is lost; of inclinations [rad] to either side of level ground.
 _LEAST_KAPPA, _MOST_KAPPA = 2.0, 400.0
 _LEAST_R, _MOST_R = 0.05, 0.95
-_TILT = 0.1  # rad
+_TILT = 0.1
 NAMES = CONSTANTS + tuple(_ALIASES)
 
 

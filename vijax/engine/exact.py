@@ -41,7 +41,9 @@ def stick_speed(dtype: Any) -> float:
     return 1e-9 * math.sqrt(jnp.finfo(dtype).eps / jnp.finfo(jnp.float64).eps)
 
 
-_STICK_SHARE = 1e-3  # the rest of the chatter must last less than this share of the time to release
+# A ball counts as stuck once the rest of its chatter lasts less than this share of the time to its release. A larger
+# one holds balls that would still be bouncing then, a smaller one follows more bounces that nobody sees.
+_STICK_SHARE = 1e-3
 
 
 def _soft_contact(

@@ -27,7 +27,9 @@ def next_turn(force: Force, s: Scalar) -> Scalar:
     return spell_after(force, s).end
 
 
-LONGEST_PIECE = 1.0  # a flight whose acceleration has no zero is looked at in pieces of at most this length
+# Half periods of the forcing: a flight is looked at in pieces of at most this length, also where its acceleration has
+# no zero.
+LONGEST_PIECE = 1.0
 
 
 def monotone_piece(

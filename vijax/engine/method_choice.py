@@ -19,8 +19,9 @@ OPTIONS: dict[MethodName, tuple[str, ...]] = {
     "rk4": ("steps", "membrane"),
 }
 _DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
-_STEPS = 1000
-_FEWEST_STEPS, _MOST_STEPS = 8, 10**6
+# Steps of rk4 per forcing period, unless said; how few and how many may be said. Fewer than 8 do not see the forcing,
+# and beyond a million rounding is all that more would bring.
+_STEPS, _FEWEST_STEPS, _MOST_STEPS = 1000, 8, 10**6
 _FINEST = 8  # roundings: no error estimate is worth anything below
 
 

@@ -13,7 +13,10 @@ from vijax.model.flow import PI, horner
 from vijax.runtime.arrays import Lane
 from vijax.runtime.xla import once, shared
 
-REACH = 1.65  # sine and cosine hold up to so many radians
+# Sine and cosine hold up to so many radians: a quarter turn is 1.571, and contacts are looked at a little beyond. A
+# longer reach needs more terms for the same digits.
+REACH = 1.65
+# So does the exponential, which is that of a quarter of its argument, squared twice.
 EXP_REACH = 2.4
 _QUARTER = 0.25 * EXP_REACH
 

@@ -19,7 +19,7 @@ from vijax.orbits.periodic import Orbit, check_orbit
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
-MOST_POINTS = 10**6
+MOST_POINTS = 10**6  # of a branch: beyond, a number was mistyped, and is refused before memory is taken
 Direction = Literal["up", "down", "both"]
 _WAYS: dict[Direction, tuple[float, ...]] = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from vijax.runtime import checks
 
-_MOST_COUNT = 10**6
+_MOST_COUNT = 10**6  # larger ones are mistyped
 
 Rule = tuple[str, Callable[[float], bool]]
 _LENGTH: Rule = ("an arclength between 0 and 1", lambda x: 0 < x <= 1)

@@ -17,7 +17,7 @@ from vijax.orbits.periodic import SAME, Orbit, check_orbit, concatenate, guessed
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
-_FASTEST = 1.5  # largest speed of a guess, in units of A pi/omega
+_FASTEST = 1.5  # largest speed of a guess, in units of A pi/omega; to faster orbits Newton has to come by itself
 _MOST_PERIOD = 1000  # forcing periods of an orbit
 # A text may ask for so many impacts and sequences, and all sequences together for so many guesses.
 _MOST_IMPACTS, _MOST_SEQUENCES, _MOST_GUESSES = 64, 10_000, 10**7

@@ -20,7 +20,10 @@ from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
 
 _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
-SAME = 1e-6  # how closely the impact map must meet the next impact of a real orbit
+# How closely the impact map must meet the next impact of a real orbit, in time, speed and duration together; marks of
+# orbits that agree so closely are of one. Rounding of a flight is far below; nearer orbits than this are where two of
+# them are born.
+SAME = 1e-6
 TILES = (32, 256, 4096)  # orbits of one compiled call
 
 

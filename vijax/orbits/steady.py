@@ -25,7 +25,7 @@ from vijax.orbits.shooting import Knots, Sequence
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
 
-_CONVERGED = 1e-10  # residual of an orbit's equations
+_CONVERGED = 1e-10  # residual of an orbit's equations: where Newton converged, it is near rounding
 # Nearer than this to |multiplier| = 1 an orbit is at its bifurcation, and derivatives have lost half of their digits.
 _MARGIN = 1e-7
 

@@ -16,7 +16,7 @@ from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
-MOST_GENERATIONS = 64
+MOST_GENERATIONS = 64  # each may double the branches: the number that counts is `points`
 
 
 @door

@@ -21,6 +21,7 @@ T = TypeVar("T")
 MOST = 10**9
 """Of whatever is counted: periods, impacts and cells are numbered by 32 bits inside compiled programs."""
 MOST_SEED = 2**64 - 1
+"""Of a seed: 64 bits."""
 
 _WORDS = reprlib.Repr()
 _WORDS.maxstring = _WORDS.maxother = _WORDS.maxlong = 60
