@@ -274,6 +274,29 @@ def test_a_shell_completes_subcommands_options_and_choices(completed, line, word
     assert sorted(completed(line)) == sorted(words)
 
 
+@pytest.mark.parametrize(
+    ("shell", "words", "told"),
+    [
+        ("zsh", {"COMP_WORDS": "vijax sweep --wall=ri", "COMP_CWORD": "2"}, "plain\n--wall=rigid\n_\n"),
+        ("fish", {"COMP_WORDS": "vijax sweep --wall=ri", "COMP_CWORD": "--wall=ri"}, "plain,--wall=rigid\n"),
+        ("fish", {"COMP_WORDS": "vijax sweep --show", "COMP_CWORD": "lab"}, "plain,label\n"),
+    ],
+)
+def test_a_shell_that_takes_an_option_and_its_value_for_one_word_gets_both(monkeypatch, capsys, shell, words, told):
+    for name, value in {"_VIJAX_COMPLETE": f"{shell}_complete", **words}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit):
+        command.vijax.main([], prog_name="vijax")
+    assert capsys.readouterr().out == told
+
+
+def test_fish_takes_names_apart_by_commas_for_one(monkeypatch, capsys):
+    monkeypatch.setenv("_VIJAX_COMPLETE", "fish_source")
+    with pytest.raises(SystemExit):
+        command.vijax.main([], prog_name="vijax")
+    assert 'string split --max 1 "," $completion' in capsys.readouterr().out
+
+
 def test_bash_completes_after_the_line_of_the_readme(tmp_path):
     """By a command of the name that a wheel installs."""
     (line,) = set(re.findall(r'`(eval "[^`]*")`', (ROOT / "README.md").read_text(encoding="utf-8")))

@@ -3,8 +3,13 @@
 from importlib import import_module
 
 import click
+from click.shell_completion import add_completion_class
 
+from vijax.cli.completion import Fish, Zsh
 from vijax.cli.process import run
+
+add_completion_class(Zsh)
+add_completion_class(Fish)
 
 _PAGES = {
     "sweep": "sweep",
