@@ -43,8 +43,9 @@ from vijax.batch.run_records import Trajectory
 from vijax.engine import exact
 from vijax.engine.ode import Ode
 from vijax.model import flow
-from vijax.model.pair import ImpactPair, damping_ratio
+from vijax.model.pair import ImpactPair
 from vijax.model.records import State
+from vijax.model.restitution import damping_ratio
 
 HERE = Path(__file__).parent
 REFERENCE = HERE.parent / "tests" / "data" / "plane_cells.json"

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from vijax.model.device import Harvester, with_constants, with_pair
-from vijax.model.pair import ImpactPair, damping_ratio, from_membrane_pair, impact_pair, membrane_pair
+from vijax.model.pair import ImpactPair, from_membrane_pair, impact_pair, membrane_pair
+from vijax.model.restitution import damping_ratio
 
 # Round trips are a handful of roundings.
 ROUND_TRIP = 1e-14

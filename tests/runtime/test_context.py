@@ -18,7 +18,7 @@ import pytest
 import vijax
 from vijax.design import report, tolerance, variables
 from vijax.model import device as devices
-from vijax.model import energy
+from vijax.model import energy, restitution
 from vijax.model import pair as pairs
 from vijax.model.pair import membrane_pair
 from vijax.orbits import motion, orbit_properties, orbit_search, parameter, periodic
@@ -174,7 +174,7 @@ CLOSED_FORMS = {
     "Harvester": lambda: (DEVICES.k, DEVICES.length_unit, DEVICES.speed_unit, DEVICES.pair()),
     "MembranePair": lambda: (MEMBRANE.length_unit, MEMBRANE.time_unit),
     "pair.impact_pair": lambda: vijax.impact_pair([0.1, 0.2], 40.0, 0.3),
-    "pair.damping_ratio": lambda: pairs.damping_ratio(NUMBERS),
+    "restitution.damping_ratio": lambda: restitution.damping_ratio(NUMBERS),
     "device.with_pair": lambda: devices.with_pair(vijax.Harvester(), PAIR),
     "device.with_constants": lambda: devices.with_constants(vijax.Harvester(), k=NUMBERS),
     "pair.membrane_pair": lambda: membrane_pair(PAIR),

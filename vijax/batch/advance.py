@@ -7,7 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vijax.batch.cell import Cell, Event, Lane, Mask, Plan, Settings, last_period
+from vijax.batch.cell import Cell, Event, Lane, Mask, Plan, Settings
+from vijax.batch.cell_end import last_period
 from vijax.batch.lanes import choose
 from vijax.batch.tally import add_event
 from vijax.engine import exact, quick, sampled

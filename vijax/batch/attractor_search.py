@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally
+from vijax.batch.cell_end import failed
 from vijax.batch.chain import depart
 from vijax.batch.lanes import choose
 from vijax.engine.impact import Ball, Hit
 from vijax.model import flow
-from vijax.model.records import Status
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
 
@@ -111,12 +111,12 @@ def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
 def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """Decide about the cells that have stopped: start a round, judge one, or end."""
     stopped = ~cell.running & ~cell.done
-    failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
+    lost = failed(cell.status)
     if cell.candidate is None:
         return replace(cell, done=cell.done | stopped)
     c = cell.candidate
-    start = stopped & c.found & ~failed
-    judged = stopped & c.tracing & (c.left <= 0) & ~failed
+    start = stopped & c.found & ~lost
+    judged = stopped & c.tracing & (c.left <= 0) & ~lost
     newton = _newton(cell)
     size = newton.size
     least = grain(settings)

@@ -206,13 +206,6 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
     return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, harvest, stuck)
 
 
-def last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:
-    """Say where a cell's window ends; one that a failed round made begin late is a share of the periods long too."""
-    if plan.until == "window":
-        return settings.periods + settings.transient + jnp.zeros_like(since)
-    return jnp.maximum(settings.periods, since + jnp.ceil(TRANSIENT_SHARE * settings.periods))
-
-
 def batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
     """Give the periods of a batch behind the standard error."""
     window = settings.periods * (1.0 if plan.until == "window" else 1 - TRANSIENT_SHARE)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from vijax.batch.advance import QUIET, neutral
 from vijax.batch.attractor_search import review
-from vijax.batch.cell import Cell, Course, Event, Lane, Plan, Settings, last_period
+from vijax.batch.cell import Cell, Course, Event, Lane, Plan, Settings
+from vijax.batch.cell_end import last_period, out_of_steps
 from vijax.batch.lanes import choose
 from vijax.batch.tally import add_event
 from vijax.engine.impact import Ball, Hit
@@ -17,10 +18,6 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
-
-# Steps per forcing period after which a cell is stopped (EVENT_BUDGET), where the method chooses them: with a tolerance
-# that rounding does not let it meet, it would go on for ever.
-_STEPS = 20_000
 
 
 def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane) -> Course:
@@ -77,7 +74,7 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
     cell = add_event(plan, settings, cell, Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
     taken = method.taken(carry)
     if taken is not None:
-        spent = cell.running & (taken.astype(cell.count.dtype) > _STEPS * (end + 1))
+        spent = out_of_steps(cell, taken, end)
         status = jnp.where(spent, Status.EVENT_BUDGET, cell.status).astype(cell.status.dtype)
         cell = replace(cell, running=cell.running & ~spent, status=status)
     stopped = ~cell.running

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from vijax.batch.cell import TANGENT_SCALE, Cell, Harvest, Lane, Mask, Plan, Settings, batch_length, last_period
+from vijax.batch.cell import TANGENT_SCALE, Cell, Harvest, Lane, Mask, Plan, Settings, batch_length
+from vijax.batch.cell_end import failed, last_period
 from vijax.batch.chain import Handover, hand_over
 from vijax.engine.impact import Ball
 from vijax.model.records import Status
@@ -87,15 +88,15 @@ class _End(eqx.Module):
 
 def _ended(plan: Plan, settings: Settings, cell: Cell) -> _End:
     c, impacts = cell.candidate, cell.tally.left + cell.tally.right
-    failed = (cell.status == Status.EVENT_BUDGET) | (cell.status == Status.NONFINITE)
-    periodic = (jnp.zeros_like(cell.running) if c is None else c.tracing) & ~failed
+    lost = failed(cell.status)
+    periodic = (jnp.zeros_like(cell.running) if c is None else c.tracing) & ~lost
     permanent = cell.status == Status.PERMANENT_CONTACT
     end = last_period(plan, settings, cell.since)
     window = end - cell.since
     span = jnp.where(periodic, 1.0 if c is None else c.period, window)
     quiet = impacts == 0 if c is None else (impacts == 0) | (cell.status == Status.NO_IMPACT)
-    silent = ~periodic & ~failed & ~permanent & quiet
-    return _End(periodic, silent, permanent, failed, end, window, span, span if c is None else c.prime)
+    silent = ~periodic & ~lost & ~permanent & quiet
+    return _End(periodic, silent, permanent, lost, end, window, span, span if c is None else c.prime)
 
 
 def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:

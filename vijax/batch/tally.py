@@ -1,4 +1,4 @@
-"""Adding an impact to a cell: its sums, its tangent map, its recurrence, and whether the cell stops there."""
+"""Adding an impact to a cell: its sums, its tangent map, its recurrence; `cell_end` says whether it stops there."""
 
 from dataclasses import replace
 
@@ -17,38 +17,28 @@ from vijax.batch.cell import (
     Settings,
     Tally,
     batch_length,
-    last_period,
 )
+from vijax.batch.cell_end import ended, last_period
 from vijax.batch.chain import note
 from vijax.batch.lanes import choose
 from vijax.engine.impact import Hit
 from vijax.model import energy
-from vijax.model.records import Status
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
-
-# Impacts per forcing period after which a cell is stopped (EVENT_BUDGET): a chatter without end would hold its lane for
-# ever.
-_BUDGET = 512
 
 
 def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     """Add one event to a cell."""
     hit = event.hit
-    ended = event.quiet | event.permanent
     end = last_period(plan, settings, cell.since)
     over = event.real & (hit.onset_n >= end)
     tracing = jnp.zeros_like(over) if cell.candidate is None else cell.candidate.tracing
     over = over & ~tracing
     kept = event.real & ~over & ~event.permanent
-    status = jnp.where(event.quiet, Status.NO_IMPACT, cell.status)
-    status = jnp.where(event.permanent, Status.PERMANENT_CONTACT, status).astype(cell.status.dtype)
     counted = kept & (tracing | (hit.onset_n >= cell.since))
     over, kept, counted = share((over, kept, counted))
     count = cell.count + kept.astype(cell.count.dtype)
-    spent = count > _BUDGET * (end + 1)
-    broken = event.real & ~jnp.isfinite(hit.v_out + hit.after.t)
-    status = jnp.where(spent, Status.EVENT_BUDGET, jnp.where(broken, Status.NONFINITE, status))
+    status, stop = ended(cell, event, count, end)
     tangent, exponent = _extend_tangent(cell, hit, kept, counted)
     batch = jnp.where(counted & ~tracing, _batch_of(plan, settings, cell, hit), cell.batch)
     # A batch that has ended is squared away before the first impact of the next is added.
@@ -59,12 +49,11 @@ def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
         depth = present(hit.depth)
         tally = replace(tally, deepest=jnp.where(event.permanent & (depth > tally.deepest), depth, tally.deepest))
     candidate, found = recur(settings, cell, hit, kept, count)
-    stop = over | ended | spent | broken | found
     return replace(
         cell,
         ball=choose(kept, hit.after, cell.ball),
-        running=cell.running & ~stop,
-        status=status.astype(cell.status.dtype),
+        running=cell.running & ~(stop | over | found),
+        status=status,
         count=count,
         batch=batch,
         tally=tally,

@@ -85,7 +85,7 @@ def _agree(planned: "Plan", yes: bool) -> None:
 
 
 def _check_show(show: str, until: str) -> None:
-    from vijax.planes.dataset import OUTPUTS
+    from vijax.planes.outputs import OUTPUTS
 
     if show != "label" and show not in OUTPUTS:
         raise ValueError(f"show must be label, or among {', '.join(OUTPUTS)}; got {show!r}")
@@ -96,7 +96,7 @@ def _check_show(show: str, until: str) -> None:
 def _wanted(outputs: str | None, show: str) -> list[str] | None:
     if outputs is not None:
         return [name.strip() for name in outputs.split(",")]
-    from vijax.planes.dataset import ON_REQUEST, OUTPUTS
+    from vijax.planes.outputs import ON_REQUEST, OUTPUTS
 
     shown = "lyapunov" if show == "label" else show
     return [name for name in OUTPUTS if name not in ON_REQUEST or name == shown]
@@ -249,7 +249,7 @@ def _output_options() -> list[click.Parameter]:
 
 def _complete_outputs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     """Complete the last of several names of variables. The rooms that know them take a moment to load."""
-    from vijax.planes.dataset import OUTPUTS
+    from vijax.planes.outputs import OUTPUTS
 
     before, comma, begun = incomplete.rpartition(",")
     names = [*OUTPUTS, "label"] if param.name == "show" else OUTPUTS

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vijax.model.pair import ImpactPair
+from vijax.model.restitution import calibrated
 from vijax.runtime.arrays import Values
 from vijax.runtime.xla import once, share, shared
 
@@ -66,12 +67,11 @@ class Force(eqx.Module):
 
 @shared
 def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
-    """Find the soft wall of a pair, by the calibration of Eq. (19); omega1 from r: kappa^2 - zeta^2 cancels."""
-    decrement = 0.0 - jnp.log(pair.r)  # +0 at r = 1: a free half cycle that begins at -0 would be over at once
+    """Find the soft wall of a pair, as `restitution` calibrates it."""
     kappa = pair._soft_kappa()
-    scale = kappa / jnp.sqrt(PI**2 + decrement * decrement)
+    zeta, omega1 = calibrated(kappa, pair.r)
     # Else every loop that needs omega1 makes its own, and some lanes of a loop round PI - omega1 once and others twice.
-    return Membrane(kappa, decrement * scale, PI * scale, rolled)
+    return Membrane(kappa, zeta, omega1, rolled)
 
 
 # On |x| <= pi/4 the first neglected term is below 1e-17 of the sum.

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from vijax.model import units
 from vijax.model.choices import Walls
 from vijax.model.quantities import check
+from vijax.model.restitution import damped_frequency, damping_ratio, restitution
 from vijax.model.units import Given
 from vijax.runtime import checks
 from vijax.runtime.arrays import AnyArray
@@ -46,7 +47,7 @@ class ImpactPair(eqx.Module):
     @property
     @door
     def mu(self) -> Float[AnyArray, "..."]:
-        """Compute the damping of w'' + mu w' + kappa^2 w = f, by the calibration of Eq. (19)."""
+        """Compute the damping of w'' + mu w' + kappa^2 w = f, as `restitution` calibrates it."""
         return 2 * self.zeta
 
     @property
@@ -58,28 +59,13 @@ class ImpactPair(eqx.Module):
     @property
     @door
     def omega1(self) -> Float[AnyArray, "..."]:
-        """Compute the damped frequency sqrt(kappa^2 - zeta^2).
-
-        It comes from r, as kappa pi/sqrt(pi^2 + ln^2 r): the difference would cancel.
-        """
-        return self._soft_kappa() * math.pi / jnp.sqrt(math.pi**2 + jnp.log(self.r) ** 2)
+        """Compute the damped frequency sqrt(kappa^2 - zeta^2)."""
+        return damped_frequency(self._soft_kappa(), self.r)
 
     def _soft_kappa(self) -> Float[AnyArray, "..."]:
         if self.kappa is None:
             raise ValueError("kappa must be a number for a membrane's damping and frequency; got None (a rigid wall)")
         return self.kappa
-
-
-@door
-def damping_ratio(r: Real) -> Float[AnyArray, "..."]:
-    """Compute the ratio c/(2 sqrt(k m_b)) = mu/(2 kappa) whose free contact has restitution r.
-
-    -ln r/sqrt(pi^2 + ln^2 r), in [0, 1): every contact is underdamped.
-
-    Source: Eqs. (14)-(19).
-    """
-    decrement = 0.0 - jnp.log(r)  # +0 at r = 1, where a bare minus leaves -0
-    return decrement / jnp.sqrt(math.pi**2 + decrement * decrement)
 
 
 WALLS: tuple[Walls, ...] = get_args(Walls)
@@ -125,8 +111,7 @@ def membrane_pair(pair: ImpactPair) -> MembranePair:
 def from_membrane_pair(pair: MembranePair) -> ImpactPair:
     """Bring a soft pair into the scaling of Eqs. (37)-(38); the inverse of `membrane_pair` for 0 <= c* < 2."""
     ratio = 0.5 * pair.c_star
-    r = jnp.exp(-math.pi * ratio / jnp.sqrt((1 - ratio) * (1 + ratio)))
-    return ImpactPair(pair.length_unit, 1 / pair.time_unit, r, pair.g_star / pair.A_star)
+    return ImpactPair(pair.length_unit, 1 / pair.time_unit, restitution(ratio), pair.g_star / pair.A_star)
 
 
 def check_pair(pair: Any) -> ImpactPair:

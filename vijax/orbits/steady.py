@@ -19,15 +19,12 @@ from vijax.model.device import Harvester, check_device
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.orbits import shooting
-from vijax.orbits.grazing import Clearance, between
+from vijax.orbits.grazing import Clearance
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.shooting import Knots, Sequence
+from vijax.orbits.validity import validity
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
-
-_CONVERGED = 1e-10  # residual of an orbit's equations: where Newton converged, it is near rounding
-# Nearer than this to |multiplier| = 1 an orbit is at its bifurcation, and derivatives have lost half of their digits.
-_MARGIN = 1e-7
 
 
 class Steady(WithStatus):
@@ -149,7 +146,7 @@ def response(
 ) -> Steady:
     """Compute what the orbit with the given knots yields; these follow device and pair under differentiation."""
     frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
-    status, multiplier, condition, (room, deepest) = _validity(*frozen)
+    status, multiplier, condition, (room, deepest) = validity(*frozen)
     # Harmless numbers where there is no orbit: what is computed from them is thrown away.
     absent = (status == Status.NO_ORBIT) | ~sequence.real
     knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)
@@ -180,21 +177,6 @@ def response(
 
 
 _HARMLESS = (0.0, 1.0, 0.5)  # a knot
-
-
-def _validity(pair: ImpactPair, sequence: Sequence, knots: Knots, residual):
-    around = shooting.monodromy(pair, sequence, knots)
-    multiplier = jnp.abs(shooting.floquet(around[None], sequence.mirrored[None])).max()
-    away = jnp.eye(2, dtype=knots.dtype) - around
-    condition = (away * away).sum() / jnp.abs(away[0, 0] * away[1, 1] - away[0, 1] * away[1, 0])
-    motion = between(pair, sequence, knots)
-    found = residual < _CONVERGED
-    real = jnp.stack(motion.clearance).min() > 0
-    attracts = multiplier < 1 - _MARGIN
-    status = jnp.where(attracts, Status.OK, Status.UNSTABLE)
-    status = jnp.where(real, status, Status.VIRTUAL)
-    status = jnp.where(found, status, Status.NO_ORBIT).astype(jnp.int32)
-    return status, multiplier, condition, motion
 
 
 def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):

@@ -1,16 +1,16 @@
-"""The map that a sweep returns: its variables, coordinates and units, and the record of how it was made."""
+"""The map that a sweep returns: its variables (`outputs`), coordinates, and the record of how it was made."""
 
 import math
 import os
 import platform
 import subprocess
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,16 +18,15 @@ from vijax.batch import simulate
 from vijax.engine.method import Method
 from vijax.engine.method_choice import record
 from vijax.model.device import CONSTANTS, Harvester
-from vijax.model.quantities import AXES, MEASURED
+from vijax.model.quantities import AXES
 from vijax.model.records import Status
 from vijax.planes.axes import Cells
+from vijax.planes.outputs import OUTPUTS, VARIED, Found
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import tiles
 
 if TYPE_CHECKING:
     import xarray as xr
-
-Found = dict[str, Any]  # field of Summary -> xr.Variable
 
 # Made here because making it loads JAX, which the room of the settings must not.
 DEFAULT = SweepSettings()
@@ -63,7 +62,7 @@ class Plan:
         """Count the bytes of the variables wanted, at eight a number; a store compresses them."""
         of = self.cells
         variants = math.prod(of.sizes[dim] for dim in of.variant)
-        varied = sum(bool(_VARIED & set(OUTPUTS[name].needs)) for name in self.outputs)
+        varied = sum(bool(VARIED & set(OUTPUTS[name].needs)) for name in self.outputs)
         return 8 * self.count * (varied * variants + len(self.outputs) - varied)
 
     @property
@@ -74,69 +73,6 @@ class Plan:
     def cut(self, block: Mapping[str, slice]) -> "Plan":
         """Plan a block of the cells alone."""
         return replace(self, cells=self.cells.cut(block))
-
-
-class Output(NamedTuple):
-    """A variable of the map: what it is, the fields of `Summary` it needs, and how it follows from them."""
-
-    units: str
-    description: str
-    needs: tuple[str, ...]
-    formula: "Callable[[Found, Plan], xr.Variable] | None" = None
-
-
-def _power(found: Found, planned: Plan) -> "xr.Variable":
-    return found["P"] * planned.cells.quantities["omega"] / np.pi
-
-
-def _penetration(found: Found, planned: Plan) -> "xr.Variable":
-    return found["deepest"] * planned.cells.length
-
-
-def _speed(found: Found, planned: Plan) -> "xr.Variable":
-    return found["fastest"] * planned.cells.speed
-
-
-def _admissible(found: Found, planned: Plan) -> "xr.Variable":
-    within = _penetration(found, planned) <= float(planned.device.depth_limit)
-    return (found["energy_ratio"] <= 1) & within
-
-
-OUTPUTS = {
-    "P": Output(MEASURED["P"].units, MEASURED["P"].text, ("P",)),
-    "power": Output("W", "harvested power, P omega / pi", ("P",), _power),
-    "P_stderr": Output("J", "standard error of P by batch means, 0 when periodic", ("P_stderr",)),
-    "period": Output("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided", ("period",)),
-    "impacts_left": Output("1", "left impacts in `period` periods, -1 unless period > 0", ("impacts_left",)),
-    "impacts_right": Output("1", "right impacts in `period` periods, -1 unless period > 0", ("impacts_right",)),
-    "impacts_per_period": Output("1", "impacts on both walls per forcing period", ("impacts_per_period",)),
-    "max_penetration": Output("m", "greatest penetration of the membrane", ("deepest",), _penetration),
-    "max_impact_speed": Output("m s-1", "greatest speed at the onset of an impact", ("fastest",), _speed),
-    "asymmetry": Output(
-        "1",
-        "mean velocity at the onset of an impact over the greatest; mirror images differ in its sign",
-        ("asymmetry",),
-    ),
-    "restitution": Output("1", "mean of -v_out / v_in over all impacts, NaN without impacts", ("restitution",)),
-    "restitution_left": Output("1", "mean of -v_out / v_in over left impacts", ("restitution_left",)),
-    "restitution_right": Output("1", "mean of -v_out / v_in over right impacts", ("restitution_right",)),
-    "contact_time": Output("1", "mean duration of a contact, in half forcing periods", ("contact_time",)),
-    "contact_fraction": Output("1", "part of the time spent in contact", ("contact_fraction",)),
-    "admissible": Output(
-        "1",
-        "no impact yields more energy than it gives to the membrane, none passes the penetration limit",
-        ("energy_ratio", "deepest"),
-        _admissible,
-    ),
-    "energy_ratio": Output("1", "largest ratio of harvested energy to energy given to the membrane", ("energy_ratio",)),
-    "lyapunov": Output("1", "largest Lyapunov exponent per forcing period", ("lyapunov",)),
-    "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
-    "status": Output("1", "how the cell ended", ("status",)),
-}
-# Fields of `Summary` in units that vary where the motion does not: a column for every variant.
-_VARIED = {"P", "P_stderr", "energy_ratio", "deepest", "fastest"}
-# Variables that few ask for, and that cost something: a tangent map along the motion, or another sum.
-ON_REQUEST = ("asymmetry", "lyapunov")
 
 
 def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
@@ -198,7 +134,7 @@ def warn_if_held(dataset: "xr.Dataset") -> None:
 
 def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":
     output = OUTPUTS[name]
-    values = output.formula(found, planned) if output.formula else found[output.needs[0]]
+    values = output.formula(found, planned.cells, planned.device) if output.formula else found[output.needs[0]]
     values = values.transpose(*(dim for dim in planned.cells.sizes if dim in values.dims))
     # Scales are float64 whatever the cells were computed in.
     values = values.astype(planned.settings.dtype if values.dtype.kind == "f" else values.dtype)

@@ -25,7 +25,8 @@ from vijax.model.records import State, Status
 from vijax.model.units import Given
 from vijax.planes import estimate
 from vijax.planes.axes import Axes, cells, check_axis
-from vijax.planes.dataset import OUTPUTS, Plan, coordinates, flagged, provenance, warn_if_held
+from vijax.planes.dataset import Plan, coordinates, flagged, provenance, warn_if_held
+from vijax.planes.outputs import OUTPUTS
 from vijax.planes.sweep_settings import DiagramSettings
 from vijax.runtime import checks, context
 from vijax.runtime.context import door

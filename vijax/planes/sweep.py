@@ -20,8 +20,9 @@ from vijax.model.membrane import HuntCrossley, Law
 from vijax.planes import cluster, dispatch, estimate, tiled_store
 from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, Cells, cells
-from vijax.planes.dataset import DEFAULT, ON_REQUEST, OUTPUTS, Plan, label, variables, warn_if_held
+from vijax.planes.dataset import DEFAULT, Plan, label, variables, warn_if_held
 from vijax.planes.dispatch import Call, Fields
+from vijax.planes.outputs import ON_REQUEST, OUTPUTS
 from vijax.planes.store import check_store, load, save, view
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import checks, context
@@ -88,7 +89,7 @@ def sweep(
         membrane: Of "ode" and "rk4": `HuntCrossley(chi)` for the linear membrane. It takes no r: the map's
             `restitution` is what came out.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
-        outputs: The variables wanted, of those in `vijax.planes.dataset.OUTPUTS`; all but `asymmetry` and `lyapunov`
+        outputs: The variables wanted, of those in `vijax.planes.outputs.OUTPUTS`; all but `asymmetry` and `lyapunov`
             unless given. What is not wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.

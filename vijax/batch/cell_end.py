@@ -1,0 +1,50 @@
+"""What ends a cell: its window is over, no impact comes, the ball rests for ever, or there is no going on.
+
+Where an attractor is sought, the search decides too: `attractor_search.review`.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Int
+
+from vijax.batch.cell import TRANSIENT_SHARE, Cell, Event, Lane, Mask, Plan, Settings
+from vijax.model.records import Status
+from vijax.runtime.arrays import AnyArray
+
+# Impacts per forcing period after which a cell is stopped: a chatter without end would hold its lane for ever.
+_IMPACTS = 512
+# Steps likewise, where the method chooses them: with a tolerance that rounding does not let it meet, it would go on.
+_STEPS = 20_000
+
+
+def last_period(plan: Plan, settings: Settings, since: Lane) -> Lane:
+    """Say where a cell's window ends; one that a failed round made begin late is a share of the periods long too."""
+    if plan.until == "window":
+        return settings.periods + settings.transient + jnp.zeros_like(since)
+    return jnp.maximum(settings.periods, since + jnp.ceil(TRANSIENT_SHARE * settings.periods))
+
+
+def ended(cell: Cell, event: Event, count: Lane, end: Lane) -> tuple[Int[AnyArray, "lane"], Mask]:
+    """Say how cells end by an event, and which do.
+
+    Args:
+        cell: As it was.
+        event: What happened to it.
+        count: Its impacts, this one included.
+        end: The last period of its window; whether that is over, the onset of the impact says.
+    """
+    status = jnp.where(event.quiet, Status.NO_IMPACT, cell.status)
+    status = jnp.where(event.permanent, Status.PERMANENT_CONTACT, status).astype(cell.status.dtype)
+    spent = count > _IMPACTS * (end + 1)
+    broken = event.real & ~jnp.isfinite(event.hit.v_out + event.hit.after.t)
+    status = jnp.where(spent, Status.EVENT_BUDGET, jnp.where(broken, Status.NONFINITE, status))
+    return status.astype(cell.status.dtype), event.quiet | event.permanent | spent | broken
+
+
+def out_of_steps(cell: Cell, taken: Int[AnyArray, "lane"], end: Lane) -> Mask:
+    """Say which cells have taken more steps than any motion needs."""
+    return cell.running & (taken.astype(cell.count.dtype) > _STEPS * (end + 1))
+
+
+def failed(status: Int[AnyArray, "..."]) -> Mask:
+    """Say which cells came to no end of their own: nothing they saw counts."""
+    return (status == Status.EVENT_BUDGET) | (status == Status.NONFINITE)

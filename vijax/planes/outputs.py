@@ -1,0 +1,78 @@
+"""The outputs of a map: what each variable is, its unit, what it needs of a `Summary`, and how it follows from that."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from vijax.model.device import Harvester
+from vijax.model.quantities import MEASURED
+from vijax.planes.axes import Cells
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Found = dict[str, Any]  # field of Summary -> xr.Variable
+
+
+class Output(NamedTuple):
+    """A variable of the map: what it is, the fields of `Summary` it needs, and how it follows from them."""
+
+    units: str
+    description: str
+    needs: tuple[str, ...]
+    formula: "Callable[[Found, Cells, Harvester], xr.Variable] | None" = None
+
+
+def _power(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
+    return found["P"] * cells.quantities["omega"] / np.pi
+
+
+def _penetration(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
+    return found["deepest"] * cells.length
+
+
+def _speed(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
+    return found["fastest"] * cells.speed
+
+
+def _admissible(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
+    within = _penetration(found, cells, device) <= float(device.depth_limit)
+    return (found["energy_ratio"] <= 1) & within
+
+
+OUTPUTS = {
+    "P": Output(MEASURED["P"].units, MEASURED["P"].text, ("P",)),
+    "power": Output("W", "harvested power, P omega / pi", ("P",), _power),
+    "P_stderr": Output("J", "standard error of P by batch means, 0 when periodic", ("P_stderr",)),
+    "period": Output("1", "forcing periods in which the motion repeats; 0 aperiodic, -1 undecided", ("period",)),
+    "impacts_left": Output("1", "left impacts in `period` periods, -1 unless period > 0", ("impacts_left",)),
+    "impacts_right": Output("1", "right impacts in `period` periods, -1 unless period > 0", ("impacts_right",)),
+    "impacts_per_period": Output("1", "impacts on both walls per forcing period", ("impacts_per_period",)),
+    "max_penetration": Output("m", "greatest penetration of the membrane", ("deepest",), _penetration),
+    "max_impact_speed": Output("m s-1", "greatest speed at the onset of an impact", ("fastest",), _speed),
+    "asymmetry": Output(
+        "1",
+        "mean velocity at the onset of an impact over the greatest; mirror images differ in its sign",
+        ("asymmetry",),
+    ),
+    "restitution": Output("1", "mean of -v_out / v_in over all impacts, NaN without impacts", ("restitution",)),
+    "restitution_left": Output("1", "mean of -v_out / v_in over left impacts", ("restitution_left",)),
+    "restitution_right": Output("1", "mean of -v_out / v_in over right impacts", ("restitution_right",)),
+    "contact_time": Output("1", "mean duration of a contact, in half forcing periods", ("contact_time",)),
+    "contact_fraction": Output("1", "part of the time spent in contact", ("contact_fraction",)),
+    "admissible": Output(
+        "1",
+        "no impact yields more energy than it gives to the membrane, none passes the penetration limit",
+        ("energy_ratio", "deepest"),
+        _admissible,
+    ),
+    "energy_ratio": Output("1", "largest ratio of harvested energy to energy given to the membrane", ("energy_ratio",)),
+    "lyapunov": Output("1", "largest Lyapunov exponent per forcing period", ("lyapunov",)),
+    "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
+    "status": Output("1", "how the cell ended", ("status",)),
+}
+# Fields of `Summary` in units that vary where the motion does not: a column for every variant.
+VARIED = {"P", "P_stderr", "energy_ratio", "deepest", "fastest"}
+# Variables that few ask for, and that cost something: a tangent map along the motion, or another sum.
+ON_REQUEST = ("asymmetry", "lyapunov")
