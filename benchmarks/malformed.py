@@ -218,7 +218,7 @@ CALLS: Table = {
             "values": (0.2, [], "0.1", NAN, None, [[0.1]], ["a"], [0.0]),
             "direction": CHOICE,
             "periods": COUNT,
-            "keep": (*COUNT, 401),
+            "recorded_periods": (*COUNT, 401),
             "wall": CHOICE,
             "dtype": CHOICE,
             "device": DEVICE,
@@ -422,7 +422,7 @@ CALLS: Table = {
             "along": (3, "mass"),
             "within": (3, (0.3, 0.1)),
             "device": DEVICE,
-            "generations": (True, 1.5, "3", -1, HUGE),
+            "max_switches": (True, 1.5, "3", -1, HUGE),
             "points": (0, 1.5, 10**9),
             "settings": (3, None),
         },
@@ -587,7 +587,9 @@ LARGE: dict[str, Callable[[], Any]] = {
     "values and kappa of 10^10": lambda: vijax.orbit_diagram(
         along="d", values=np.linspace(0.1, 0.3, 10**5), kappa=np.linspace(3, 40, 10**5)
     ),
-    "keep of 10^9": lambda: vijax.orbit_diagram(along="d", values=[0.1, 0.2], periods=10**9, keep=10**9),
+    "recorded_periods of 10^9": lambda: vijax.orbit_diagram(
+        along="d", values=[0.1, 0.2], periods=10**9, recorded_periods=10**9
+    ),
     "periods of 10^9 recorded": lambda: vijax.trajectory(pair(), 0.05, -0.4, 10**9),
     "periods of 10^8 and u0 of many": lambda: vijax.trajectory(pair(), np.zeros(10**4), -0.4, 10**7),
     "samples of 10^9": lambda: orbit_properties.path(an_orbit(), 10**9),

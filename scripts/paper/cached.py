@@ -29,7 +29,7 @@ def diagram(run: Run) -> "xr.Dataset":
         direction=run.direction,
         wall=run.wall,
         periods=run.periods,
-        keep=run.keep,
+        recorded_periods=run.recorded_periods,
         **axes,
     )
 

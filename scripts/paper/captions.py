@@ -40,7 +40,7 @@ class Run(NamedTuple):
         axes: The other axes: name and value or values.
         direction: "down" or "up".
         wall: "soft" or "rigid".
-        periods, keep: Of every point, as in `orbit_diagram`.
+        periods, recorded_periods: Of every point, as in `orbit_diagram`.
     """
 
     along: str
@@ -49,7 +49,7 @@ class Run(NamedTuple):
     direction: Direction = "down"
     wall: Walls = "soft"
     periods: int = PERIODS
-    keep: int = KEEP
+    recorded_periods: int = KEEP
 
 
 class Source(NamedTuple):
@@ -110,13 +110,13 @@ class PaperFigure(NamedTuple):
 
 def run(along: str, *values: float, **told: Any) -> Run:
     """Make a `Run`: its settings by their names, everything else an axis."""
-    settings = {name: told.pop(name) for name in ("direction", "wall", "periods", "keep") if name in told}
+    settings = {name: told.pop(name) for name in ("direction", "wall", "periods", "recorded_periods") if name in told}
     return Run(along, values, tuple(told.items()), **settings)
 
 
 def _chaos(along: str, value: float, **told: Any) -> Run:
     """Make a long run at one point, for a Poincare section."""
-    return run(along, value, periods=SECTION_PERIODS + PERIODS, keep=SECTION_PERIODS, **told)
+    return run(along, value, periods=SECTION_PERIODS + PERIODS, recorded_periods=SECTION_PERIODS, **told)
 
 
 # --- the runs -------------------------------------------------------------------------------------

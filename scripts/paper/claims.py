@@ -196,7 +196,7 @@ def _end_of_two_to_three() -> Finding:
 
 def _slow_sides(d: float) -> float:
     """Count the share of slow impacts that lie on the wall with fewer of them, in a long run."""
-    found = orbit_diagram(along="d", values=np.array([d]), r=0.5, wall="rigid", periods=6000, keep=5000)
+    found = orbit_diagram(along="d", values=np.array([d]), r=0.5, wall="rigid", periods=6000, recorded_periods=5000)
     side = found["side"].where(abs(found["v_in"]) < SLOW_IMPACT)
     counts = [int((side == wall).sum()) for wall in (-1, 1)]
     return min(counts) / sum(counts)

@@ -72,7 +72,7 @@ def _mirrored(run: Run) -> "xr.Dataset":
     later = np.floor(found["phase"])  # of two half periods, the second becomes the first of the next period
     image = {name: -found[name] for name in ("v_in", "v_out", "side")}
     image |= {"phase": found["phase"] + 1 - 2 * later, "period_number": found["period_number"] + later}
-    halfway = 2.0 * np.arange(1, run.keep + 1) - 1.0
+    halfway = 2.0 * np.arange(1, run.recorded_periods + 1) - 1.0
     strobes = [states(pair_of(point, run.wall), *_impacts(point), when=halfway) for point in _points_of(found, run)]
     u, v = (np.stack(rows) for rows in zip(*strobes, strict=True))
     dims = found["u_strobe"].dims

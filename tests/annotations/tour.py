@@ -39,7 +39,9 @@ def more_planes(vijax, np, jax):
     vijax.sweep(**plane | {"d": np.linspace(0.1, 0.3, 9)}, periods=20, refine=1)
     vijax.compare(**plane, periods=40, tolerance=0.1)
     vijax.basin_fractions(d=0.2, kappa=3.0, r=0.5, starts=4, periods=60)
-    vijax.orbit_diagram(along="d", values=[0.2, 0.21], kappa=[5.0, 50.0], r=0.5, direction="both", periods=40, keep=4)
+    vijax.orbit_diagram(
+        along="d", values=[0.2, 0.21], kappa=[5.0, 50.0], r=0.5, direction="both", periods=40, recorded_periods=4
+    )
 
 
 def motions(vijax, np, jax):

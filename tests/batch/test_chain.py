@@ -26,7 +26,7 @@ def test_a_ball_at_rest_in_a_soft_wall_repeats_itself(gamma):
 
 def test_a_ball_at_rest_is_handed_on():
     """Gravity beyond the forcing holds the ball on the left wall; as it falls the ball takes off from there."""
-    ds = orbit_diagram(along="gamma", values=[1.2, 1.1, 0.3], d=0.2, wall="rigid", periods=60, keep=5)
+    ds = orbit_diagram(along="gamma", values=[1.2, 1.1, 0.3], d=0.2, wall="rigid", periods=60, recorded_periods=5)
     assert ds.status.sel(gamma=[1.2, 1.1]).values.tolist() == [Status.PERMANENT_CONTACT] * 2
     np.testing.assert_array_equal(ds.u_strobe.sel(gamma=[1.2, 1.1]), -0.1)
     assert ds.filled.sel(gamma=1.2) == 0 < ds.filled.sel(gamma=0.3)

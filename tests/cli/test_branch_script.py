@@ -5,7 +5,7 @@ import pytest
 import vijax
 from scripts import branch as script
 
-SHAKEN = ["--wall", "rigid", "--A", "100", "--guesses", "32", "--generations", "0"]
+SHAKEN = ["--wall", "rigid", "--A", "100", "--guesses", "32", "--max-switches", "0"]
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 import vijax
 from scripts import orbit_diagram as script
 
-TINY = ["--along", "d=0.3:0.2:3", "--kappa", "40,400", "--periods", "120", "--keep", "2"]
+TINY = ["--along", "d=0.3:0.2:3", "--kappa", "40,400", "--periods", "120", "--recorded-periods", "2"]
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_a_store_a_picture_and_a_summary(folder, capsys):
         (["--along", "d=0.3"], "along must have several values"),
         (["--along", "d=0.3:0.2:3", "--d", "0.2"], "d must not be given twice"),
         (["--kappa=-1"], "kappa must be positive"),
-        (["--keep", "500"], "keep must be at most periods"),
+        (["--recorded-periods", "500"], "recorded_periods must be at most periods"),
         (["--direction", "left"], "direction must be"),
         (["--quantity", "speed"], "quantity must be among"),
         (["--kappa", "40,400", "--r", "0.3,0.5"], "at most one axis besides d"),

@@ -54,7 +54,7 @@ def test_what_is_drawn_at_one_value_was_visited(number):
 @pytest.mark.parametrize(("number", "r"), [(8, 0.5), (9, 0.1), (10, 0.95)])
 def test_sweeps_over_the_gap(number, r):
     for run in runs(number):
-        assert (run.along, run.direction, run.wall, run.periods, run.keep) == ("d", "down", "soft", 400, 25)
+        assert (run.along, run.direction, run.wall, run.periods, run.recorded_periods) == ("d", "down", "soft", 400, 25)
         assert held(run) == {"r": r, "kappa": (400.0, 126.5, 40.0, 12.65, 4.0)}
         assert (max(run.values), min(run.values), len(run.values)) == (0.3, 0.05, 126)
 

@@ -68,7 +68,9 @@ def followed(d, kappa, u0, v0, periods):
 def test_a_chain_of_equal_points_is_one_long_run(wall):
     """Onsets, speeds and states of three points of 4 periods, against one run of 12."""
     kappa = np.array([4.0, 12.65, 40.0, 400.0])
-    ds = orbit_diagram(along="d", values=[0.12] * 3, kappa=kappa, r=0.5, direction="up", periods=4, keep=4, wall=wall)
+    ds = orbit_diagram(
+        along="d", values=[0.12] * 3, kappa=kappa, r=0.5, direction="up", periods=4, recorded_periods=4, wall=wall
+    )
     run = followed(np.full(4, 0.12), kappa if wall == "soft" else None, 0.05853, -0.47898, 12)
     when = 2 * run.impacts["n"] + run.impacts["t"]
     exits = when + run.impacts["duration"]
@@ -95,7 +97,7 @@ def test_a_chain_of_equal_points_is_one_long_run(wall):
     ],
 )
 def test_physical_displacement_and_velocity_are_carried(along, values, axes):
-    ds = orbit_diagram(along=along, values=values, direction="up", periods=3, keep=3, **axes)
+    ds = orbit_diagram(along=along, values=values, direction="up", periods=3, recorded_periods=3, **axes)
     first, second = ds.isel({along: 0}), ds.isel({along: 1})
     metres, speed = (first.A * (np.pi / first.omega) ** power for power in (2, 1))
     new_metres, new_speed = (second.A * (np.pi / second.omega) ** power for power in (2, 1))
@@ -106,13 +108,15 @@ def test_physical_displacement_and_velocity_are_carried(along, values, axes):
 
 
 def test_a_rigid_start_outside_the_gap_is_put_back():
-    ds = orbit_diagram(along="d", values=[0.05, 0.1], u0=0.2, v0=0.3, wall="rigid", direction="up", periods=2, keep=2)
+    ds = orbit_diagram(
+        along="d", values=[0.05, 0.1], u0=0.2, v0=0.3, wall="rigid", direction="up", periods=2, recorded_periods=2
+    )
     np.testing.assert_allclose(ds.u_strobe[0], followed(0.05, None, 0.49 * 0.05, 0.3, 2).u[0], atol=1e-10)
 
 
 def test_a_round_that_comes_to_nothing_leaves_no_trace():
     """Just under its loss of symmetry the 1:1 orbit draws Newton to itself, and lets the ball go a little later."""
-    ds = orbit_diagram(along="d", values=[0.27, 0.262], r=0.5, wall="rigid", keep=1)
+    ds = orbit_diagram(along="d", values=[0.27, 0.262], r=0.5, wall="rigid", recorded_periods=1)
     assert ds.status.values.tolist() == [Status.OK, Status.SLOW]
     run = followed(0.262, None, ds.u_strobe[0, -1], ds.v_strobe[0, -1], 400)
     assert float(ds.u_strobe[1, -1]) == pytest.approx(run.u[0, -1], abs=1e-7)
@@ -121,7 +125,9 @@ def test_a_round_that_comes_to_nothing_leaves_no_trace():
 @pytest.mark.parametrize("periods", [100, 101])
 def test_an_orbit_is_taken_to_the_end_of_its_periods(periods):
     """Of a period-2 orbit the state after an odd number of periods is another than after an even one."""
-    ds = orbit_diagram(along="d", values=[0.18], r=0.5, u0=0.03, v0=0.5, wall="rigid", periods=periods, keep=2)
+    ds = orbit_diagram(
+        along="d", values=[0.18], r=0.5, u0=0.03, v0=0.5, wall="rigid", periods=periods, recorded_periods=2
+    )
     assert labels(ds) == ["2:4/2T"]
     np.testing.assert_allclose(ds.u_strobe[0], followed(0.18, None, 0.03, 0.5, periods).u[0, -2:], atol=1e-9)
     assert abs(ds.u_strobe[0, 0] - ds.u_strobe[0, 1]) > 1e-3
@@ -130,7 +136,7 @@ def test_an_orbit_is_taken_to_the_end_of_its_periods(periods):
 @pytest.mark.parametrize("wall", ["soft", "rigid"])
 def test_the_last_state_recorded_is_handed_on(wall):
     """Of orbits of periods 1 to 8 and of chaos; the record is flown from elsewhere on them."""
-    settings = DiagramSettings(periods=101, keep=3, wall=wall)
+    settings = DiagramSettings(periods=101, recorded_periods=3, wall=wall)
     asked = diagrams.plan("d", [0.3, 0.19, 0.18, 0.175, 0.16, 0.12], {"kappa": 400.0}, None, settings)
     ds = diagrams.run(asked)
     assert {1, 2} < set(ds.period.values.tolist())
@@ -146,10 +152,12 @@ def test_the_last_state_recorded_is_handed_on(wall):
 
 def test_order_of_values_and_company_do_not_matter():
     kappa, values = [40.0, 12.65], [0.13, 0.12, 0.125]
-    both = orbit_diagram(along="d", values=values, kappa=kappa, direction="both", periods=30, keep=5)
+    both = orbit_diagram(along="d", values=values, kappa=kappa, direction="both", periods=30, recorded_periods=5)
     assert both.v_in.dims == ("direction", "kappa", "d", "impact")
     for way in ("down", "up"):
-        alone = orbit_diagram(along="d", values=sorted(values), kappa=12.65, direction=way, periods=30, keep=5)
+        alone = orbit_diagram(
+            along="d", values=sorted(values), kappa=12.65, direction=way, periods=30, recorded_periods=5
+        )
         same = both.sel(direction=way, kappa=12.65).sortby("d")
         assert np.array_equal(same.v_in[:, : alone.sizes["impact"]], alone.v_in, equal_nan=True)
 
@@ -157,7 +165,9 @@ def test_order_of_values_and_company_do_not_matter():
 @pytest.mark.parametrize("wall", ["soft", "rigid"])
 def test_power_along_the_orbit_is_that_of_the_recorded_impacts(wall):
     """One comes from the polished orbit within the run, the other from flying it again."""
-    ds = orbit_diagram(along="d", values=[0.3, 0.2, 0.19], kappa=[40.0, 80.0], wall=wall, periods=200, keep=4)
+    ds = orbit_diagram(
+        along="d", values=[0.3, 0.2, 0.19], kappa=[40.0, 80.0], wall=wall, periods=200, recorded_periods=4
+    )
     assert (ds.period == 1).all()
     np.testing.assert_allclose(ds.E.sum("impact") / (2 * 4), ds.P, rtol=1e-9)
     np.testing.assert_allclose(ds.E, vijax.harvested_energy(vijax.Harvester(), ds.depth.values), rtol=1e-12)
@@ -180,7 +190,9 @@ def test_a_dataset_explains_itself_and_comes_back(tmp_path, rigid):
 
 def test_progress_is_told():
     told = []
-    orbit_diagram(along="d", values=[0.3, 0.2], periods=1, keep=1, progress=lambda *state: told.append(state))
+    orbit_diagram(
+        along="d", values=[0.3, 0.2], periods=1, recorded_periods=1, progress=lambda *state: told.append(state)
+    )
     assert told[0] == (0, 2)
     assert told[-1] == (2, 2)
 
@@ -195,7 +207,7 @@ def test_progress_is_told():
         ({"values": 0.2}, "values must be a 1-D array of d; got 0.2"),
         ({"values": [0.2, -0.1]}, "values must be positive .* at index 1; it is the gap"),
         ({"periods": 0}, "periods must be a whole number of at least 1"),
-        ({"keep": 30, "periods": 20}, "keep must be at most periods; got 30 of 20"),
+        ({"recorded_periods": 30, "periods": 20}, "recorded_periods must be at most periods; got 30 of 20"),
         ({"direction": "left"}, 'direction must be "down" or "up" or "both"'),
         ({"wall": "hard"}, "wall must be"),
         ({"dtype": "float16"}, "dtype must be"),

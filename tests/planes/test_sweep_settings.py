@@ -54,7 +54,7 @@ def test_a_diagram_refuses_the_settings_that_it_does_not_read():
     read = {"periods", "wall", "dtype"}
     for name, chosen in OTHERS.items():
         if name in read:
-            asked = orbit_diagram.plan("d", [0.2, 0.3], {}, None, DiagramSettings(keep=5, **chosen))
+            asked = orbit_diagram.plan("d", [0.2, 0.3], {}, None, DiagramSettings(recorded_periods=5, **chosen))
             assert getattr(asked.planned.settings, name) == chosen[name]
         else:
             with pytest.raises(ValueError, match="must be left out of an orbit diagram"):
@@ -119,13 +119,13 @@ def test_a_record_holds_only_what_can_be(wrong, say):
 
 
 def test_a_changed_record_is_checked_again():
-    with pytest.raises(ValueError, match="keep must be at most periods; got 25 of 20"):
+    with pytest.raises(ValueError, match="recorded_periods must be at most periods; got 25 of 20"):
         dataclasses.replace(DiagramSettings(), periods=20)
 
 
 @pytest.mark.parametrize("settings", [SweepSettings, DiagramSettings])
 def test_every_setting_is_documented_with_its_default(settings):
-    said = dict(re.findall(r"^ {4}([a-z, ]+): (.+?)$", inspect.getdoc(settings), re.MULTILINE))
+    said = dict(re.findall(r"^ {4}([a-z_, ]+): (.+?)$", inspect.getdoc(settings), re.MULTILINE))
     documented = {name: text for names, text in said.items() for name in names.split(", ")}
     own = {name: getattr(settings, name) for name in settings.__annotations__}
     assert set(documented) == set(own)

@@ -103,7 +103,7 @@ CALLS = {
     "survival": lambda i, known: vijax.survival(d=0.2, kappa=40.0 + i, starts=5 + i, periods=8 + i),
     "compare": lambda i, known: vijax.compare(d=0.2, kappa=np.linspace(40, 50, 5 + i), r=0.5),
     "orbit_diagram": lambda i, known: vijax.orbit_diagram(
-        along="d", values=np.linspace(0.2, 0.15, 5 + i), kappa=40.0, r=0.5, periods=30, keep=5
+        along="d", values=np.linspace(0.2, 0.15, 5 + i), kappa=40.0, r=0.5, periods=30, recorded_periods=5
     ),
     "optimise": lambda i, known: vijax.optimise(
         tuned(omega0(i)), survey_points=8, starts=2, max_impacts=2, max_evaluations=6

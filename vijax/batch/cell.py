@@ -68,7 +68,7 @@ class Settings(eqx.Module):
     method: Method | None
     length_variant: Float[Array, "variant"]
     speed_variant: Float[Array, "variant"]
-    keep: Float[Array, ""] | None = None  # chained: periods at the end whose impacts are wanted
+    recorded_periods: Float[Array, ""] | None = None  # chained: periods at the end whose impacts are wanted
 
 
 class Entry(eqx.Module):

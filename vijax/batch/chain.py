@@ -46,9 +46,9 @@ def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Rel
     old = cell.relay
     if old is None:
         return None
-    candidate, keep = present(cell.candidate), present(settings.keep)
+    candidate, recorded = present(cell.candidate), present(settings.recorded_periods)
     tracing, period = candidate.tracing, jnp.maximum(candidate.period, 1.0)
-    early = kept & ~tracing & (hit.after.n < end - keep)
+    early = kept & ~tracing & (hit.after.n < end - recorded)
     ahead = _ahead(hit.onset_n, end, period)
     onset = hit.onset_n + ahead + 0.5 * hit.onset_t
     later = kept & tracing & (onset > old.latest)
@@ -88,7 +88,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     rise, v = jax.vmap(flow.flight)(pair.gamma, last.t, last.v, left)
     ball = Ball(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
     ball = choose(permanent, resting(pair, end), ball)
-    first = end - present(settings.keep)
+    first = end - present(settings.recorded_periods)
     mark = choose(periodic, _moved(last, _ahead(last.n, first, present(cell.candidate).period)), old.mark)
     mark = choose(quiet | permanent, Ball(ball.u, ball.v, ball.t, first), mark)
     held = jnp.where(permanent, jnp.sign(ball.u), jnp.where(periodic | quiet, 0.0, old.held))

@@ -252,7 +252,7 @@ def attractors(
     starts: "Starts",
     *,
     periods: int,
-    keep: int,
+    recorded_periods: int,
     count: int | None = None,
 ) -> Summary:
     """Run a tile of devices with soft walls, each until its attractor is certain, in one jitted call; with their ends.
@@ -262,7 +262,7 @@ def attractors(
         device: Those that they are the nondimensional form of: arrays [cell].
         starts: At any phase, in contact too.
         periods: The most that the search for an attractor may take.
-        keep: Periods at the end whose impacts will be wanted.
+        recorded_periods: Periods at the end whose impacts will be wanted.
         count: How many cells are real, the rest being padding; all unless given.
 
     Returns:
@@ -273,7 +273,7 @@ def attractors(
     cells = rows.pack(Entry(pair, length, speed, starts.u, starts.v, starts.t, electrical(device)))
     plan = dataclasses.replace(_chained(pair), devices=True)
     number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
-    settings = _chained_settings(pair, Harvester(), periods, keep)
+    settings = _chained_settings(pair, Harvester(), periods, recorded_periods)
     return _run(plan, cells, number, settings)
 
 
@@ -283,7 +283,7 @@ def _chained(pair: ImpactPair) -> Plan:
     return Plan(rigid=pair.rigid, level=level, deep=True, energies=True, chained=True)
 
 
-def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, keep: int) -> Settings:
+def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, recorded_periods: int) -> Settings:
     dtype = pair.d.dtype
     one = jnp.ones(1, dtype)
     return Settings(
@@ -293,7 +293,7 @@ def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, keep: i
         method=None,
         length_variant=one,
         speed_variant=one,
-        keep=jnp.asarray(keep, dtype),
+        recorded_periods=jnp.asarray(recorded_periods, dtype),
     )
 
 
@@ -351,7 +351,7 @@ def follow(
     device: Harvester,
     *,
     periods: int = 400,
-    keep: int = 25,
+    recorded_periods: int = 25,
     count: int | None = None,
     links: int | None = None,
 ) -> Summary:
@@ -364,7 +364,7 @@ def follow(
         length, speed: SI sizes of the units of every cell; see `Scale`.
         device: Electrical constants, mass and penetration limit.
         periods: Forcing periods of a cell; one whose attractor is certain ends there, as if it had run them all.
-        keep: Periods at the end whose impacts will be wanted.
+        recorded_periods: Periods at the end whose impacts will be wanted.
         count, links: How many chains and links are real, the rest being padding; all unless given.
 
     Returns:
@@ -373,6 +373,6 @@ def follow(
     cells = rows.pack(Entry(pair, length, speed, growth.u, growth.v, jnp.zeros_like(pair.d)), leading=2)
     chains, most = pair.d.shape
     number, long = (jnp.asarray(x, jnp.int32) for x in (count or chains, links or most))
-    settings, plan = _chained_settings(pair, device, periods, keep), _chained(pair)
+    settings, plan = _chained_settings(pair, device, periods, recorded_periods), _chained(pair)
     table = np.asarray(_compiled_chains(plan)(cells, starts, number, long, settings))
     return rows.unpack(table, shapes(plan, cells.dtype))

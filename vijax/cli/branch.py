@@ -36,7 +36,7 @@ class Asked:
 
     Attributes:
         pair, device: What the orbits belong to.
-        impacts, guesses, generations: As `orbit_search.search` and `switching.family` take them.
+        impacts, guesses, max_switches: As `orbit_search.search` and `switching.family` take them.
         along, within: The parameter that is followed, and its bounds.
         places: Values of it at which orbits to begin with are looked for, in turn.
     """
@@ -45,7 +45,7 @@ class Asked:
     device: "Harvester"
     impacts: str
     guesses: int
-    generations: int
+    max_switches: int
     along: str
     within: tuple[float, float]
     places: list[float]
@@ -75,7 +75,7 @@ def branches(
         show(1, 2)
         waiting("branches, compiled at first")
         followed = switching.family(
-            found, asked.along, asked.within, device=asked.device, generations=asked.generations
+            found, asked.along, asked.within, device=asked.device, max_switches=asked.max_switches
         )
         show(2, 2)
     seconds = time.perf_counter() - began
@@ -90,7 +90,7 @@ def branches(
 
 
 def _asked(
-    constants: tuple[str, ...], along: str, impacts: str, guesses: int, generations: int, wall: str, **given: Any
+    constants: tuple[str, ...], along: str, impacts: str, guesses: int, max_switches: int, wall: str, **given: Any
 ) -> Asked:
     from vijax.orbits import orbit_search, parameter, switching
     from vijax.runtime import checks
@@ -100,13 +100,13 @@ def _asked(
     # Along a quantity of the device a branch begins at that of Tables I and II, all that is not given.
     start = {} if name in options.DEVICE else _START
     pair, made = at_one_point(take_axes(given, start), device(constants), wall)
-    checks.whole("generations", generations, 0, switching.MOST_GENERATIONS)
+    checks.whole("max_switches", max_switches, 0, switching.MOST_SWITCHES)
     walls, _ = orbit_search.sequences(impacts)
     orbit_search.check_guesses(guesses, len(walls))
     with about("along"):
         parameter.check_along(pair, name, within)
     places = list(_places(float(parameter.value_at(pair, name, made)), name, within, chosen))
-    return Asked(pair, made, impacts, guesses, generations, name, within, places)
+    return Asked(pair, made, impacts, guesses, max_switches, name, within, places)
 
 
 def _check_picture(path: Path | None, quantity: str) -> None:
@@ -186,7 +186,7 @@ def _sections() -> Sections:
             click.Option(
                 ["--guesses"], type=Whole(1), default=1024, help="random guesses of each sequence of walls", **shown
             ),
-            click.Option(["--generations"], type=Whole(0), default=1, help=switches, **shown),
+            click.Option(["--max-switches"], type=Whole(0), default=1, help=switches, **shown),
         ],
         "Device": [
             *options.axis_options(PARAMETERS),
@@ -200,7 +200,7 @@ def _sections() -> Sections:
 _EXAMPLES = (
     "",
     "--wall rigid --d 0.19 --impacts RLL --along d=0.1:0.3",
-    "--s 0.2 --omega 11 --impacts 1:1/3T --along omega=2.5:13 --generations 2",
+    "--s 0.2 --omega 11 --impacts 1:1/3T --along omega=2.5:13 --max-switches 2",
     "--s 0.3 --along omega0=20:400 --quantity P",
 )
 

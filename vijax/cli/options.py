@@ -70,7 +70,8 @@ def setting(name: str, text: str, kind: Any = None, of: type[SweepSettings] = Sw
     """
     default, words = getattr(of, name), choices(of).get(name)
     kind = kind if words is None else Choice(words)
-    return click.Option([f"--{name}"], type=kind, default=default, show_default=default is not None, help=text)
+    option = f"--{name.replace('_', '-')}"
+    return click.Option([option], type=kind, default=default, show_default=default is not None, help=text)
 
 
 def wall_option() -> click.Parameter:

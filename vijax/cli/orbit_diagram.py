@@ -121,7 +121,7 @@ def _sections() -> Sections:
         "Device": [*options.axis_options(), *options.device_options()],
         "Run": [
             options.setting("periods", "forcing periods of every point", Whole(1), DiagramSettings),
-            options.setting("keep", kept, Whole(1), DiagramSettings),
+            options.setting("recorded_periods", kept, Whole(1), DiagramSettings),
             options.wall_option(),
             options.dtype_option(),
         ],

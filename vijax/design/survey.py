@@ -118,7 +118,7 @@ def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, pe
 
     def part(rows: np.ndarray) -> Any:
         own = jax.tree.map(lambda x: jnp.asarray(x[np.resize(rows, size)]), (pair, device, starts))
-        summary = simulate.attractors(*own, periods=periods, keep=longest, count=rows.size)
+        summary = simulate.attractors(*own, periods=periods, recorded_periods=longest, count=rows.size)
         return jax.tree.map(lambda x: x[: rows.size], summary)
 
     with context.pool(workers()) as pool:

@@ -16,7 +16,7 @@ from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
-MOST_GENERATIONS = 64  # each may double the branches: the number that counts is `points`
+MOST_SWITCHES = 64  # in a row: each may find several branches from every one before
 
 
 @door
@@ -75,7 +75,7 @@ def family(
     within: tuple[float, float],
     *,
     device: Harvester | None = None,
-    generations: int = 1,
+    max_switches: int = 1,
     points: int = 4000,
     settings: ContinuationSettings = DEFAULT,
 ) -> list[Branch]:
@@ -83,12 +83,12 @@ def family(
 
     Args:
         orbit, along, within, device, points, settings: As in `follow`; symmetric orbits are closed half way.
-        generations: How often to switch; 0 follows the given orbits alone.
+        max_switches: How often a branch may lead to another; 0 follows the given orbits alone.
 
     Raises:
         ValueError: As `follow`.
     """
-    generations = checks.whole("generations", generations, 0, MOST_GENERATIONS)
+    max_switches = checks.whole("max_switches", max_switches, 0, MOST_SWITCHES)
     points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
     set_out(orbit, along, within, device, settings)
     # What follow and switch are told alike.
@@ -100,7 +100,7 @@ def family(
         one = symmetry.halved(one) if closed else one
         grown += _new(follow(one, along, within, **told), grown, settings)
     youngest = grown
-    for _ in range(generations):
+    for _ in range(max_switches):
         where = [point for branch in youngest for point in branch.points if _begins(point)]
         youngest = []
         for point in where:

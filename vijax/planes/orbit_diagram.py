@@ -65,7 +65,7 @@ def orbit_diagram(
     values: Given,
     direction: Direction = DiagramSettings.direction,
     periods: int = DiagramSettings.periods,
-    keep: int = DiagramSettings.keep,
+    recorded_periods: int = DiagramSettings.recorded_periods,
     wall: Walls = DiagramSettings.wall,
     device: Harvester | None = None,
     dtype: Precision = DiagramSettings.dtype,
@@ -90,7 +90,7 @@ def orbit_diagram(
         values: Its values [point], visited in falling order, in rising order, or in both.
         direction: "down", "up" or "both".
         periods: Forcing periods of every point.
-        keep: How many of these, at the end, are recorded.
+        recorded_periods: How many of these, at the end, are recorded.
         wall: "soft" or "rigid".
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
@@ -111,7 +111,9 @@ def orbit_diagram(
 
     Source: the procedure of the paper's bifurcation diagrams.
     """
-    settings = DiagramSettings(periods=periods, wall=wall, dtype=dtype, direction=direction, keep=keep)
+    settings = DiagramSettings(
+        periods=periods, wall=wall, dtype=dtype, direction=direction, recorded_periods=recorded_periods
+    )
     return run(plan(along, values, axes, device, settings), progress)
 
 
@@ -159,7 +161,7 @@ class Diagram:
     @property
     def size(self) -> int:
         """Count the bytes of the dataset where there are two impacts a period."""
-        return 8 * self.count * (self.settings.keep * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
+        return 8 * self.count * (self.settings.recorded_periods * (2 * len(_IMPACTS) + len(_STROBES)) + len(_POINTS))
 
 
 @door
@@ -192,7 +194,7 @@ def plan(
     laid_out = cells({**given, along: points}, device, "soft")
     outputs = (*_POINTS, *_IMPACTS, *_STROBES)
     diagram = Diagram(Plan(laid_out, settings, None, outputs, device), along, settings)
-    names = ["keep", "values", *(name for name in diagram.dims if name in given)]
+    names = ["recorded_periods", "values", *(name for name in diagram.dims if name in given)]
     checks.fits(names, diagram.size, f"the impacts of {diagram.count:,} points")
     return diagram
 
@@ -267,12 +269,12 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
                 _WAITING.info("compiling")
                 # One short call compiles before all threads would do so at once.
                 brief = {name: x[:, :1] for name, x in table.items()}
-                pool.submit(_simulate, diagram, brief, tiles[0][:1], lanes, 1, 1).result()
+                pool.submit(_simulate, diagram, tiles[0][:1], brief, lanes, 1, 1).result()
                 _WAITING.info("running %s", chains)
             else:
                 _WAITING.info("compiling, then running %s", chains)
-            run_for, keep = diagram.settings.periods, diagram.settings.keep
-            running = {pool.submit(_simulate, diagram, table, tile, lanes, run_for, keep): tile for tile in tiles}
+            told = table, lanes, diagram.settings.periods, diagram.settings.recorded_periods
+            running = {pool.submit(_simulate, diagram, tile, *told): tile for tile in tiles}
             for future in as_completed(running):
                 yield running.pop(future), future.result()
     finally:
@@ -281,13 +283,13 @@ def _simulate_all(diagram: Diagram, table: dict[str, np.ndarray]) -> Iterator[tu
 
 
 def _simulate(
-    diagram: Diagram, table: dict[str, np.ndarray], index: np.ndarray, lanes: int, periods: int, keep: int
+    diagram: Diagram, index: np.ndarray, table: dict[str, np.ndarray], lanes: int, periods: int, recorded_periods: int
 ) -> dict[str, np.ndarray]:
     """Compute the fields of the dataset for these chains, [chain, point] or [chain, point, impact or strobe]."""
     planned = diagram.planned
     table = {name: x[index].astype(planned.settings.dtype) for name, x in table.items()}
-    summary = _follow(planned, table, lanes, periods, keep)
-    flown = _fly(planned, table, summary, keep)
+    summary = _follow(planned, table, lanes, periods, recorded_periods)
+    flown = _fly(planned, table, summary, recorded_periods)
     impacts, shape = flown.impacts, table["d"].shape
     depth = impacts["depth"] * table["depth"].reshape(-1, 1)
     fields = {
@@ -313,7 +315,7 @@ def _simulate(
     return points | {name: values.reshape(shape + values.shape[1:]) for name, values in fields.items()}
 
 
-def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: int, keep: int) -> Any:
+def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: int, recorded_periods: int) -> Any:
     """Summarise every point, [chain, point], the chains taken so many points further by every call."""
     chains, points = table["d"].shape
     growth = {name: np.ones_like(table[name]) for name in ("metres", "speed")}
@@ -337,7 +339,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
             extended(table["speed"]),
             planned.device,
             periods=periods,
-            keep=keep,
+            recorded_periods=recorded_periods,
             count=chains,
             links=links,
         )
@@ -348,14 +350,16 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
     return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
 
 
-def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, keep: int) -> Record:
+def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, recorded_periods: int) -> Record:
     """Fly the kept periods of every point again, from where they begin."""
     soft = planned.settings.wall == "soft"
     d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
     whole_numbers = (x.astype(np.int32) for x in (n, held))
     lost = np.isin(summary.status, (Status.EVENT_BUDGET, Status.NONFINITE)).ravel()
-    return record(ImpactPair(d, kappa if soft else None, r, gamma), State(u, v, t, *whole_numbers), keep, ~lost)
+    return record(
+        ImpactPair(d, kappa if soft else None, r, gamma), State(u, v, t, *whole_numbers), recorded_periods, ~lost
+    )
 
 
 def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":

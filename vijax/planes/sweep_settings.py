@@ -22,7 +22,7 @@ SPEED = 0.6
 # Settings that methods are told, each its own ones.
 _OPTIONS = ("solver", "rtol", "atol", "membrane", "steps")
 # Settings that an orbit diagram reads, in the order of its attributes.
-_OF_DIAGRAMS = ("direction", "periods", "keep", "wall", "dtype")
+_OF_DIAGRAMS = ("direction", "periods", "recorded_periods", "wall", "dtype")
 
 
 @dataclass(frozen=True)
@@ -113,21 +113,21 @@ class DiagramSettings(SweepSettings):
 
     Attributes:
         direction: Ways along the axis that is swept, "down", "up" or "both"; "down".
-        keep: How many of the periods, at the end, are recorded, 25.
+        recorded_periods: How many of the periods, at the end, are recorded, 25.
 
     Raises:
         ValueError: Which setting, what must hold, what came.
     """
 
     direction: Direction = "down"
-    keep: int = 25
+    recorded_periods: int = 25
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.only("an orbit diagram", *_OF_DIAGRAMS)
-        self._count("keep", 1)
-        if self.keep > self.periods:
-            raise ValueError(f"keep must be at most periods; got {self.keep} of {self.periods}")
+        self._count("recorded_periods", 1)
+        if self.recorded_periods > self.periods:
+            raise ValueError(f"recorded_periods must be at most periods; got {self.recorded_periods} of {self.periods}")
 
     @property
     def told(self) -> dict[str, Any]:
