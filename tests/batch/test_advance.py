@@ -47,7 +47,7 @@ def declined():
     some = cell.declined & sampled.sure
     assert 100 < some.sum() < CELLS
     assert some.sum() > 0.7 * cell.declined.sum()
-    return some, cell, sampled.event.hit, careful.event.hit
+    return some, cell, sampled.event.impact, careful.event.impact
 
 
 def test_the_kept_arrival_is_that_of_where_the_lane_stands(declined):

@@ -11,7 +11,7 @@ from jaxtyping import Array
 import vijax
 from vijax import Harvester, HuntCrossley, sweep
 from vijax.batch.simulate import Scale, summarise
-from vijax.engine.method import HELD, Method, Passage
+from vijax.engine.method import HELD, ImpactOutcome, Method
 from vijax.engine.method_choice import OPTIONS, choose, record
 from vijax.engine.ode import Ode
 from vijax.model.membrane import Linear
@@ -173,7 +173,7 @@ class Leapfrog(Method[Sample]):
         onset, exits = (mode != 0) & (m.mode == 0), (mode == 0) & (m.mode != 0)
         now, begun = time(n, t), time(m.onset_n, m.onset_t)
         impact = Impact(m.onset_n, m.onset_t, m.mode, m.v_in, new.v, m.depth, now - begun, 0 * t)
-        passage = Passage(impact, begun - m.left, State(new.u, new.v, t, n, mode), None)
+        outcome = ImpactOutcome(impact, begun - m.left, State(new.u, new.v, t, n, mode), None)
         new = replace(
             new,
             k=k,
@@ -185,7 +185,7 @@ class Leapfrog(Method[Sample]):
             depth=jnp.where(onset, w, jnp.maximum(m.depth, w)),
             left=jnp.where(exits, now, m.left),
         )
-        return new, passage, exits
+        return new, outcome, exits
 
     def ball(self, pair, m):
         """The last sample."""

@@ -196,7 +196,7 @@ def test_too_few_impacts_are_said():
 # --- the seam, step by step -------------------------------------------------------------------------------------------
 
 
-def passages(method, case, count, **wanted):
+def outcomes(method, case, count, **wanted):
     """The first finished impacts of one start, by `start` and `step` alone."""
     d, kappa, r, gamma, u, v = (jnp.asarray(x) for x in case)
     pair, whole = ImpactPair(d, kappa, r, gamma), jnp.int32(0)
@@ -205,24 +205,24 @@ def passages(method, case, count, **wanted):
     step = jax.jit(lambda m: method.step(pair, wall, m))
     found = []
     while len(found) < count:
-        m, passage, finished = step(m)
+        m, outcome, finished = step(m)
         if finished:
-            found.append(passage)
+            found.append(outcome)
     return pair, found
 
 
 def test_tangent_maps_hold_flight_contact_and_saltation():
-    pair, found = passages(FINE, (0.2, 40.0, 0.5, 0.05, 0.02, 0.3), 4, deep=True, tangent=True)
-    for passage in found:
-        contact = flow.contact_matrix(flow.membrane(pair), passage.impact.duration)
-        matrix = np.asarray(contact @ flow.flight_matrix(passage.flight))
-        assert np.allclose(np.reshape(passage.tangent, (2, 2)), matrix, rtol=0, atol=1e-9 * np.abs(matrix).max())
+    pair, found = outcomes(FINE, (0.2, 40.0, 0.5, 0.05, 0.02, 0.3), 4, deep=True, tangent=True)
+    for outcome in found:
+        contact = flow.contact_matrix(flow.membrane(pair), outcome.impact.duration)
+        matrix = np.asarray(contact @ flow.flight_matrix(outcome.flight))
+        assert np.allclose(np.reshape(outcome.tangent, (2, 2)), matrix, rtol=0, atol=1e-9 * np.abs(matrix).max())
 
 
 def test_what_is_not_asked_for_does_not_change_the_steps():
     case = (0.2, 40.0, 0.5, 0.05, 0.02, 0.3)
-    _, plain = passages(FINE, case, 3, deep=False, tangent=False)
-    _, rich = passages(FINE, case, 3, deep=False, tangent=True)
+    _, plain = outcomes(FINE, case, 3, deep=False, tangent=False)
+    _, rich = outcomes(FINE, case, 3, deep=False, tangent=True)
     assert [float(p.after.v) for p in plain] == [float(p.after.v) for p in rich]
 
 

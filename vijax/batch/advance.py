@@ -12,7 +12,7 @@ from vijax.batch.cell_end import last_period
 from vijax.batch.lanes import choose
 from vijax.batch.tally import add_event
 from vijax.engine import exact, quick, sampled
-from vijax.engine.impact import Arrival, Ball, Hit
+from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
@@ -29,14 +29,16 @@ def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     pair, ball = cell.pair, cell.ball
     arrival = None
     if cell.wall is not None:
-        hit, arrival, sure, never = quick.quick_step(cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
+        impact, arrival, sure, never = quick.quick_step(
+            cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent
+        )
     else:
-        hit, sure = sampled.sampled_step(pair, ball, deep=plan.deep, tangent=plan.tangent)
+        impact, sure = sampled.sampled_step(pair, ball, deep=plan.deep, tangent=plan.tangent)
         never = jnp.zeros_like(sure)
     active = cell.running & ~cell.declined
     free = active & (cell.held == 0)
     no = jnp.zeros_like(active)
-    event = Event(hit, free & sure, free & never, no, no)
+    event = Event(impact, free & sure, free & never, no, no)
     declined = active & ~(free & (sure | never))
     hard = cell.hard | declined if not plan.level else cell.hard  # sampling will not do better a second time
     cell = replace(cell, declined=cell.declined | declined, hard=hard)
@@ -76,10 +78,12 @@ def request(plan: Plan, settings: Settings, cell: Cell) -> Request:
 
 def sampled_answer(plan: Plan, request: Request) -> Answer:
     """Answer by certified sampling."""
-    hit, sure = sampled.sampled_step(request.pair, request.ball, request.arrival, deep=plan.deep, tangent=plan.tangent)
+    impact, sure = sampled.sampled_step(
+        request.pair, request.ball, request.arrival, deep=plan.deep, tangent=plan.tangent
+    )
     no = jnp.zeros_like(sure)
     sure = sure & (request.held == 0)
-    return Answer(Event(hit, sure, no, no, no), no, sure)
+    return Answer(Event(impact, sure, no, no, no), no, sure)
 
 
 def careful_answer(plan: Plan, request: Request) -> Answer:
@@ -95,7 +99,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
     after = out.state
     # A flight that drifts comes to a wall after the horizon.
     late = out.quiet & ~neutral(pair, ball)
-    hit = Hit(
+    impact = LaneImpact(
         onset_t=out.impact.t,
         onset_n=jnp.where(late, jnp.inf, ball.n + out.impact.n.astype(ball.n.dtype)),
         side=jnp.where(out.impact.side < 0, -1.0, 1.0).astype(ball.u.dtype),
@@ -108,7 +112,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
         work=out.impact.work if plan.deep else None,
         tangent=matrix,
     )
-    event = Event(hit, (out.impact.side != 0) | late, out.quiet & ~late, out.permanent, out.stuck)
+    event = Event(impact, (out.impact.side != 0) | late, out.quiet & ~late, out.permanent, out.stuck)
     return Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
 
 
@@ -122,12 +126,12 @@ def settle(plan: Plan, settings: Settings, cell: Cell, answer: Answer, served: M
     """Give the cells with the answers of those that were served."""
     event, left = answer.event, answer.left & served
     ours = served & answer.sure
-    event = Event(event.hit, event.real & ours, event.quiet & ours, event.permanent & ours, event.stuck & ours)
+    event = Event(event.impact, event.real & ours, event.quiet & ours, event.permanent & ours, event.stuck & ours)
     cell = replace(
         cell,
         declined=cell.declined & ~ours,
         hard=(cell.hard | served) & ~ours,
-        ball=choose(left, event.hit.after, cell.ball),
+        ball=choose(left, event.impact.after, cell.ball),
         held=jnp.where(left, 0.0, cell.held),
     )
     return add_event(plan, settings, cell, event)

@@ -11,7 +11,7 @@ from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, S
 from vijax.batch.cell_end import failed
 from vijax.batch.chain import depart
 from vijax.batch.lanes import choose
-from vijax.engine.impact import Ball, Hit
+from vijax.engine.impact import Ball, LaneImpact
 from vijax.model import flow
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
@@ -74,14 +74,14 @@ def blank_candidate(settings: Settings, like: Lane, ball: Ball) -> Candidate:
     )
 
 
-def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
+def recur(settings: Settings, cell: Cell, impact: LaneImpact, kept: Mask, count: Lane):
     """Compare the impact with the anchor, an earlier one moved on by a quarter of the count; end rounds."""
     c = cell.candidate
     if c is None:
         return None, jnp.zeros_like(kept)
-    lag = (hit.onset_n - c.anchor_n) + 0.5 * (hit.onset_t - c.anchor_t)  # counted in forcing periods
+    lag = (impact.onset_n - c.anchor_n) + 0.5 * (impact.onset_t - c.anchor_t)  # counted in forcing periods
     period = jnp.round(lag)
-    near = (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < c.tolerance) & (period >= 1)
+    near = (2 * jnp.abs(lag - period) + jnp.abs(impact.v_in - c.anchor_v) < c.tolerance) & (period >= 1)
     found = kept & ~c.tracing & near & (period <= MAX_PERIOD)
     fresh = kept & ~c.tracing & ~found & (count >= c.next_anchor)
     left = c.left - (kept & c.tracing).astype(c.left.dtype)
@@ -90,13 +90,13 @@ def recur(settings: Settings, cell: Cell, hit: Hit, kept: Mask, count: Lane):
     opening = kept & c.tracing & (c.left == c.length)
     again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
     same = 1e-2 * recurrence(lag.dtype, 100 * grain(settings))
-    again = again & (2 * jnp.abs(lag - period) + jnp.abs(hit.v_in - c.anchor_v) < same)
+    again = again & (2 * jnp.abs(lag - period) + jnp.abs(impact.v_in - c.anchor_v) < same)
     fresh, again, found = share((fresh | opening, again, found))
     candidate = replace(
         c,
-        anchor_t=jnp.where(fresh, hit.onset_t, c.anchor_t),
-        anchor_n=jnp.where(fresh, hit.onset_n, c.anchor_n),
-        anchor_v=jnp.where(fresh, hit.v_in, c.anchor_v),
+        anchor_t=jnp.where(fresh, impact.onset_t, c.anchor_t),
+        anchor_n=jnp.where(fresh, impact.onset_n, c.anchor_n),
+        anchor_v=jnp.where(fresh, impact.v_in, c.anchor_v),
         anchor_count=jnp.where(fresh, count, c.anchor_count),
         next_anchor=jnp.where(fresh, count + 8 + jnp.floor(0.25 * count), c.next_anchor),
         found=c.found | found,

@@ -13,8 +13,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vijax.engine.impact import Arrival, Ball, Hit
-from vijax.engine.method import Method, Passage
+from vijax.engine.impact import Arrival, Ball, LaneImpact
+from vijax.engine.method import ImpactOutcome, Method
 from vijax.engine.quick_contact import Wall
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
@@ -144,7 +144,7 @@ class Course(eqx.Module):
     wall: Any
     carry: Any
     waits: Mask
-    passage: Passage
+    outcome: ImpactOutcome
 
 
 class Relay(eqx.Module):
@@ -186,9 +186,9 @@ class Cell(eqx.Module):
 
 
 class Event(eqx.Module):
-    """A hit with what only the careful step can meet: nothing within the horizon, a contact for ever, sticking."""
+    """An impact with what only the careful step can meet: nothing within the horizon, a contact for ever, sticking."""
 
-    hit: Hit
+    impact: LaneImpact
     real: Mask  # an onset was seen
     quiet: Mask
     permanent: Mask

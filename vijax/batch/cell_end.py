@@ -35,7 +35,7 @@ def ended(cell: Cell, event: Event, count: Lane, end: Lane) -> tuple[Int[AnyArra
     status = jnp.where(event.quiet, Status.NO_IMPACT, cell.status)
     status = jnp.where(event.permanent, Status.PERMANENT_CONTACT, status).astype(cell.status.dtype)
     spent = count > _IMPACTS * (end + 1)
-    broken = event.real & ~jnp.isfinite(event.hit.v_out + event.hit.after.t)
+    broken = event.real & ~jnp.isfinite(event.impact.v_out + event.impact.after.t)
     status = jnp.where(spent, Status.EVENT_BUDGET, jnp.where(broken, Status.NONFINITE, status))
     return status.astype(cell.status.dtype), event.quiet | event.permanent | spent | broken
 

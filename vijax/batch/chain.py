@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from vijax.batch.cell import Cell, Lane, Mask, Relay, Settings
 from vijax.batch.lanes import choose
-from vijax.engine.impact import Ball, Hit
+from vijax.engine.impact import Ball, LaneImpact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import START_REACH
@@ -41,22 +41,22 @@ def begin(ball: Ball, held: Lane) -> Relay:
     return Relay(start=ball, mark=ball, held=held, last=ball, latest=jnp.full_like(held, -jnp.inf))
 
 
-def note(settings: Settings, cell: Cell, hit: Hit, kept: Mask, end: Lane) -> Relay | None:
+def note(settings: Settings, cell: Cell, impact: LaneImpact, kept: Mask, end: Lane) -> Relay | None:
     """Add one impact to the record; there is none of a cell that is not chained."""
     old = cell.relay
     if old is None:
         return None
     candidate, recorded = present(cell.candidate), present(settings.recorded_periods)
     tracing, period = candidate.tracing, jnp.maximum(candidate.period, 1.0)
-    early = kept & ~tracing & (hit.after.n < end - recorded)
-    ahead = _ahead(hit.onset_n, end, period)
-    onset = hit.onset_n + ahead + 0.5 * hit.onset_t
+    early = kept & ~tracing & (impact.after.n < end - recorded)
+    ahead = _ahead(impact.onset_n, end, period)
+    onset = impact.onset_n + ahead + 0.5 * impact.onset_t
     later = kept & tracing & (onset > old.latest)
     return replace(
         old,
-        mark=choose(early, hit.after, old.mark),
+        mark=choose(early, impact.after, old.mark),
         held=jnp.where(early, 0.0, old.held),
-        last=choose(later, _moved(hit.after, ahead), old.last),
+        last=choose(later, _moved(impact.after, ahead), old.last),
         latest=jnp.where(later, onset, old.latest),
     )
 

@@ -41,9 +41,9 @@ class Next(eqx.Module):
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """Answer by the quick step, of level cells."""
     wall = quick_contact.prepare(request.pair)
-    hit, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
+    impact, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
     no = jnp.zeros_like(sure)
-    return advance.Answer(Event(hit, sure, never, no, no), no, sure | never)
+    return advance.Answer(Event(impact, sure, never, no, no), no, sure | never)
 
 
 def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
@@ -58,9 +58,10 @@ def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
 def _compiled(answer: Callable, plan: Plan):
     def work(request: advance.Request) -> tuple[Next, Bool[AnyArray, "ball"]]:
         given = answer(plan, request)
-        hit, real = given.event.hit, given.event.real & ~given.event.permanent
-        onset = 2 * hit.onset_n + hit.onset_t
-        return Next(onset, hit.side, hit.v_in, hit.v_out, hit.duration, hit.depth, hit.work, real), given.sure
+        impact, real = given.event.impact, given.event.real & ~given.event.permanent
+        onset = 2 * impact.onset_n + impact.onset_t
+        seen = impact.side, impact.v_in, impact.v_out, impact.duration, impact.depth, impact.work
+        return Next(onset, *seen, real), given.sure
 
     return jax.jit(work, compiler_options=xla.compiler_options())
 

@@ -12,7 +12,7 @@ from vijax.batch.cell import Cell, Course, Event, Lane, Plan, Settings
 from vijax.batch.cell_end import last_period, out_of_steps
 from vijax.batch.lanes import choose
 from vijax.batch.tally import add_event
-from vijax.engine.impact import Ball, Hit
+from vijax.engine.impact import Ball, LaneImpact
 from vijax.engine.method import Method
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
@@ -26,21 +26,21 @@ def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane
     state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
     carry = jax.vmap(partial(method.start, deep=plan.deep, tangent=plan.tangent))(pair, state)
     wall = jax.vmap(method.law.wall)(pair)
-    _, passage, _ = jax.eval_shape(jax.vmap(method.step), pair, wall, carry)
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), passage)
+    _, outcome, _ = jax.eval_shape(jax.vmap(method.step), pair, wall, carry)
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outcome)
     return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
 
 
 def step(method: Method, cell: Cell) -> Cell:
     """Take every lane one step on. A finished impact waits for review; a lane that finishes another waits with it."""
     old = present(cell.course)
-    carry, passage, finished = share(jax.vmap(method.step)(cell.pair, old.wall, old.carry))
+    carry, outcome, finished = share(jax.vmap(method.step)(cell.pair, old.wall, old.carry))
     blocked = old.waits & finished
     new = Course(
         old.wall,
         choose(blocked, old.carry, carry),
         old.waits | finished,
-        choose(finished & ~blocked, passage, old.passage),
+        choose(finished & ~blocked, outcome, old.outcome),
     )
     return replace(cell, course=new)
 
@@ -48,8 +48,8 @@ def step(method: Method, cell: Cell) -> Cell:
 def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """Add the impacts that wait, end flights and contacts that outlast the run, and review what has stopped."""
     course = present(cell.course)
-    carry, passage = course.carry, course.passage
-    impact, after = passage.impact, passage.after
+    carry, outcome = course.carry, course.outcome
+    impact, after = outcome.impact, outcome.after
     waits = course.waits & cell.running
     # A round of a candidate orbit may begin close to the end and go on beyond it.
     end = last_period(plan, settings, cell.since)
@@ -58,20 +58,21 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
     out = idle & (carry.mode == 0) & (late >= (QUIET if cell.candidate is not None else 0))
     quiet = out & neutral(cell.pair, cell.ball)
     permanent = idle & (carry.mode != 0) & (late >= QUIET)
-    hit = Hit(
+    lane_impact = LaneImpact(
         onset_t=impact.t,
         onset_n=jnp.where(out, jnp.inf, impact.n.astype(impact.t.dtype)),
         side=impact.side.astype(impact.t.dtype),
         v_in=impact.v_in,
         v_out=impact.v_out,
-        flight=passage.flight,
+        flight=outcome.flight,
         duration=impact.duration,
         after=Ball(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
         depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
         work=impact.work if plan.deep else None,
-        tangent=passage.tangent,
+        tangent=outcome.tangent,
     )
-    cell = add_event(plan, settings, cell, Event(hit, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits)))
+    event = Event(lane_impact, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits))
+    cell = add_event(plan, settings, cell, event)
     taken = method.taken(carry)
     if taken is not None:
         spent = out_of_steps(cell, taken, end)

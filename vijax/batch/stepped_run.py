@@ -68,8 +68,8 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, r
 
     def advance(r: _Recording) -> _Recording:
         going = runs(r)
-        carry, passage, ended = jax.vmap(partial(method.step, recorded=True))(pair, wall, r.carry)
-        impact = passage.impact
+        carry, outcome, ended = jax.vmap(partial(method.step, recorded=True))(pair, wall, r.carry)
+        impact = outcome.impact
         real = going & ended & (impact.n < periods)
         strobe = going & (carry.n > r.carry.n) & (carry.n <= periods)
         ball = jax.vmap(method.ball)(pair, carry)

@@ -21,7 +21,7 @@ from vijax.batch.cell import (
 from vijax.batch.cell_end import ended, last_period
 from vijax.batch.chain import note
 from vijax.batch.lanes import choose
-from vijax.engine.impact import Hit
+from vijax.engine.impact import LaneImpact
 from vijax.model import energy
 from vijax.runtime.arrays import present
 from vijax.runtime.xla import share
@@ -29,29 +29,29 @@ from vijax.runtime.xla import share
 
 def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     """Add one event to a cell."""
-    hit = event.hit
+    impact = event.impact
     end = last_period(plan, settings, cell.since)
-    over = event.real & (hit.onset_n >= end)
+    over = event.real & (impact.onset_n >= end)
     tracing = jnp.zeros_like(over) if cell.candidate is None else cell.candidate.tracing
     over = over & ~tracing
     kept = event.real & ~over & ~event.permanent
-    counted = kept & (tracing | (hit.onset_n >= cell.since))
+    counted = kept & (tracing | (impact.onset_n >= cell.since))
     over, kept, counted = share((over, kept, counted))
     count = cell.count + kept.astype(cell.count.dtype)
     status, stop = ended(cell, event, count, end)
-    tangent, exponent = _extend_tangent(cell, hit, kept, counted)
-    batch = jnp.where(counted & ~tracing, _batch_of(plan, settings, cell, hit), cell.batch)
+    tangent, exponent = _extend_tangent(cell, impact, kept, counted)
+    batch = jnp.where(counted & ~tracing, _batch_of(plan, settings, cell, impact), cell.batch)
     # A batch that has ended is squared away before the first impact of the next is added.
     turned = counted & ~tracing & (batch != cell.batch) & (cell.batch >= 0)
-    tally = _add(settings, cell, hit, counted, turned, event.stuck)
+    tally = _add(settings, cell, impact, counted, turned, event.stuck)
     if tally.deepest is not None:
         # A contact for ever has a depth although no impact ends it.
-        depth = present(hit.depth)
+        depth = present(impact.depth)
         tally = replace(tally, deepest=jnp.where(event.permanent & (depth > tally.deepest), depth, tally.deepest))
-    candidate, found = recur(settings, cell, hit, kept, count)
+    candidate, found = recur(settings, cell, impact, kept, count)
     return replace(
         cell,
-        ball=choose(kept, hit.after, cell.ball),
+        ball=choose(kept, impact.after, cell.ball),
         running=cell.running & ~(stop | over | found),
         status=status,
         count=count,
@@ -60,15 +60,15 @@ def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
         candidate=candidate,
         tangent=tangent,
         exponent=exponent,
-        relay=note(settings, cell, hit, kept, end),
+        relay=note(settings, cell, impact, kept, end),
     )
 
 
-def _batch_of(plan: Plan, settings: Settings, cell: Cell, hit: Hit) -> Lane:
-    return jnp.floor((hit.onset_n - cell.since) / batch_length(plan, settings))
+def _batch_of(plan: Plan, settings: Settings, cell: Cell, impact: LaneImpact) -> Lane:
+    return jnp.floor((impact.onset_n - cell.since) / batch_length(plan, settings))
 
 
-def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
+def _extend_tangent(cell: Cell, impact: LaneImpact, kept: Mask, counted: Mask):
     """Put the new step on the left of the tangent map; the first impact of the window starts it afresh."""
     if cell.tangent is None:
         return None, None
@@ -76,7 +76,7 @@ def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
     if cell.candidate is not None:
         fresh = fresh & ~cell.candidate.tracing
     a, b, c, d = (jnp.where(fresh, unit, old) for unit, old in zip((1.0, 0.0, 0.0, 1.0), cell.tangent, strict=True))
-    p, q, r, s = present(hit.tangent)
+    p, q, r, s = present(impact.tangent)
     a, b, c, d = p * a + q * c, p * b + q * d, r * a + s * c, r * b + s * d
     size = jnp.abs(a) + jnp.abs(b) + jnp.abs(c) + jnp.abs(d)
     shrink = jnp.where(size > TANGENT_SCALE, 1 / TANGENT_SCALE, jnp.where(size < 1 / TANGENT_SCALE, TANGENT_SCALE, 1.0))
@@ -86,24 +86,24 @@ def _extend_tangent(cell: Cell, hit: Hit, kept: Mask, counted: Mask):
     return new, jnp.where(kept, exponent + carried, present(cell.exponent))
 
 
-def _add(settings: Settings, cell: Cell, hit: Hit, counted: Mask, turned: Mask, stuck: Mask) -> Tally:
+def _add(settings: Settings, cell: Cell, impact: LaneImpact, counted: Mask, turned: Mask, stuck: Mask) -> Tally:
     """Add one impact to the tally."""
     old = cell.tally
-    left, right = counted & (hit.side < 0), counted & (hit.side > 0)
-    rebound = -hit.v_out / jnp.where(hit.v_in == 0, 1.0, hit.v_in)
-    speed = jnp.where(counted, jnp.abs(hit.v_in), 0.0)
-    harvest = None if old.harvest is None else _harvested(settings, cell, old.harvest, hit, counted, turned)
+    left, right = counted & (impact.side < 0), counted & (impact.side > 0)
+    rebound = -impact.v_out / jnp.where(impact.v_in == 0, 1.0, impact.v_in)
+    speed = jnp.where(counted, jnp.abs(impact.v_in), 0.0)
+    harvest = None if old.harvest is None else _harvested(settings, cell, old.harvest, impact, counted, turned)
     momentum = deepest = None
     if old.momentum is not None:
-        momentum = old.momentum + jnp.where(counted, hit.v_in, 0.0)
+        momentum = old.momentum + jnp.where(counted, impact.v_in, 0.0)
     if old.deepest is not None:
-        deepest = jnp.where(counted, jnp.maximum(old.deepest, present(hit.depth)), old.deepest)
+        deepest = jnp.where(counted, jnp.maximum(old.deepest, present(impact.depth)), old.deepest)
     return Tally(
         left=old.left + left.astype(speed.dtype),
         right=old.right + right.astype(speed.dtype),
         rebound_left=old.rebound_left + jnp.where(left, rebound, 0.0),
         rebound_right=old.rebound_right + jnp.where(right, rebound, 0.0),
-        contact=old.contact + jnp.where(counted, hit.duration, 0.0),
+        contact=old.contact + jnp.where(counted, impact.duration, 0.0),
         fastest=jnp.maximum(old.fastest, speed),
         momentum=momentum,
         deepest=deepest,
@@ -112,13 +112,15 @@ def _add(settings: Settings, cell: Cell, hit: Hit, counted: Mask, turned: Mask, 
     )
 
 
-def _harvested(settings: Settings, cell: Cell, old: Harvest, hit: Hit, counted: Mask, turned: Mask) -> Harvest:
+def _harvested(
+    settings: Settings, cell: Cell, old: Harvest, impact: LaneImpact, counted: Mask, turned: Mask
+) -> Harvest:
     """Add what one impact harvests."""
-    metres = (present(hit.depth) * cell.length)[:, None] * settings.length_variant
+    metres = (present(impact.depth) * cell.length)[:, None] * settings.length_variant
     speeds = cell.speed[:, None] * settings.speed_variant
     device = settings.device if cell.device is None else jax.tree.map(lambda x: x[:, None], cell.device)
     got = energy.harvested_energy(device, metres)
-    given = device.m_b * speeds * speeds * present(hit.work)[:, None]
+    given = device.m_b * speeds * speeds * present(impact.work)[:, None]
     wide, ended = counted[:, None], turned[:, None]
     return Harvest(
         batch=jnp.where(ended, 0.0, old.batch) + jnp.where(wide, got, 0.0),

@@ -132,13 +132,13 @@ def step(
     wanted = ~held & (horizon > 0)
     sought = lax.stop_gradient((pair.gamma, room, state.t, state.v, horizon))
     flight, side = next_wall(*sought, wanted)
-    hit = wanted & (side != 0)
-    side = jnp.where(held, state.mode.astype(flight.dtype), jnp.where(hit, side, 1.0))
+    reached = wanted & (side != 0)
+    side = jnp.where(held, state.mode.astype(flight.dtype), jnp.where(reached, side, 1.0))
     args = (pair.gamma, side, jnp.where(side > 0, room[1], room[0]), state.t, state.v)
-    flight = jnp.where(hit, implicit_root(_crossing, jnp.where(hit, flight, 1.0), args), 0.0)
+    flight = jnp.where(reached, implicit_root(_crossing, jnp.where(reached, flight, 1.0), args), 0.0)
     _, v_in = flow.flight(pair.gamma, state.t, state.v, flight)
     t, periods = flow.wrap_phase(state.t + flight)
-    meets = hit | held
+    meets = reached | held
     if pair.rigid:
         out, stuck, stay = _rigid_contact(pair, side, t, side * v_in, held)
         depth = side * v_in * energy.rigid_penetration(pair.r)
@@ -164,9 +164,9 @@ def step(
         n=jnp.where(ends, n + more.astype(n.dtype), state.n),
         mode=jnp.where(ends, 0, state.mode),
     )
-    counted = jnp.where(hit, side, 0.0).astype(state.mode.dtype)
+    counted = jnp.where(reached, side, 0.0).astype(state.mode.dtype)
     impact = Impact(n=n, t=t, side=counted, v_in=v_in, v_out=-side * out, depth=depth, duration=stay, work=work)
-    return Outcome(after, impact, flight, stay, stuck & ends, wanted & ~hit, permanent)
+    return Outcome(after, impact, flight, stay, stuck & ends, wanted & ~reached, permanent)
 
 
 def start_mode(pair: ImpactPair, u: Values, v: Values, t: Values) -> Values:

@@ -86,8 +86,8 @@ def next_wall(
         rise, v = flow.flight(gamma, t0, v0, s)
         return distance - found.side * rise, -found.side * v
 
-    hit = wanted & (found.side != 0)
-    return bracketed_root(gap, found.low, found.high, 0.5 * (found.low + found.high), hit), found.side
+    reached = wanted & (found.side != 0)
+    return bracketed_root(gap, found.low, found.high, 0.5 * (found.low + found.high), reached), found.side
 
 
 def _beyond(gamma, room, t0, v0, heading, s):

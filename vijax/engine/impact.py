@@ -17,8 +17,8 @@ class Ball(eqx.Module):
     n: Lane
 
 
-class Hit(eqx.Module):
-    """One impact of every lane: onset, exit and, where asked for, depth, work and tangent map (row by row)."""
+class LaneImpact(eqx.Module):
+    """A finished impact of every lane: onset, exit and, where asked for, depth, work and tangent map (row by row)."""
 
     onset_t: Lane
     onset_n: Lane

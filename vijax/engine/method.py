@@ -46,7 +46,7 @@ def _is_decision(primitive: Any, /, *_: Any, **params: Any) -> bool:
     return primitive.name == "name" and params["name"] == _DECISION
 
 
-class Passage(eqx.Module):
+class ImpactOutcome(eqx.Module):
     """A finished impact of a method that steps: from the exit of the last contact to the exit of this one.
 
     Attributes:
@@ -111,7 +111,7 @@ class Method(eqx.Module, Generic[C]):
         """
 
     @abstractmethod
-    def step(self, pair: ImpactPair, wall: Wall, carry: C, *, recorded: bool = False) -> tuple[C, Passage, Flag]:
+    def step(self, pair: ImpactPair, wall: Wall, carry: C, *, recorded: bool = False) -> tuple[C, ImpactOutcome, Flag]:
         """Try one step.
 
         Args:

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from vijax.engine.dense_output import Dense, Point, dense_output, root
-from vijax.engine.method import Method, Passage, decided
+from vijax.engine.method import ImpactOutcome, Method, decided
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair, Real
@@ -166,7 +166,9 @@ class Ode(Method[Motion]):
             steps=whole,
         )
 
-    def step(self, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False) -> tuple[Motion, Passage, Flag]:
+    def step(
+        self, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
+    ) -> tuple[Motion, ImpactOutcome, Flag]:
         """Try one step of the solver; one that vanishes beside the time, or is not finite, makes an impact of NaN."""
         half, held = 0.5 * pair.d, m.mode != 0
         trial = _try(self, _solver(self, recorded), m, Spell(pair.gamma, m.mode, wall), recorded)
@@ -183,9 +185,9 @@ class Ode(Method[Motion]):
         over = decided(t >= 2)
         t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
         n = m.n + (moved & over).astype(m.n.dtype)
-        passage = _passage(m, half, side, y, t, n, landing.speed)
+        outcome = _outcome(m, half, side, y, t, n, landing.speed)
         lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
-        passage = eqx.tree_at(lambda p: p.impact.v_out, passage, jnp.where(lost, jnp.nan, passage.impact.v_out))
+        outcome = eqx.tree_at(lambda p: p.impact.v_out, outcome, jnp.where(lost, jnp.nan, outcome.impact.v_out))
 
         if y.tangent is not None:
             unit = (1.0, 0.0, 0.0, 1.0)
@@ -213,7 +215,7 @@ class Ode(Method[Motion]):
             left_n=jnp.where(landing.exits, n, m.left_n),
             steps=m.steps + 1,
         )
-        return new, passage, (landing.exits & m.entered) | lost
+        return new, outcome, (landing.exits & m.entered) | lost
 
     def ball(self, pair: ImpactPair, m: Motion) -> State:
         """Say where the ball of a carry is."""
@@ -384,7 +386,9 @@ def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, m
     return lax.stop_gradient((h, jnp.where(seen, ahead, m.full), jnp.where(shut, m.full, m.other)))
 
 
-def _passage(m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[Array, ""], speed: Scalar) -> Passage:
+def _outcome(
+    m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[Array, ""], speed: Scalar
+) -> ImpactOutcome:
     """Record the impact that ends at (t, n) with the ball leaving at a speed."""
     zero, v_out = jnp.zeros_like(half), -side * speed
     impact = Impact(
@@ -398,4 +402,4 @@ def _passage(m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[
         work=zero if y.work is None else y.work,
     )
     flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
-    return Passage(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), y.tangent)
+    return ImpactOutcome(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), y.tangent)

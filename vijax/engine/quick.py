@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from vijax.engine.exact import stick_speed
-from vijax.engine.impact import Arrival, Ball, Hit, Lane
+from vijax.engine.impact import Arrival, Ball, Lane, LaneImpact
 from vijax.engine.quick_contact import RigidWall, SoftWall, Wall, touch
 from vijax.engine.quick_flight import Flight, fly
 from vijax.model import energy
@@ -25,9 +25,9 @@ def through(contact: tuple[Lane, ...], elapsed: Lane) -> tuple[Lane, Lane, Lane,
 class Quick(NamedTuple):
     """What the quick step made of every lane."""
 
-    hit: Hit
+    impact: LaneImpact
     arrival: Arrival
-    sure: Bool[Array, "lane"]  # whether all of the hit is certain
+    sure: Bool[Array, "lane"]  # whether all of the impact is certain
     never: Bool[Array, "lane"]  # will meet no wall again
 
 
@@ -97,7 +97,7 @@ def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tange
         leaves = _rebound(wall, flight, onset, deep)
     else:
         leaves = _release(wall, flight, onset, deep, gamma)
-    hit = Hit(
+    impact = LaneImpact(
         onset.t,
         onset.n,
         side,
@@ -110,4 +110,4 @@ def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tange
         work=leaves.work,
         tangent=through(leaves.contact, flight.elapsed) if tangent else None,
     )
-    return Quick(hit, arrival, leaves.sure & arrival.sure, flight.never & flight.sure)
+    return Quick(impact, arrival, leaves.sure & arrival.sure, flight.never & flight.sure)

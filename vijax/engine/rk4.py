@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vijax.engine.method import HELD, Method, Passage, decided
+from vijax.engine.method import HELD, ImpactOutcome, Method, decided
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, Real
@@ -97,7 +97,7 @@ class Rk4(Method[Motion]):
 
     def step(
         self, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
-    ) -> tuple[Motion, Passage, Bool[Array, ""]]:
+    ) -> tuple[Motion, ImpactOutcome, Bool[Array, ""]]:
         """Take one step, and see what its sample shows; one at phase 0 and derivatives in reverse cost nothing."""
         h = 2 / self.steps
         new = _moved(self.steps, pair, wall, m)
@@ -107,7 +107,7 @@ class Rk4(Method[Motion]):
         power = _power(pair, wall, m.u, m.v) + _power(pair, wall, new.u, new.v)
         work = jnp.where(onset, 0.0, m.work + 0.5 * h * power)
         t = m.offset + new.k * h
-        passage = _passage(replace(new, mode=mode, work=work), m.mode, t)
+        outcome = _outcome(replace(new, mode=mode, work=work), m.mode, t)
         tangent = new.tangent
         if tangent is not None:
             unit = (1.0, 0.0, 0.0, 1.0)
@@ -125,7 +125,7 @@ class Rk4(Method[Motion]):
             left_n=jnp.where(leaves, new.n, m.left_n),
             tangent=tangent,
         )
-        return new, passage, leaves & m.entered
+        return new, outcome, leaves & m.entered
 
     def ball(self, pair: ImpactPair, m: Motion) -> State:
         """Say where the last sample is."""
@@ -172,7 +172,7 @@ def _power(pair: ImpactPair, wall: Wall, u: Scalar, v: Scalar) -> Scalar:
     return jnp.where(depth >= 0, -wall(depth, along) * along, 0.0)
 
 
-def _passage(m: Motion, side: Int[Array, ""], t: Scalar) -> Passage:
+def _outcome(m: Motion, side: Int[Array, ""], t: Scalar) -> ImpactOutcome:
     """Record the impact on a wall that ends with this sample, the first one outside, at a time t."""
     impact = Impact(
         n=m.onset_n,
@@ -185,4 +185,4 @@ def _passage(m: Motion, side: Int[Array, ""], t: Scalar) -> Passage:
         work=m.work,
     )
     flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
-    return Passage(impact, flight, State(m.u, m.v, t, m.n, m.mode), m.tangent)
+    return ImpactOutcome(impact, flight, State(m.u, m.v, t, m.n, m.mode), m.tangent)

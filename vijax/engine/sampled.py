@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vijax.engine.exact import stick_speed
-from vijax.engine.impact import Arrival, Ball, Hit
+from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.engine.quick import through
 from vijax.engine.roots import converged_step, householder
 from vijax.model import energy, flow
@@ -319,7 +319,7 @@ def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: L
 
 def sampled_step(
     pair: ImpactPair, lane: Ball, arrival: Arrival | None = None, *, deep: bool = False, tangent: bool = False
-) -> tuple[Hit, Mask]:
+) -> tuple[LaneImpact, Mask]:
     """Take every lane one impact on by certified sampling.
 
     Args:
@@ -328,7 +328,7 @@ def sampled_step(
         tangent: Also give the tangent map of the step, flight and saltations included.
 
     Returns:
-        The hit, and for which lanes it is certain.
+        The impact, and for which lanes it is certain.
     """
     flight, speed, side, sure = arrival or _fly(pair, lane)
     side = jnp.where(side < 0, -1.0, 1.0).astype(flight.dtype)
@@ -355,4 +355,4 @@ def sampled_step(
     leave_t, passed = flow.wrap_phase(onset_t + duration)
     after = Ball(0.5 * side * pair.d, -side * out, leave_t, onset_n + passed)
     matrix = None if contact is None else through(contact, flight)
-    return Hit(onset_t, onset_n, side, v_in, -side * out, flight, duration, after, depth, work, matrix), sure
+    return LaneImpact(onset_t, onset_n, side, v_in, -side * out, flight, duration, after, depth, work, matrix), sure

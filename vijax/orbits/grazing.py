@@ -80,17 +80,17 @@ def between(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Between:
     real = sequence.real
     # Padded impacts are given harmless knots.
     knots = jnp.where(real[:, None], knots, 1.0)
-    passage = shooting.passages(pair, sequence, knots)
+    departure = shooting.departures(pair, sequence, knots)
 
     def least(values):
         return jnp.where(real, values, _NOTHING).min()
 
     flights = jax.vmap(_flight_room, in_axes=(None, 0, 0, 0, 0, 0))
-    flight = flights(pair, passage.side, passage.speed, passage.t, passage.next_t - passage.t, real)
+    flight = flights(pair, departure.side, departure.speed, departure.t, departure.next_t - departure.t, real)
     if pair.rigid:
-        deepest = jnp.full_like(passage.side, jnp.nan)
+        deepest = jnp.full_like(departure.side, jnp.nan)
         contact = leaves = jnp.full_like(pair.d, _NOTHING)
     else:
-        deepest, shallow = jax.vmap(_contact, in_axes=(None, 0, 0, 0))(pair, passage.side, knots, real)
-        contact, leaves = least(shallow), least(passage.speed / knots[:, 1])
+        deepest, shallow = jax.vmap(_contact, in_axes=(None, 0, 0, 0))(pair, departure.side, knots, real)
+        contact, leaves = least(shallow), least(departure.speed / knots[:, 1])
     return Between(Clearance(least(knots[:, 1]), least(flight), contact, leaves), deepest)

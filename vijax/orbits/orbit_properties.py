@@ -66,7 +66,7 @@ def impacts(orbit: Orbit) -> Impact:
 @jax.jit
 def _hits(full: Orbit) -> Impact:
     """Compute the impacts of orbits that are in full."""
-    passage = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots)
+    departure = jax.vmap(shooting.departures)(full.pair, full.sequence, full.knots)
     side, (t, speed, stay) = full.sequence.side, jnp.moveaxis(full.knots, -1, 0)
     phase, n = flow.wrap_phase(jnp.where(side == 0, 0.0, t))
     blank, wall = jnp.where(side == 0, jnp.nan, 0.0), side.astype(t.dtype)
@@ -75,7 +75,7 @@ def _hits(full: Orbit) -> Impact:
         t=phase + blank,
         side=side,
         v_in=wall * speed + blank,
-        v_out=-wall * passage.speed + blank,
+        v_out=-wall * departure.speed + blank,
         depth=full.depth,
         duration=stay,
         work=full.work,
@@ -125,7 +125,7 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
 @partial(jax.jit, static_argnames="samples")
 def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
     """Compute (t, u, v) [orbit, impact, instant] of orbits that are in full."""
-    until = jax.vmap(shooting.passages)(full.pair, full.sequence, full.knots).next_t
+    until = jax.vmap(shooting.departures)(full.pair, full.sequence, full.knots).next_t
     hits, t = _hits(full), full.knots[..., 0]
     side = hits.side.astype(t.dtype)
     return jax.vmap(partial(pieces, samples=samples))(full.pair, t, side, hits.v_in, hits.v_out, hits.duration, until)

@@ -143,7 +143,7 @@ class _Claim(NamedTuple):
     knots: Float[AnyArray, "orbit impact 3"]
     residual: Float[AnyArray, "orbit"]
     multipliers: Complex[AnyArray, "orbit 2"]
-    passage: shooting.Passage
+    departure: shooting.Departure
     phase: Float[AnyArray, "orbit impact"]
     periods: Float[AnyArray, "orbit impact"]
 
@@ -161,8 +161,10 @@ def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbi
 
 def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"]) -> _Claim:
     around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
-    passage = jax.vmap(shooting.passages)(pair, sequence, knots)
-    return _Claim(knots, residual, shooting.floquet(around, sequence.mirrored), passage, *flow.wrap_phase(passage.t))
+    departure = jax.vmap(shooting.departures)(pair, sequence, knots)
+    return _Claim(
+        knots, residual, shooting.floquet(around, sequence.mirrored), departure, *flow.wrap_phase(departure.t)
+    )
 
 
 @lru_cache(maxsize=2)
@@ -176,7 +178,7 @@ def _tile(solved: Callable[..., _Claim], level: bool, rows: tuple) -> Orbit:
     claim = solved(pair, sequence, guess)
     shape = sequence.side.shape
     wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf[:, None], shape), pair)
-    balls = (wide, claim.passage.side, claim.passage.speed, claim.phase)
+    balls = (wide, claim.departure.side, claim.departure.speed, claim.phase)
     flown = next_impacts(*jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1), balls), level=level)
     return _judged(pair, sequence, claim, jax.tree.map(lambda leaf: leaf.reshape(shape), flown))
 
@@ -184,11 +186,12 @@ def _tile(solved: Callable[..., _Claim], level: bool, rows: tuple) -> Orbit:
 @jax.jit
 def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) -> Orbit:
     """Judge the claims by what the flights say of them."""
-    real, passage = sequence.real, claim.passage
+    real, departure = sequence.real, claim.departure
     found = jnp.isfinite(claim.residual) & real.any(axis=1)
-    miss = jnp.abs(flown.t + 2 * claim.periods - passage.next_t)
-    miss = miss + jnp.abs(flown.side * flown.v_in - passage.next_speed) + jnp.abs(flown.duration - passage.next_stay)
-    met = flown.real & (flown.side == passage.next_side) & (miss < SAME)
+    miss = jnp.abs(flown.t + 2 * claim.periods - departure.next_t)
+    miss = miss + jnp.abs(flown.side * flown.v_in - departure.next_speed)
+    miss = miss + jnp.abs(flown.duration - departure.next_stay)
+    met = flown.real & (flown.side == departure.next_side) & (miss < SAME)
     verified = found & (met | ~real).all(axis=1)
     status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
     good = verified[:, None] & real

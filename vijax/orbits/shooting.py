@@ -170,7 +170,7 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactP
     return Linear(missing, slope)
 
 
-class Passage(NamedTuple):
+class Departure(NamedTuple):
     """The end of each contact and the impact that is to follow it."""
 
     side: Float[AnyArray, "impact"]
@@ -182,13 +182,13 @@ class Passage(NamedTuple):
     next_stay: Float[Array, "impact"]
 
 
-def passages(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Passage:
+def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
     """Say how each contact ends, and where the flight after it is to lead."""
     side, wall, joined = _joined(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
     rate = jax.vmap(lambda side, knot: _contact(pair, side, knot).rate)(side, joined)
     next_stay = knots[_following(sequence)[0], 2]
-    return Passage(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
+    return Departure(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
 
 
 def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, ""]:

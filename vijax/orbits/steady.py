@@ -188,10 +188,10 @@ def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Kno
         depth = speed * energy.rigid_penetration(pair.r) / kappa
         work = energy.membrane_work_rigid(speed, pair.r)
     else:
-        passage = shooting.passages(pair, sequence, knots)
-        depth = _depths(pair, passage.side, knots, deepest)
-        signed = passage.side * speed, -passage.side * passage.speed
-        work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, passage.side, t, stay, *signed)
+        departure = shooting.departures(pair, sequence, knots)
+        depth = _depths(pair, departure.side, knots, deepest)
+        signed = departure.side * speed, -departure.side * departure.speed
+        work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, departure.side, t, stay, *signed)
     depth = jnp.where(real, depth, 0.0) * device.length_unit
     work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
     return depth, energy.harvested_energy(device, depth), work
