@@ -79,7 +79,7 @@ def _equations(arc: Arc, y) -> shooting.Linear:
     return shooting.linearise(pair, arc.sequence, knots, moved)
 
 
-class _Arrival(NamedTuple):
+class _Corrected(NamedTuple):
     """Newton's way back to the branch: the point, the tangent there, the size of the last correction, how many."""
 
     y: Float[Array, "unknown"]
@@ -88,21 +88,21 @@ class _Arrival(NamedTuple):
     corrections: Int[Array, ""]
 
 
-def _correct(arc: Arc, guess, former) -> _Arrival:
+def _correct(arc: Arc, guess, former) -> _Corrected:
     """Correct by Newton in the plane across the former tangent, and find the tangent there."""
     ahead = jnp.zeros_like(guess).at[-1].set(1.0)
 
-    def once(at: _Arrival) -> _Arrival:
+    def once(at: _Corrected) -> _Corrected:
         gap, slope = _equations(arc, at.y)
         slope = jnp.concatenate([slope, former[None]])
         miss = jnp.append(gap, former @ (at.y - guess))
         step, tangent = jax.vmap(linear_solve.solve, in_axes=(None, 0))(slope, jnp.stack([miss, ahead]))
-        return _Arrival(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.corrections + 1)
+        return _Corrected(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.corrections + 1)
 
-    def going(at: _Arrival):
+    def going(at: _Corrected):
         return (at.size > arc.newton_tolerance) & (at.size < 1.0) & (at.corrections < arc.max_corrections)
 
-    return lax.while_loop(going, once, _Arrival(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
+    return lax.while_loop(going, once, _Corrected(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
 
 
 def _tests(arc: Arc, y, tangent) -> Tests:
