@@ -28,6 +28,7 @@ gc.set_threshold(*SELDOM)  # tests trace outside of public functions, too
 CACHE = str(Path(__file__).parent.parent / ".pytest_cache" / "jax")
 os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
 jax.config.update("jax_compilation_cache_dir", CACHE)
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 # No deadline: the first example of a property pays for the compilation.

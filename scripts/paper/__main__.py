@@ -36,7 +36,6 @@ def paper(figure: str | None, claims: bool, into: str, overwrite: bool) -> None:
         numbers = [] if figure is None else _numbers(figure)
         files = {number: _target(into, f"figure_{number}.png", overwrite) for number in numbers}
         table = _target(into, "claims.md", overwrite) if claims else None
-    process.keep_compiled()
     for number, file in files.items():
         _draw(number, file)
     if table is not None:

@@ -85,11 +85,11 @@ def main(names):
 
         import vijax.public
         from vijax.model import flow
-        from vijax.runtime import export_cache
+        from vijax.runtime import cache_folder
     with suppress(TypeCheckError):
         flow.wrap_phase(0.5)  # no array
         raise SystemExit("annotations are not checked")
-    export_cache.cache_folder = lambda: None
+    cache_folder.kept = lambda: None
     for name in names or KINDS:
         KINDS[name](vijax, np, jax)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from scripts import basins as script
-from vijax.cli import process
 from vijax.planes import sweep
 
 TINY = ["--d", "0.2", "--kappa", "3", "--periods", "200"]
@@ -15,7 +14,6 @@ TINY = ["--d", "0.2", "--kappa", "3", "--periods", "200"]
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     return tmp_path
 
 

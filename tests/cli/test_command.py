@@ -15,7 +15,6 @@ import vijax
 from scripts import grid
 from tests.helpers import SCRIPTS
 from vijax.cli import main as command
-from vijax.cli import process
 from vijax.engine.method_choice import choose, record
 from vijax.orbits import orbit_search, switching
 from vijax.plots import branch_diagrams, orbit_diagrams
@@ -40,7 +39,6 @@ RUNS = {
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     return tmp_path
 
 

@@ -27,7 +27,6 @@ LINES = list(islice(doors.TABLES["lines"](), 5, None, 13))
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     return tmp_path
 
 

@@ -14,7 +14,6 @@ import pytest
 
 import vijax
 from scripts import design as script
-from vijax.cli import process
 from vijax.design import objective, off_design, optimise
 from vijax.design import report as reports
 from vijax.design import robustness as around
@@ -258,7 +257,6 @@ BAD = [
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     return tmp_path
 
 

@@ -11,7 +11,6 @@ from vijax.cli import process
 def drawn(tmp_path, monkeypatch):
     """Numbers and files instead of pictures."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     asked = []
     monkeypatch.setattr(figures, "draw", lambda number, file: asked.append((number, str(file))))
     return asked

@@ -8,7 +8,6 @@ import xarray as xr
 
 from scripts import grid as script
 from vijax import plots
-from vijax.cli import process
 from vijax.model.records import Status
 from vijax.planes import sweep as sweeps
 from vijax.planes.compare import SURE, Label, Model, cheapest_model, compare, plan, rigid_from, run
@@ -213,7 +212,6 @@ def test_a_comparison_comes_back_equal_and_is_drawn(found, tmp_path):
 
 def test_from_arguments_to_store_and_picture(found, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(process, "keep_compiled", lambda: None)
     axes = [part for name, values in AXES.items() for part in (f"--{name}", ",".join(map(str, values)))]
     assert script.main([*axes, "--compare", "rigid", "--tolerance", str(TOLERANCE)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["comparison.png", "comparison.zarr"]

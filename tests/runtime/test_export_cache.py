@@ -18,7 +18,7 @@ from jax import monitoring
 
 import vijax
 from vijax.model.records import State
-from vijax.runtime import export_cache, xla
+from vijax.runtime import cache_folder, export_cache, xla
 
 PACKAGE = Path(vijax.__file__).parent
 X = jnp.linspace(0.1, 2.0, 7)
@@ -39,7 +39,7 @@ class Work:
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     place = tmp_path / "compiled"
-    monkeypatch.setattr(export_cache, "cache_folder", lambda: place)
+    monkeypatch.setattr(cache_folder, "kept", lambda: place)
     return place
 
 
@@ -96,7 +96,7 @@ def test_a_program_without_kernels_is_another_one(folder, monkeypatch):
 
 @pytest.mark.parametrize("kept", [True, False])
 def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
-    monkeypatch.setattr(export_cache, "cache_folder", lambda: tmp_path if kept else None)
+    monkeypatch.setattr(cache_folder, "kept", lambda: tmp_path if kept else None)
     program = export_cache.Program(lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop")
     compiled, ready = [], threading.Barrier(4)
 
@@ -175,22 +175,6 @@ def test_where_nothing_can_be_kept_it_is_traced_every_time(tmp_path, monkeypatch
     taken = tmp_path / "file"
     taken.touch()
     for place in (taken, None):
-        monkeypatch.setattr(export_cache, "cache_folder", lambda place=place: place)
+        monkeypatch.setattr(cache_folder, "kept", lambda place=place: place)
         assert called()[1] == called()[1] == 1
     assert taken.read_bytes() == b""
-
-
-def test_the_folder_is_that_of_compiled_programs(tmp_path):
-    before = {name: jax.config.values[name] for name in ("jax_compilation_cache_dir", "jax_enable_compilation_cache")}
-    try:
-        for asked, kept, expected in ((str(tmp_path), True, tmp_path), (str(tmp_path), False, None)):
-            jax.config.update("jax_compilation_cache_dir", asked)
-            jax.config.update("jax_enable_compilation_cache", kept)
-            assert export_cache.cache_folder() == expected
-        jax.config.update("jax_enable_compilation_cache", True)
-        for asked in (None, "gs://bucket/compiled"):
-            jax.config.update("jax_compilation_cache_dir", asked)
-            assert export_cache.cache_folder() is None
-    finally:
-        for name, value in before.items():
-            jax.config.update(name, value)

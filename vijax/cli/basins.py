@@ -47,7 +47,6 @@ def coexisting(
         planned = _plan(axes, made, starts, speed, seed, merge_mirrors, given)
         if plot is not None:
             _check_picture(plot, planned)
-        process.keep_compiled()
         _agree(planned, yes)
     from vijax.planes import sweep
 

@@ -64,7 +64,6 @@ def branches(
         store, picture = targets(out, plot, _FILES, overwrite)
         asked = _asked(constants, **given)
         _check_picture(picture, quantity)
-    process.keep_compiled()
     from vijax.orbits import branch_dataset, switching
 
     began = time.perf_counter()

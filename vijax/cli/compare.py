@@ -28,7 +28,6 @@ def difference_map(constants: tuple[str, ...], tolerance: str | None, overwrite:
         axes, made = take_axes(given, PLANE), device(constants)
         planned = _plan(axes, made, tolerance, given)
         _check(planned, plot)
-        process.keep_compiled()
         _agree(planned, yes)
     if plot is not None:
         process.import_beside("vijax.plots.number_maps")

@@ -63,7 +63,6 @@ def best(out: str | None, plot: str | None, overwrite: bool, yes: bool, **given:
         if picture is not None:
             _check_format(picture)
         asked = _asked(**given)
-        process.keep_compiled()
         _agree(asked, yes)
     whole, diagram, climbed = _run(asked)
     _write(whole, diagram, written, picture)

@@ -46,7 +46,6 @@ def diagram(
         planned = _plan(along, take_axes(given, {}), device(constants), given)
         if picture is not None:
             _check_picture(picture, planned, quantity)
-        process.keep_compiled()
         process.agree(planned.expected, yes)
     began = time.perf_counter()
     dataset = _run(planned)

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -37,16 +36,6 @@ def agree(expected: "Estimate", yes: bool) -> None:
     if not sys.stdin.isatty():
         raise ValueError(f"yes must be given beyond an hour or 10 GB; got {expected}; add --yes, or ask for less")
     click.confirm(f"{expected}: begin?", abort=True, err=True)
-
-
-def keep_compiled() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told of another."""
-    import jax
-
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "vijax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def import_beside(module: str) -> None:

@@ -47,7 +47,6 @@ def power_map(
             _check_picture(plot, planned, show)
         crew = _crew(planned, workers, scheduler, out)
         _check_room(planned, out, overwrite)
-        process.keep_compiled()
         _agree(planned, yes)
     if plot is not None:
         process.import_beside("vijax.plots.number_maps")

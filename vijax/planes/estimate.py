@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vijax.planes.dataset import Plan
-from vijax.runtime import checks, export_cache
+from vijax.runtime import cache_folder, checks
 from vijax.runtime.context import door
 from vijax.runtime.files import write_json
 from vijax.runtime.tiles import places
@@ -118,7 +118,7 @@ def _slow(planned: Plan) -> float:
 
 
 def _file() -> Path | None:
-    folder = export_cache.cache_folder()
+    folder = cache_folder.kept()
     return None if folder is None else folder / _FILE
 
 

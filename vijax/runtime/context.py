@@ -14,6 +14,7 @@ import jax
 from jax.extend import backend
 
 from vijax.runtime import forks
+from vijax.runtime.cache_folder import keep_programs
 from vijax.runtime.garbage import seldom_collected
 
 P = ParamSpec("P")
@@ -37,6 +38,7 @@ def door(function: Callable[P, T]) -> Callable[P, T]:
                 "vijax must not be called in a process that was forked after JAX had started, where it would hang; "
                 'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep'
             )
+        keep_programs()
         with _held(args, kwargs), seldom_collected():
             try:
                 return function(*args, **kwargs)

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jax import export
 
-from vijax.runtime import xla
+from vijax.runtime import cache_folder, xla
 from vijax.runtime.files import replacing
 
 # Distributions whose code a trace goes through, down to those that jax and diffrax stand on.
@@ -67,7 +67,7 @@ class Program:
         def flat(*leaves):
             return self._work(*jax.tree.unflatten(tree, leaves))
 
-        options, folder = xla.compiler_options(), cache_folder()
+        options, folder = xla.compiler_options(), cache_folder.kept()
         if folder is None or not _ours(tree):
             return jax.jit(flat, compiler_options=options)
         path = folder / f"traced-{_DIGEST(f'{name} {xla.KERNELS} {source_digest()}'.encode()).hexdigest()}"
@@ -76,13 +76,6 @@ class Program:
             known = export.export(jax.jit(flat), platforms=[platform])(*leaves)
             _write(path, known.serialize())
         return jax.jit(known.call, compiler_options=options)
-
-
-def cache_folder() -> Path | None:
-    """Say where compiled programs are kept, if they are, on a disk."""
-    asked = jax.config.values
-    folder = asked["jax_compilation_cache_dir"] if asked["jax_enable_compilation_cache"] else None
-    return Path(folder) if folder and "://" not in folder else None
 
 
 def _ours(tree: Any) -> bool:
