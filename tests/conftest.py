@@ -10,8 +10,9 @@ os.environ["XLA_FLAGS"] = " ".join(
     (
         "--xla_backend_optimization_level=0",
         "--xla_cpu_use_fusion_emitters=false",
-        # The first as always (`runtime.xla`); the others walk all loops of a program again and again, and mend little.
-        "--xla_disable_hlo_passes=cpu-parallel-task-assigner,simplify-while-loops,while-loop-invariant-code-motion",
+        # The first as always (`runtime.xla`); the others walk a program again and again for what no test waits for.
+        "--xla_disable_hlo_passes=cpu-parallel-task-assigner,algsimp,simplify-while-loops,"
+        "while-loop-invariant-code-motion",
         os.environ.get("XLA_FLAGS", ""),
     )
 )

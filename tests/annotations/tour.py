@@ -24,9 +24,7 @@ def checked(function):
 
 
 def planes(vijax, np, jax):
-    """Level, inclined and rigid maps, basins."""
-    plane = {"d": np.linspace(0.1, 0.3, 3), "kappa": [5.0, 50.0], "r": 0.5}
-    vijax.sweep(**plane, periods=40)
+    """Inclined and rigid maps, basins on level ground."""
     vijax.sweep(d=[0.1, 0.2], kappa=10, r=0.5, gamma=[0.05, 0.3], periods=40)
     vijax.sweep(d=[0.1, 0.2], wall="rigid", r=0.5, periods=40, A=[1.0, 2.0], omega=3.0)
     vijax.basins(d=0.2, kappa=3.0, r=0.5, u0=[0.0, 0.05], v0=[0.1, 0.3], periods=60)
