@@ -14,6 +14,7 @@ from vijax.batch import rows, simulate
 from vijax.batch.cell import Plan, Settings
 from vijax.batch.rows import pack, unpack, width
 from vijax.batch.summary import shapes, unload
+from vijax.engine.ground import Ground
 from vijax.model.device import Harvester
 
 LEAST = Plan(variants=3)
@@ -66,7 +67,7 @@ def test_a_table_of_another_width_is_no_record():
         {"rigid": True},
         {"until": "window", "tangent": False},
         {"until": "window", "asymmetry": True, "deep": True},
-        {"level": False, "deep": True, "energies": True},
+        {"ground": Ground.GENTLE, "deep": True, "energies": True},
         {"deep": True, "energies": True, "chained": True},
     ],
     ids=str,

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.yardstick import reference_rows
 from vijax.batch import lanes, perturbed, rows, simulate, summary
 from vijax.design.average import Smoothness, average
+from vijax.engine.ground import Ground
 from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.energy import harvested_energy
 
@@ -149,7 +150,7 @@ def test_a_traced_ensemble_runs_the_program_of_its_ground(monkeypatch, beta):
         entry = rows.unpack(table, simulate.entry_shapes(plan, table.dtype))
         like = summary.shapes(plan, table.dtype)
         blank = rows.unpack(jnp.zeros((table.shape[0], outputs)), like)
-        P = entry.pair.kappa[:, None] * jnp.where(plan.level, 1.0, 2.0) + jnp.zeros_like(blank.P)
+        P = entry.pair.kappa[:, None] * jnp.where(plan.ground is Ground.LEVEL, 1.0, 2.0) + jnp.zeros_like(blank.P)
         return rows.pack(dataclasses.replace(blank, P=P))
 
     monkeypatch.setattr(lanes, "run", run)

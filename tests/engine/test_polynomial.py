@@ -31,6 +31,11 @@ def test_exponential(drawn):
     assert np.max(np.abs(np.asarray(polynomial.exp(x)) / np.exp(wide) - 1)) < 8 * eps
 
 
+def test_long_decay(drawn):
+    x, wide, eps = drawn(0, 16 * polynomial.EXP_REACH)
+    assert np.max(np.abs(np.asarray(polynomial.long_decay(x)) / np.exp(-wide) - 1)) < 200 * eps
+
+
 def test_arcsine(drawn):
     x, wide, eps = drawn(-1, 1)
     assert np.max(np.abs(np.asarray(polynomial.arcsine(x)) - np.arcsin(wide))) < 4 * eps

@@ -1,7 +1,8 @@
-"""One impact of every lane by the exact engine: the quick or the sampled step, a service for what they decline."""
+"""One impact of every lane by the exact engine: the quick step, a service for what it declines."""
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
+from vijax.runtime.arrays import present
 
 # Forcing periods beyond the last one in which the end of a flight is still looked for. With fewer, a slow ball that has
 # a wall ahead of it is told to meet none.
@@ -25,23 +27,16 @@ _FOR_EVER = 1e7
 
 
 def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
-    """Take every lane one impact on: by the quick step on level cells, by certified sampling with gravity."""
+    """Take every lane one impact on: by the quick step."""
     pair, ball = cell.pair, cell.ball
-    arrival = None
-    if cell.wall is not None:
-        impact, arrival, sure, never = quick.quick_step(
-            cell.wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent
-        )
-    else:
-        impact, sure = sampled.sampled_step(pair, ball, deep=plan.deep, tangent=plan.tangent)
-        never = jnp.zeros_like(sure)
+    wall: Any = present(cell.wall)
+    impact, arrival, sure, never = quick.quick_step(wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
     active = cell.running & ~cell.declined
     free = active & (cell.held == 0)
     no = jnp.zeros_like(active)
     event = Event(impact, free & sure, free & never, no, no)
     declined = active & ~(free & (sure | never))
-    hard = cell.hard | declined if not plan.level else cell.hard  # sampling will not do better a second time
-    cell = replace(cell, declined=cell.declined | declined, hard=hard)
+    cell = replace(cell, declined=cell.declined | declined)
     if knows_arrival(plan):
         # A lane that is declined stays where it is: until it is served every step finds the same arrival.
         cell = replace(cell, arrival=arrival)
@@ -50,7 +45,7 @@ def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
 
 def knows_arrival(plan: Plan) -> bool:
     """Say whether a declined lane's flight is known: of soft walls it is nearly always the contact that is declined."""
-    return plan.level and not plan.rigid
+    return not plan.rigid
 
 
 class Request(eqx.Module):

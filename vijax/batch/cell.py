@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from vijax.engine.ground import Ground
 from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.engine.method import ImpactOutcome, Method
 from vijax.engine.quick_contact import Wall
@@ -37,7 +38,7 @@ class Plan(eqx.Module):
     Attributes:
         until: "attractor" or "window".
         rigid: Whether the walls are.
-        level: Whether gamma is 0 everywhere.
+        ground: What gamma is over all cells.
         deep: Whether greatest depths and works are wanted.
         energies: Whether what is harvested is wanted; needs `deep`.
         asymmetry: Whether the mean of v_in is wanted.
@@ -49,7 +50,7 @@ class Plan(eqx.Module):
 
     until: str = eqx.field(static=True, default="attractor")
     rigid: bool = eqx.field(static=True, default=False)
-    level: bool = eqx.field(static=True, default=True)
+    ground: Ground = eqx.field(static=True, default=Ground.LEVEL)
     deep: bool = eqx.field(static=True, default=False)
     energies: bool = eqx.field(static=True, default=False)
     asymmetry: bool = eqx.field(static=True, default=False)

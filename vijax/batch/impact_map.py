@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from vijax.batch import advance
 from vijax.batch.cell import Event, Plan
 from vijax.engine import quick, quick_contact
+from vijax.engine.ground import Ground
 from vijax.engine.impact import Ball
 from vijax.model.pair import ImpactPair
 from vijax.runtime import tiles, xla
@@ -39,8 +40,8 @@ class Next(eqx.Module):
 
 
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
-    """Answer by the quick step, of level cells."""
-    wall = quick_contact.prepare(request.pair)
+    """Answer by the quick step."""
+    wall = quick_contact.prepare(request.pair, ground=plan.ground)
     impact, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
     no = jnp.zeros_like(sure)
     return advance.Answer(Event(impact, sure, never, no, no), no, sure | never)
@@ -49,7 +50,8 @@ def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
 def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """Answer by certified sampling; of a contact alone where the quick step knows the flight."""
     if advance.knows_arrival(plan):
-        known = quick.quick_step(quick_contact.prepare(request.pair), request.pair.gamma, request.ball).arrival
+        wall = quick_contact.prepare(request.pair, ground=plan.ground)
+        known = quick.quick_step(wall, request.pair.gamma, request.ball).arrival
         request = replace(request, arrival=known)
     return advance.sampled_answer(plan, request)
 
@@ -92,15 +94,15 @@ def next_impacts(
         t: Phase, in [0, 2).
         level: Whether gamma is 0 everywhere.
     """
-    plan = Plan(until="window", rigid=pair.rigid, level=level, deep=True, tangent=False)
+    ground = Ground.LEVEL if level else Ground.GENTLE
+    plan = Plan(until="window", rigid=pair.rigid, ground=ground, deep=True, tangent=False)
     pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
     zero: Any = np.zeros_like(t)
     ball = Ball(0.5 * side * pair.d, -side * speed, t, zero)
     requests = advance.Request(pair, ball, zero, zero + _HORIZON)
     # What one step is not sure of is left to the next, which costs several times as much.
-    steps = [_sampled_answer, advance.careful_answer]
-    found, sure = _answered(_compiled(_quick_answer if level else steps.pop(0), plan), requests)
-    for step in steps:
+    found, sure = _answered(_compiled(_quick_answer, plan), requests)
+    for step in (_sampled_answer, advance.careful_answer):
         rest = np.flatnonzero(~sure)
         if rest.size:
             again, certain = _answered(_compiled(step, plan), jax.tree.map(partial(np.take, indices=rest), requests))

@@ -19,6 +19,7 @@ from vijax.batch import lanes, rows
 from vijax.batch.cell import TRANSIENT_SHARE, Entry, Plan, Settings
 from vijax.batch.simulate import compiled, program, width_of
 from vijax.batch.summary import Summary, shapes
+from vijax.engine.ground import Ground
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.runtime import checks
@@ -56,10 +57,10 @@ def averages(
         speed_variant=jnp.ones_like(length),
     )
     given = table, count, settings
-    plans = [_plan(level, length.size) for level in (True, False)]
+    plans = [_plan(ground, length.size) for ground in (Ground.LEVEL, Ground.GENTLE)]
     if checks.is_concrete(given):
         plan = plans[0 if not np.any(pair.gamma) else 1]
-        found = compiled(plan, width_of(table.shape[0], plan.level))(*given)
+        found = compiled(plan, width_of(table.shape[0]))(*given)
     else:
         # Rows of padding may hold anything.
         real = jnp.arange(table.shape[0], dtype=count.dtype) < count
@@ -69,7 +70,7 @@ def averages(
 
 
 def _either(plans: list[Plan], tilted: Any, given: Any) -> Float[Array, "ball out"]:
-    """Run the quick program of level ground if all balls are on it; where that is not known yet, both are compiled."""
+    """Run the program of level ground if all balls are on it; where that is not known yet, both are compiled."""
     if isinstance(tilted, bool):
         return _traced(plans[tilted], given)
     return lax.cond(tilted, partial(_traced, plans[1]), partial(_traced, plans[0]), given)
@@ -85,10 +86,10 @@ def _traced(plan: Plan, given: Any) -> Float[Array, "ball out"]:
     @sequential_vmap
     def run(table, count, settings):
         outputs = rows.width(shapes(plan, table.dtype))
-        return lanes.run(program(plan, settings), table, count, outputs, width_of(table.shape[0], plan.level))
+        return lanes.run(program(plan, settings), table, count, outputs, width_of(table.shape[0]))
 
     return run(*given)
 
 
-def _plan(level: bool, variants: int) -> Plan:
-    return Plan(level=level, deep=True, energies=True, variants=variants)
+def _plan(ground: Ground, variants: int) -> Plan:
+    return Plan(ground=ground, deep=True, energies=True, variants=variants)

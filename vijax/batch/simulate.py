@@ -15,6 +15,7 @@ from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
 from vijax.batch.summary import Summary, shapes, unload
 from vijax.engine import exact, quick_contact
+from vijax.engine.ground import ground_of
 from vijax.engine.impact import Arrival, Ball
 from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device, electrical
@@ -53,7 +54,7 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     attractor, method = plan.until == "attractor", settings.method
     return Cell(
         pair=pair,
-        wall=quick_contact.prepare(pair) if plan.level and method is None else None,
+        wall=quick_contact.prepare(pair, ground=plan.ground) if method is None else None,
         course=None if method is None else solver_steps.set_off(method, plan, pair, ball, held),
         length=entry.length,
         speed=entry.speed,
@@ -108,7 +109,7 @@ def program(plan: Plan, settings: Settings) -> lanes.Program:
             declined=lambda cell: cell.declined,
             hard=lambda cell: cell.hard,
             request=partial(advance.request, plan, settings),
-            second=partial(advance.sampled_answer, plan) if plan.level else None,
+            second=partial(advance.sampled_answer, plan),
             careful=partial(advance.careful_answer, plan),
             settle=partial(advance.settle, plan, settings),
         )
@@ -126,12 +127,9 @@ def compiled(plan: Plan, width: int) -> export_cache.Program:
     return export_cache.Program(tile, f"{tile.__qualname__} {plan} {width}")
 
 
-def width_of(cells: int, level: bool) -> int:
-    """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
-
-    A sampled step holds some dozens of samples a lane.
-    """
-    return max(min(cells // 8, 512 if level else 256), 128)
+def width_of(cells: int) -> int:
+    """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling."""
+    return max(min(cells // 8, 512), 128)
 
 
 def tolerances(dtype: str) -> dict[str, float]:
@@ -211,7 +209,7 @@ def summarise(
     plan = Plan(
         until=until,
         rigid=pair.rigid,
-        level=bool((np.asarray(pair.gamma) == 0).all()),
+        ground=ground_of(pair.gamma, deep=bool(outputs & DEEP)),
         deep=bool(outputs & DEEP),
         energies=bool(outputs & ENERGY),
         asymmetry="asymmetry" in outputs,
@@ -233,8 +231,8 @@ def summarise(
 
 
 def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""], settings: Settings) -> Summary:
-    """Summarise a tile, of NumPy's arrays."""
-    table = compiled(plan, width_of(cells.shape[0], plan.level))(cells, count, settings)
+    """Make the summary of a tile, of NumPy's arrays."""
+    table = compiled(plan, width_of(cells.shape[0]))(cells, count, settings)
     return rows.unpack(np.asarray(table), shapes(plan, cells.dtype))
 
 
@@ -279,8 +277,7 @@ def attractors(
 
 def _chained(pair: ImpactPair) -> Plan:
     """Make the plan of cells whose ends are wanted."""
-    level = bool((np.asarray(pair.gamma) == 0).all())
-    return Plan(rigid=pair.rigid, level=level, deep=True, energies=True, chained=True)
+    return Plan(rigid=pair.rigid, ground=ground_of(pair.gamma, deep=True), deep=True, energies=True, chained=True)
 
 
 def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, recorded_periods: int) -> Settings:

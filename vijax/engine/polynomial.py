@@ -81,6 +81,15 @@ def exp(x: Lane) -> Lane:
 
 
 @once
+def long_decay(x: Lane) -> Lane:
+    """Compute exp(-x) for x >= 0, to a few dozen roundings; what is less than 1e-16 counts as that."""
+    value = exp(jnp.minimum(x, 16 * EXP_REACH) * (-1 / 16))
+    for _ in range(4):
+        value = value * value
+    return value
+
+
+@once
 def phase(t: Lane) -> tuple[Lane, Lane]:
     """Compute sin(pi t) and cos(pi t) for t in [0, 2]."""
     quadrant = jnp.round(2 * t)

@@ -1,4 +1,4 @@
-"""The regular impact in straight-line arithmetic: one flight without gravity and one contact, certified or declined.
+"""The regular impact in straight-line arithmetic: one flight and one contact, certified or declined.
 
 Elementwise over lanes: fixed rounds, polynomial sine, cosine and exponential on known ranges, no library call. A lane
 whose impact is not certified to be the first and converged to rounding is declined, and `exact.step` does it instead.
@@ -13,6 +13,7 @@ from vijax.engine.exact import stick_speed
 from vijax.engine.impact import Arrival, Ball, Lane, LaneImpact
 from vijax.engine.quick_contact import RigidWall, SoftWall, Wall, touch
 from vijax.engine.quick_flight import Flight, fly
+from vijax.engine.quick_inclined_flight import fly as fly_inclined
 from vijax.model import energy
 
 
@@ -57,7 +58,10 @@ def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool) -> _Exi
     """Leave a rigid wall, at once."""
     out = wall.r * flight.speed
     # In the frame of the wall the acceleration there is -sine.
-    contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * flight.sine / flight.speed, -wall.r)
+    push = flight.sine
+    if wall.incline is not None:
+        push = push + onset.side * wall.incline.gamma
+    contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * push / flight.speed, -wall.r)
     depth = wall.chi * flight.speed if deep else None
     work = energy.membrane_work_rigid(onset.v_in, wall.r) if deep else None
     sure = out > 10 * stick_speed(out.dtype)
@@ -66,7 +70,7 @@ def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool) -> _Exi
 
 def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: Lane) -> _Exit:
     """Leave a membrane, after a contact."""
-    left, depth, sure = touch(wall, flight, deep)
+    left, depth, sure = touch(wall, flight, deep, onset.t + jnp.where(onset.side < 0, 1.0, 0.0))
     duration, out = left.duration, left.speed
     leave = onset.t + duration
     passed = jnp.floor(0.5 * leave)
@@ -81,13 +85,14 @@ def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: L
 
 
 def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tangent: bool = False) -> Quick:
-    """Take every lane one impact on by the regular path; gamma must be 0.
+    """Take every lane one impact on by the regular path.
 
     Args:
+        wall: Made for ground that gamma fits.
         deep: Also find the greatest depth and the work given to the membrane.
         tangent: Also give the tangent map of the step, flight and saltations included.
     """
-    flight = fly(wall.half, lane)
+    flight = fly(wall.half, lane) if wall.incline is None else fly_inclined(wall.half, wall.incline, lane)
     side = flight.flip * flight.wall
     arrival = Arrival(flight.elapsed, flight.speed, side, flight.sure & ~flight.never)
     meets = lane.t + flight.elapsed

@@ -1,20 +1,23 @@
 """The quick contact: one membrane contact in straight-line arithmetic, certified or declined."""
 
 import math
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from vijax.engine.ground import Ground
 from vijax.engine.impact import Lane
-from vijax.engine.polynomial import EXP_REACH, REACH, exp, sine_cosine
+from vijax.engine.polynomial import EXP_REACH, REACH, exp, long_decay, phase, sine_cosine
 from vijax.engine.quick_flight import Flight
+from vijax.engine.quick_inclined_flight import Incline, incline
 from vijax.engine.roots import converged_step, householder, single
 from vijax.model import energy
 from vijax.model.flow import PI, horner, membrane
 from vijax.model.pair import ImpactPair
-from vijax.runtime.arrays import AnyArray
+from vijax.runtime.arrays import AnyArray, present
 from vijax.runtime.xla import once, share, shared
 
 # Rounds in single precision towards the exit and the crest, after the first step from the reference. With fewer, the
@@ -22,6 +25,7 @@ from vijax.runtime.xla import once, share, shared
 _EXIT_ROUNDS, _CREST_ROUNDS = 2, 2
 _DOUBT = 1e-3  # a sign or a bound that is closer is not trusted to single precision
 _DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
+_LONG_REACH = 3.0  # with gravity more contacts take longer than that
 
 
 class RigidWall(eqx.Module):
@@ -30,6 +34,17 @@ class RigidWall(eqx.Module):
     half: Lane
     r: Lane
     chi: Lane  # greatest depth per speed
+    incline: Incline | None  # None: level
+
+
+class Ebb(eqx.Module):
+    """When and how fast a membrane under gravity and forcing, its swing gone, comes back to where a ball leaves it."""
+
+    phase: Lane  # of the forcing towards the wall
+    arc: Lane  # how long it has been coming from the steady response's other extremum
+    rate: Lane
+    force_cos: Lane  # the forcing then, as in `_Entry`
+    force_sin: Lane
 
 
 class SoftWall(eqx.Module):
@@ -55,22 +70,28 @@ class SoftWall(eqx.Module):
     crest_decay: Lane
     steep: Lane  # least speed at which w' is sure to have its first zero near the free crest
     lift: Lane  # least -w'' at the crest, per bound of f', that keeps w' negative until the exit
+    long_lift: Lane | None  # likewise for a longer way; None: level
     usable: Bool[AnyArray, "lane"]
+    incline: Incline | None  # None: level
+    ebb: Ebb | None  # None: contacts that outlast the free one by far are not looked for
 
 
 Wall = RigidWall | SoftWall
 
 
-def prepare(pair: ImpactPair) -> Wall:
+def prepare(pair: ImpactPair, *, ground: Ground = Ground.LEVEL) -> Wall:
     """Compute the constants of the quick step for every cell.
 
-    The size certificates, for a forcing of at most 1: while v h'(s) > h(s), up to half the free time of greatest depth
-    s_a, w' stays positive (Duhamel with h' > 0), and once kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From
-    there -w' starts with slope V = -w'' and is driven by at most max f': it stays positive while V h > max f' H, H the
-    integral of h ("lift"); h/H falls with time since h is log-concave.
+    The size certificates, for a forcing of at most 1, or with gravity 1 + |gamma| and that many times the speed: while
+    v h'(s) > h(s), up to half the free time of greatest depth s_a, w' stays positive (Duhamel with h' > 0), and once
+    kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From there -w' starts with slope V = -w'' and is driven by at
+    most max f': it stays positive while V h > max f' H, H the integral of h ("lift"); h/H falls with time since h is
+    log-concave.
     """
+    level = ground is Ground.LEVEL
+    slope = None if level else incline(pair.gamma)
     if pair.rigid:
-        return RigidWall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r))
+        return RigidWall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r), incline=slope)
     wall = membrane(pair)
     kappa, zeta, omega1 = wall.kappa, wall.zeta, wall.omega1
     square = kappa * kappa
@@ -87,6 +108,8 @@ def prepare(pair: ImpactPair) -> Wall:
 
     h_a, slope_a, static_a = response(0.5 * theta)
     h_d, _, static_d = response(jnp.full_like(theta, _DEEP_REACH))
+    h_e, _, static_e = response(jnp.full_like(theta, _LONG_REACH))
+    steep = (1 + _DOUBT) * jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a)
     return SoftWall(
         half=0.5 * pair.d,
         r=pair.r,
@@ -106,19 +129,36 @@ def prepare(pair: ImpactPair) -> Wall:
         cos_crest=jnp.cos(PI * crest),
         sin_crest=jnp.sin(PI * crest),
         crest_decay=jnp.exp(-zeta * crest),
-        steep=(1 + _DOUBT) * jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a),
+        steep=steep if level else steep * (1 + jnp.abs(pair.gamma)),
         lift=(1 + _DOUBT) * static_d / h_d,
+        long_lift=None if level else (1 + _DOUBT) * static_e / h_e,
         # Near the resonance the steady response is large and cancels.
         usable=(size > 1.0) & (pair.r > 1e-2),
+        incline=slope,
+        ebb=None if ground is not Ground.STEEP else _ebb(stiffness, loss, jnp.abs(pair.gamma) / square),
     )
 
 
+def _ebb(stiffness: Lane, loss: Lane, rest: Lane) -> Ebb:
+    """Find where a steady response about `rest`, of the amplitude and lag of (stiffness, loss), falls through 0."""
+    amplitude = 1 / jnp.hypot(stiffness, loss)
+    level = jnp.clip(rest / amplitude, 0.0, 1.0)
+    turn = jnp.arccos(-level) * (1 / PI)
+    phase = turn + jnp.arctan2(loss, stiffness) * (1 / PI)
+    rate = PI * amplitude * jnp.sqrt((1 - level) * (1 + level))
+    return Ebb(phase, turn + 1, rate, jnp.cos(PI * phase), jnp.sin(PI * phase))
+
+
 class _Motion(eqx.Module):
-    """Penetration w and its derivatives at one time of the contact, with the parts they were made of."""
+    """Penetration w and its derivatives at one time of the contact, with the parts they were made of.
+
+    What gravity adds to w, its steady response, is not in `w` (see `_Entry.penetration`): it changes no derivative,
+    since the membrane's force on it is gravity's, only reversed.
+    """
 
     w: Lane
     rate: Lane
-    force: Lane
+    force: Lane  # its periodic part
     push: Lane  # w''
     jerk: Lane  # w'''
     drive: Lane  # derivative of the forcing
@@ -175,9 +215,9 @@ def _in_reach(wall: SoftWall, s: Lane) -> Bool[Array, "lane"]:
     return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
 
 
-def _course(parts: tuple[Lane, ...], cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> _Course:
+def _course(entry: "_Entry", cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> _Course:
     """Rotate the contact to a reference time of given cos and sin of pi s; `free` is its free part there."""
-    steady_cos, steady_sin, force_cos, force_sin = parts
+    steady_cos, steady_sin, force_cos, force_sin = entry.parts
     return _Course(
         steady_cos * cosine + steady_sin * sine,
         steady_sin * cosine - steady_cos * sine,
@@ -218,6 +258,17 @@ class _Entry(eqx.Module):
     steady_sin: Lane
     free_cos: Lane
     free_sin: Lane
+    pressure: Lane | None  # of gravity, into the wall; None: level
+    rest: Lane | None  # the steady response to it
+
+    def penetration(self, at: _Motion) -> Lane:
+        """All of w."""
+        return at.w if self.rest is None else at.w + self.rest
+
+    @property
+    def force(self) -> Lane:
+        """All of the forcing at the onset."""
+        return self.force_cos if self.pressure is None else self.force_cos + self.pressure
 
     @property
     def parts(self) -> tuple[Lane, ...]:
@@ -234,8 +285,13 @@ def _entry(wall: SoftWall, flight: Flight) -> _Entry:
     force_cos, force_sin = -flight.sine, flight.cosine
     steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
     steady_sin = wall.gain_out * force_cos - wall.gain_in * force_sin
-    free_sin = (flight.speed - PI * steady_sin - wall.zeta * steady_cos) / wall.omega1
-    return _Entry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady_cos, free_sin)
+    pressure, rest, steady = None, None, steady_cos
+    if wall.incline is not None:
+        pressure = -flight.flip * flight.wall * wall.incline.gamma
+        rest = pressure / (wall.kappa * wall.kappa)
+        steady = steady_cos + rest
+    free_sin = (flight.speed - PI * steady_sin - wall.zeta * steady) / wall.omega1
+    return _Entry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady, free_sin, pressure, rest)
 
 
 class _Guess(eqx.Module):
@@ -250,7 +306,7 @@ class _Guess(eqx.Module):
 def _guess(wall: SoftWall, entry: _Entry) -> _Guess:
     """Guess from the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
     speed, square = entry.speed, wall.kappa * wall.kappa
-    push = entry.force_cos - 2 * wall.zeta * speed
+    push = entry.force - 2 * wall.zeta * speed
     jerk = -PI * entry.force_sin - 2 * wall.zeta * push - square * speed
     bend = 0.25 * push * push - (2 / 3) * jerk * speed
     hop = 2 * speed / (jnp.sqrt(jnp.maximum(bend, 0.0)) - 0.5 * push)
@@ -268,31 +324,89 @@ def _guess(wall: SoftWall, entry: _Entry) -> _Guess:
 
 
 @shared
-def touch(wall: SoftWall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
+def _lasts(wall: SoftWall, entry: _Entry, when: Lane) -> Bool[Array, "lane"]:
+    """Say whether a contact is sure to last until about `when`, the end of its steady response.
+
+    The membrane, pressed by gravity, follows the forcing and comes back with it, its swing as good as gone. w is
+    positive: for the time of a free contact since the forcing is (Duhamel with h > 0); then since the steady response
+    is above the first low of the swing, and above its envelope at that low and at 1/kappa before `when`, where their
+    difference falls: it rises before it falls, -log of a sine being convex. From there on the steady response falls
+    faster than the envelope of the swing rises, so that w falls until its zero, at most 1/(2 kappa) from `when`.
+    """
+    ebb = present(wall.ebb)
+    rest, pressure = present(entry.rest), present(entry.pressure)
+    swing = share(jnp.sqrt(entry.free_cos * entry.free_cos + entry.free_sin * entry.free_sin))
+    brake = wall.zeta / wall.kappa
+    # Within 1/kappa of that time the swing is slower than the steady response, which falls.
+    ring = swing * long_decay(wall.zeta * when) * (1 + brake + brake * brake)
+    size = jnp.abs(wall.gain_in) + jnp.abs(wall.gain_out)
+    fades = ebb.rate - PI**2 * size / wall.kappa > 1.1 * wall.kappa * ring
+    # A forcing into the wall keeps w positive for the time of a free contact.
+    force = entry.force_cos * wall.cos_span - entry.force_sin * wall.sin_span + pressure
+    drive = entry.force_sin * wall.cos_span + entry.force_cos * wall.sin_span
+    held = (entry.force > _DOUBT) & (force > _DOUBT) & ((entry.force_sin <= 0) | (drive >= 0)) & (wall.span < 1)
+    # From then on the steady response is beyond what is left of the swing, whose first low is a crest's time later.
+    low = swing * wall.r * wall.crest_decay + _DOUBT * rest
+    steady_cos = entry.steady_cos * wall.cos_span + entry.steady_sin * wall.sin_span
+    steady_sin = entry.steady_sin * wall.cos_span - entry.steady_cos * wall.sin_span
+    later = steady_cos * wall.cos_crest + steady_sin * wall.sin_crest
+    deep = (steady_cos + rest > low) & (later + rest > low) & (when < wall.span + ebb.arc)
+    late = when - 1 / wall.kappa > wall.span + wall.crest
+    return (pressure > 0) & (entry.free_sin > 0) & held & deep & fades & late
+
+
+@shared
+def _long_course(wall: SoftWall, entry: _Entry, when: Lane, cosine: Lane, sine: Lane) -> _Course:
+    """Rotate the contact to where its steady response ends, with cos and sin of omega1 s there."""
+    ebb = present(wall.ebb)
+    free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
+    return _Course(
+        -present(entry.rest), ebb.rate * (-1 / PI), ebb.force_cos, ebb.force_sin, *free, long_decay(wall.zeta * when)
+    )
+
+
+@shared
+def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
     """Find the exit, the greatest depth if asked for, and whether w rises once and falls once until then for certain.
 
     The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
     nothing has to be evaluated there; that of a slow entry against the forcing, from the root of its cubic Taylor
-    polynomial, about half of pi/omega1.
+    polynomial, about half of pi/omega1. Where gravity holds the ball on the wall until the forcing takes it off, about
+    when the membrane without its swing would come back.
+
+    Args:
+        begins: Phase of the forcing towards the wall at the onset.
     """
     eps = jnp.finfo(wall.half.dtype).eps
     entry = _entry(wall, flight)
-    rough, begun = single((wall, entry))
+    rough, begun = single((replace(wall, incline=None), entry))
     guess = _guess(rough, begun)
-    middle = _course(entry.parts, wall.cos_middle, wall.sin_middle, (entry.free_sin, -entry.free_cos), wall.root_r)
-    far = _course(entry.parts, wall.cos_span, wall.sin_span, (-entry.free_cos, -entry.free_sin), wall.r)
+    middle = _course(entry, wall.cos_middle, wall.sin_middle, (entry.free_sin, -entry.free_cos), wall.root_r)
+    far = _course(entry, wall.cos_span, wall.sin_span, (-entry.free_cos, -entry.free_sin), wall.r)
     course = _either(guess.short, middle, far)
     reference = jnp.where(guess.short, 0.5 * wall.span, wall.span)
+    long = None
+    if wall.ebb is not None:
+        when = wall.ebb.phase - begins
+        when = share(when - 2 * jnp.floor(0.5 * when))
+        long = _lasts(rough, begun, when.astype(jnp.float32))
+        turns = wall.omega1 * when * (1 / PI)
+        wide_sine, wide_cosine = share(phase(turns - 2 * jnp.floor(0.5 * turns)))
+        course = _either(long, _long_course(wall, entry, when, wide_cosine, wide_sine), course)
+        reference = jnp.where(long, when, reference)
+        guess = replace(guess, short=guess.short & ~long)
     s, reached = _rough_exit(rough, begun, guess, single(course))
     s = share(s.astype(reference.dtype))
     at = share(_motion(wall, course, s))
-    step = share(householder(at.w, at.rate, at.push, at.jerk))
+    step = share(householder(entry.penetration(at), at.rate, at.push, at.jerk))
     out = -(at.rate + step * (at.push + step * (0.5 * at.jerk)))
     duration = reference + s + step
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.push / at.rate))
     # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
     converged = reached & (stiffness * jnp.abs(step) < converged_step(eps)) & (wall.omega1 * duration > 0.25)
     crest, certain = _rough_crest(rough, begun, guess, single((duration, at.drive, at.force)))
+    if long is not None:
+        certain = jnp.where(long, wall.kappa * jnp.abs(duration - when) < 0.5, certain)
     depth = None
     if deep:
         depth, exact = _deepest(wall, entry, crest)
@@ -303,11 +417,14 @@ def touch(wall: SoftWall, flight: Flight, deep: bool) -> tuple[Exit, Lane | None
     turn_sine, turn_cosine = turn * (1 - twist * (1 / 6)), 1 - twist * (0.5 - twist * (1 / 24))
     sine, cosine = at.sine * turn_cosine + at.cosine * turn_sine, at.cosine * turn_cosine - at.sine * turn_sine
     short = guess.short
-    # So far they count from the course's reference, half or a whole free contact after the onset.
-    sine, cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)
+    # So far they count from the course's reference, half or a whole free contact after the onset, or much later.
+    turned_sine, turned_cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)
+    if long is not None:
+        turned_sine = jnp.where(long, sine * wide_cosine + cosine * wide_sine, turned_sine)
+        turned_cosine = jnp.where(long, cosine * wide_cosine - sine * wide_sine, turned_cosine)
     rot = wall.zeta * step
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
-    return Exit(duration, out, sine, cosine, decay), depth, sure
+    return Exit(duration, out, turned_sine, turned_cosine, decay), depth, sure
 
 
 @shared
@@ -315,11 +432,11 @@ def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: _Course) -
     """Find the exit from the course's reference in single precision, and whether the polynomials held on the way."""
     free = _at_reference(wall, course)
     near = guess.hop - 0.5 * wall.span
-    s = share(jnp.where(guess.short, near, householder(free.w, free.rate, free.push, free.jerk)))
+    s = share(jnp.where(guess.short, near, householder(entry.penetration(free), free.rate, free.push, free.jerk)))
     reached = _in_reach(wall, s)
     for _ in range(_EXIT_ROUNDS):
         at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
-        s = share(s + householder(at.w, at.rate, at.push, at.jerk))
+        s = share(s + householder(entry.penetration(at), at.rate, at.push, at.jerk))
         reached = reached & _in_reach(wall, s)
     return jnp.where(reached, s, 0.0), reached
 
@@ -329,7 +446,7 @@ def _crest_course(wall: SoftWall, entry: _Entry) -> _Course:
     """Rotate the contact to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
     cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
-    return _course(entry.parts, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
+    return _course(entry, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
 
 
 def _snap(wall: SoftWall, at: _Motion) -> Lane:
@@ -348,7 +465,8 @@ def _rough_crest(
     w' is an oscillator too, driven by the derivative f' of the forcing. Write e^(zeta s) w' = phi q with phi the free
     solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero.
     Beyond it -w' > 0 has no zero while f' < 0, and where f' ends positive at most one, so none if -w' > 0 at the exit.
-    Moreover a minimum of w needs a positive forcing. Else by size: `SoftWall.steep` and `SoftWall.lift`.
+    Moreover a minimum of w needs a positive forcing. Else by size: `SoftWall.steep` and `SoftWall.lift`. All that holds
+    while f' changes its sign once at most, for half a period (the level step asks that of the whole contact).
     """
     duration, exit_drive, exit_force = end
     course = _crest_course(wall, entry)
@@ -366,13 +484,32 @@ def _rough_crest(
     when = wall.crest + s
     way = duration - when
     falls, pulled, one_change = at.drive <= -_DOUBT, at.force <= -_DOUBT, duration < 1 - _DOUBT
-    first = falls & ((entry.force_sin >= 0) | ((entry.force_cos > 0) & (course.force_sin >= _DOUBT)))
-    first = (one_change & (first | ((entry.force_cos <= 0) & pulled))) | (entry.speed > wall.steep)
-    only = one_change & (falls | (exit_drive > _DOUBT) | (pulled & (exit_force <= -_DOUBT)))
-    # While the forcing is positive f' falls, so its value at the crest bounds it.
+    first = falls & ((entry.force_sin >= 0) | ((entry.force > 0) & (course.force_sin >= _DOUBT)))
+    if entry.pressure is None:
+        first = (one_change & (first | ((entry.force <= 0) & pulled))) | (entry.speed > wall.steep)
+        only = one_change & (falls | (exit_drive > _DOUBT) | (pulled & (exit_force <= -_DOUBT)))
+    else:
+        # With gravity the forcing is positive for more than half a period, or for less. Where it is negative at both
+        # ends it may be positive between them in the latter case alone, and then where f' has changed its sign.
+        pressed = entry.pressure >= 0
+        pulled = at.force + entry.pressure <= -_DOUBT
+        first_pulled = pulled & (pressed | (entry.force_sin >= 0) | (at.drive >= _DOUBT))
+        only_pulled = pulled & pressed & (exit_force + entry.pressure <= -_DOUBT)
+        first = ((when < 1 - _DOUBT) & (first | ((entry.force <= 0) & first_pulled))) | (entry.speed > wall.steep)
+        only = (way < 1 - _DOUBT) & (falls | (exit_drive > _DOUBT) | only_pulled)
+    # While its periodic part is positive f' falls, so its value at the crest bounds it.
     positive = (at.force > _DOUBT) & (exit_force > _DOUBT) & one_change
+    if entry.pressure is not None:
+        # Once f' is negative it stays so for half a period.
+        positive = (at.force > _DOUBT) & ((exit_force > _DOUBT) | (exit_drive < -_DOUBT)) & (way < 1 - _DOUBT)
     most = jnp.where(positive, jnp.maximum(at.drive, 0.0) + _DOUBT, PI)
     only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < _DEEP_REACH))
+    if wall.long_lift is not None:
+        only = only | ((-at.push > most * wall.long_lift) & (wall.omega1 * way < _LONG_REACH))
+    if entry.pressure is not None:
+        # A forcing that is never positive allows no minimum.
+        outwards = entry.pressure < -1
+        first, only = first | outwards, only | outwards
     inside = (wall.omega1 * when > _DOUBT) & (wall.omega1 * way > _DOUBT) & (way < (1 - _DOUBT) * wall.span)
     return jnp.where(reached, s, 0.0), converged & first & only & inside
 
@@ -382,7 +519,9 @@ def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Arr
     at = share(_motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
     fourth = _snap(wall, at)
     step = share(householder(at.rate, at.push, at.jerk, fourth))
-    depth = at.w + step * (at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth)))
+    depth = entry.penetration(at) + step * (
+        at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth))
+    )
     # The depth is stationary, and its Taylor polynomial of fifth order: a coarser time than the exit's will do.
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
     return depth, stiffness * jnp.abs(step) < 16 * converged_step(jnp.finfo(depth.dtype).eps)

@@ -21,16 +21,16 @@ def _kepler(slope: Lane, goal: Lane) -> tuple[Lane, Lane, Lane, Lane]:
     p, g = single((slope, goal))
     y = jnp.clip(g / (1 + p), -2.6, 2.6)
     for _ in range(_ROUNDS):
-        sine, cosine = _reflected(y)
+        sine, cosine = reflected(y)
         y = share(y + householder(sine + p * y - g, p + cosine, -sine, -cosine))
     y = share(y.astype(slope.dtype))
-    sine, cosine = _reflected(y)
+    sine, cosine = reflected(y)
     step = share(householder(sine + slope * y - goal, slope + cosine, -sine, -cosine))
     return y + step, step, sine, cosine
 
 
 @shared
-def _reflected(y: Lane) -> tuple[Lane, Lane]:
+def reflected(y: Lane) -> tuple[Lane, Lane]:
     """Compute sin and cos on |y| <= pi + 0.08."""
     size = jnp.abs(y)
     beyond = size > 0.5 * PI
