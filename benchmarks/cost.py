@@ -8,16 +8,17 @@ to simulate as soft ones; r 0.5, start (0, 0.4), over a window. Microseconds are
 for each cell of the plane and period, medians; ratios are against another row of the same round, median and range.
 Printout for 64 x 64 cells and 50 periods, two cores, on a busy machine:
 
-    counts             0.9646 us per cell-period
-    counts, again      0.8155 us per cell-period     0.95 times counts (0.80 to 1.34)
-    lyapunov           0.9172 us per cell-period     1.07 times counts (0.94 to 1.35)
-    P                  1.5345 us per cell-period     1.72 times counts (1.59 to 2.61)
-    P at 8 omega       1.6227 us per cell-period     1.09 times P (1.06 to 1.13)
-    gamma = 0 given    1.0239 us per cell-period     1.19 times counts (0.82 to 1.34)
-    gamma = 0.1       12.9800 us per cell-period    15.08 times counts (13.28 to 19.52)
-    soft, starts       0.7707 us per cell-period
-    rigid, starts      0.4817 us per cell-period     0.62 times soft, starts (0.52 to 0.64)
-    rigid map          0.2363 us per cell-period     0.12 times P (0.12 to 0.15)
+    counts             0.4350 us per cell-period
+    counts, again      0.3783 us per cell-period     0.85 times counts (0.70 to 1.00)
+    lyapunov           0.4351 us per cell-period     1.02 times counts (0.73 to 1.15)
+    P                  0.4858 us per cell-period     1.00 times counts (0.91 to 1.29)
+    P at 8 omega       0.8966 us per cell-period     1.85 times P (1.53 to 2.10)
+    gamma = 0 given    0.4191 us per cell-period     0.96 times counts (0.78 to 1.04)
+    gamma = 0.1        0.5837 us per cell-period     1.39 times counts (1.05 to 1.68)
+    gamma = 0.5        0.8554 us per cell-period     1.96 times counts (1.62 to 2.27)
+    soft, starts       0.5903 us per cell-period
+    rigid, starts      0.4612 us per cell-period     0.75 times soft, starts (0.58 to 0.89)
+    rigid map          0.2564 us per cell-period     0.54 times P (0.44 to 0.74)
 
 """
 
@@ -38,7 +39,7 @@ import vijax
 from benchmarks.speed import HERE, U0, V0, R, Row, axes
 
 FREQUENCIES = 8
-LEVEL, INCLINED = 0.0, 0.1
+LEVEL, INCLINED = 0.0, (0.1, 0.5)
 STIFF = 400.0
 SPEEDS = 0.6  # starts of the second plane reach from minus to plus it
 
@@ -65,7 +66,7 @@ def contenders(side: int, periods: int) -> dict[str, Contender]:
         "P": Contender(partial(plane, outputs=power), "counts"),
         f"P at {FREQUENCIES} omega": Contender(partial(plane, omega=omega, outputs=power), "P"),
         "gamma = 0 given": Contender(partial(plane, gamma=LEVEL, outputs=counts), "counts"),
-        f"gamma = {INCLINED}": Contender(partial(plane, gamma=INCLINED, outputs=counts), "counts"),
+        **{f"gamma = {slope}": Contender(partial(plane, gamma=slope, outputs=counts), "counts") for slope in INCLINED},
         "soft, starts": Contender(partial(starts, outputs=power), None),
         "rigid, starts": Contender(partial(starts, wall="rigid", outputs=power), "soft, starts"),
         # All kappa of a rigid wall are one simulation, so its whole map is.

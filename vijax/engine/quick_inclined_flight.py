@@ -57,7 +57,7 @@ class Incline(eqx.Module):
 
 
 def incline(gamma: Lane) -> Incline:
-    """Compute constants of flights; beyond |gamma| = 1, where the acceleration keeps its sign, half the pieces are empty.
+    """Compute constants of flights; beyond |gamma| = 1 the acceleration keeps its sign, and half the pieces are empty.
 
     U' = 0 at y has rate = slope y + sin y, an odd function whose inverse has a power series without negative terms, and
     the maximum, the integral of this inverse, is above level by rate^2 times a series in rate^2 that grows faster than
