@@ -6,6 +6,7 @@ Nothing here calls the engine but `march`, which runs many starts in one compile
 import functools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -161,7 +162,7 @@ def _peak(values: np.ndarray) -> np.ndarray:
     return np.maximum(values.max(axis=-1), inner.max(axis=-1))
 
 
-def audit_flights(pair: ImpactPair, ran: March, samples: int = 400) -> np.ndarray:
+def audit_flights(pair: ImpactPair, ran: Any, samples: int = 400) -> np.ndarray:
     """Find how far flights were beyond a wall before their reported ends (negative: never), over their terms' scale."""
     flew = (ran.before.mode == 0) & ~(ran.out.permanent & (ran.out.impact.side == 0))
     index = np.nonzero(flew)
@@ -188,7 +189,7 @@ _WIDTHS = (
 )  # samples of a contact: 40 a half cycle of the faster oscillation, as far as that goes
 
 
-def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
+def audit_contacts(pair: ImpactPair, ran: Any) -> np.ndarray:
     """Find how far w was below zero before the reported end of each contact, over the scale of w (negative: never)."""
     held = ((ran.out.impact.side != 0) | (ran.before.mode != 0)) & ~np.isnan(ran.out.stay)
     index = np.nonzero(held)
@@ -216,6 +217,41 @@ def audit_contacts(pair: ImpactPair, ran: March) -> np.ndarray:
             below = np.maximum(*(_peak(-w) for w in both))
             worst[k] = (below / np.where(scale > 0, scale, 1)).astype(float)
     return worst
+
+
+# --- what the quick step is sure of ---------------------------------------------------------------------------------
+
+
+def after_impacts(rng: np.random.Generator, count: int, slopes) -> tuple[ImpactPair, tuple[np.ndarray, ...]]:
+    """Draw balls (u, v, t) that leave a wall: fast and slow, soft walls and stiff, some as the acceleration turns."""
+    gamma = rng.choice(slopes, count)
+    d = np.exp(rng.uniform(np.log(0.01), np.log(2), count))
+    kappa = np.exp(rng.uniform(np.log(2), np.log(2e3), count))
+    side = rng.choice([-1.0, 1.0], count)
+    speed, t = np.exp(rng.uniform(np.log(1e-3), np.log(1.5), count)), rng.uniform(0, 2, count)
+    turn = np.arccos(np.clip(gamma, -1, 1)) / np.pi
+    turn = np.where(rng.random(count) < 0.5, turn, 2 - turn) + rng.choice([-1, 1], count) * 10 ** rng.uniform(-16, -1)
+    t = np.where(rng.random(count) < 0.2, turn % 2, t)
+    return pairs(d, kappa, rng.uniform(0.05, 0.97, count), gamma), (0.5 * side * d, -side * speed, t)
+
+
+def beyond_sure_flights(pair: ImpactPair, ball: tuple[np.ndarray, ...], arrival, samples: int = 200) -> np.ndarray:
+    """Find how far beyond a wall flights were before the arrivals that the quick step was sure of; `audit_flights`."""
+    sure = arrival.sure
+    u, v, t = (x[sure] for x in ball)
+    none = np.zeros(u.size, bool)
+    before = SimpleNamespace(mode=none.astype(int), u=u, v=v, t=t)
+    impact = SimpleNamespace(side=arrival.side[sure])
+    out = SimpleNamespace(permanent=none, quiet=none, flight=arrival.flight[sure], impact=impact)
+    return audit_flights(jax.tree.map(lambda x: x[sure], pair), SimpleNamespace(before=before, out=out), samples)
+
+
+def below_sure_contacts(pair: ImpactPair, hit, sure: np.ndarray) -> np.ndarray:
+    """Find how far below zero w was before the exits that the quick step was sure of; `audit_contacts`."""
+    pair, hit = jax.tree.map(lambda x: x[sure], (pair, hit))
+    before = SimpleNamespace(mode=np.zeros(hit.side.size, int), u=0 * hit.side)
+    impact = SimpleNamespace(side=hit.side, v_in=hit.v_in, t=hit.onset_t)
+    return audit_contacts(pair, SimpleNamespace(before=before, out=SimpleNamespace(stay=hit.duration, impact=impact)))
 
 
 def both_ways(hit, out) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -157,7 +157,7 @@ def test_the_next_estimate_is_by_the_pace_of_the_last_run(kept, watched):
     assert told[-1] == (10_000, 10_000)
     assert estimate.of(planned(1000)).seconds == pytest.approx(10 / 9000 * 10**6)
     inclined = planned(1000, gamma=0.1)  # whose pace nobody knows
-    assert estimate.of(inclined).seconds == pytest.approx(2e-6 * 400 * 10**6)
+    assert estimate.of(inclined).seconds == pytest.approx(5e-7 * 400 * 10**6)
 
 
 def test_a_run_is_not_lost_with_its_pace(kept, watched):

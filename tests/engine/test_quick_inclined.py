@@ -1,14 +1,21 @@
 """The quick step with gravity: where it is sure it is right, whatever gamma, and on planes it is nearly always sure."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
 
-from benchmarks.yardstick import EPS, audit_contacts, audit_flights, long_contact, long_flight, mp_flight, pairs
+from benchmarks import yardstick
+from benchmarks.yardstick import (
+    EPS,
+    below_sure_contacts,
+    beyond_sure_flights,
+    long_contact,
+    long_flight,
+    mp_flight,
+    pairs,
+)
 from vijax.engine import quick, quick_contact
 from vijax.engine.ground import Ground, ground_of
 from vijax.engine.impact import Ball
@@ -50,16 +57,8 @@ def fly(pair, u, v, t, step=step_on_steep_ground):
 
 
 def after_impacts(rng):
-    """Balls that leave a wall: fast and slow, soft walls and stiff, some as the acceleration changes its sign."""
-    gamma = rng.choice(SLOPES, COUNT)
-    d = np.exp(rng.uniform(np.log(0.01), np.log(2), COUNT))
-    kappa = np.exp(rng.uniform(np.log(2), np.log(2e3), COUNT))
-    side = rng.choice([-1.0, 1.0], COUNT)
-    speed, t = np.exp(rng.uniform(np.log(1e-3), np.log(1.5), COUNT)), rng.uniform(0, 2, COUNT)
-    turn = np.arccos(np.clip(gamma, -1, 1)) / np.pi
-    turn = np.where(rng.random(COUNT) < 0.5, turn, 2 - turn) + rng.choice([-1, 1], COUNT) * 10 ** rng.uniform(-16, -1)
-    t = np.where(rng.random(COUNT) < 0.2, turn % 2, t)
-    return pairs(d, kappa, rng.uniform(0.05, 0.97, COUNT), gamma), 0.5 * side * d, -side * speed, t
+    pair, ball = yardstick.after_impacts(rng, COUNT, SLOPES)
+    return pair, *ball
 
 
 def near_grazes(rng):
@@ -88,14 +87,7 @@ def test_no_crossing_comes_before_a_sure_one(flown):
     kind, pair, u, v, t, _, arrival, _ = flown
     sure = arrival.sure
     assert sure.mean() > {after_impacts: 0.8, near_grazes: 0.3}[kind]
-    none = np.zeros(sure.sum(), bool)
-    ran = SimpleNamespace(
-        before=SimpleNamespace(mode=none.astype(int), u=u[sure], v=v[sure], t=t[sure]),
-        out=SimpleNamespace(
-            permanent=none, quiet=none, flight=arrival.flight[sure], impact=SimpleNamespace(side=arrival.side[sure])
-        ),
-    )
-    assert np.max(audit_flights(jax.tree.map(lambda x: x[sure], pair), ran, samples=200)) < 16 * EPS
+    assert np.max(beyond_sure_flights(pair, (u, v, t), arrival)) < 16 * EPS
 
 
 def test_a_sure_flight_ends_at_the_wall_with_the_speed_there(flown):
@@ -113,13 +105,9 @@ def test_no_exit_comes_before_a_sure_one(flown):
     if kind is near_grazes:
         sure = sure & (np.arange(COUNT) < 512)
     assert sure.mean() > (0.03 if kind is near_grazes else 0.5)
-    cell = jax.tree.map(lambda x: x[sure], pair)
-    hit = jax.tree.map(lambda x: x[sure], hit)
-    impact = SimpleNamespace(side=hit.side, v_in=hit.v_in, t=hit.onset_t)
-    before = SimpleNamespace(mode=np.zeros(sure.sum(), int), u=0 * hit.side)
-    ran = SimpleNamespace(before=before, out=SimpleNamespace(stay=hit.duration, impact=impact))
     # Of a slow hop's depth the rounding of its end is more.
-    assert np.max(audit_contacts(cell, ran)) < 1e-9
+    assert np.max(below_sure_contacts(pair, hit, sure)) < 1e-9
+    cell, hit = jax.tree.map(lambda x: x[sure], (pair, hit))
     state = (cell.kappa, cell.r, cell.gamma, hit.side, hit.onset_t, 0.0, hit.side * hit.v_in, hit.duration)
     w, rate = long_contact(*state)
     assert np.max(np.abs(w)) < 1e-14
@@ -140,10 +128,7 @@ def test_contacts_that_gravity_prolongs_are_among_the_sure_ones():
     omega1 = np.sqrt(cell.kappa**2 - decay**2)
     h = np.exp(-decay * late.duration) * np.sin(omega1 * late.duration) / omega1
     assert np.max(np.abs(late.tangent[2] + cell.kappa**2 * h)) < 1e-10
-    impact = SimpleNamespace(side=late.side, v_in=late.v_in, t=late.onset_t)
-    before = SimpleNamespace(mode=np.zeros(late.side.size, int), u=0 * late.side)
-    ran = SimpleNamespace(before=before, out=SimpleNamespace(stay=late.duration, impact=impact))
-    assert np.max(audit_contacts(cell, ran)) < 1e-9
+    assert np.max(below_sure_contacts(cell, late, np.ones(late.side.size, bool))) < 1e-9
 
 
 @pytest.mark.parametrize("gamma", SURE)

@@ -74,7 +74,7 @@ def _shape(slope: Lane, half_turns: Lane) -> Shape:
     lift = 0.5 / (1 + slope)
     # Of an empty piece these are NaN, and no comparison with them is true.
     swell = (width / turn - fall / (turn * turn) - lift) / (turn * turn)
-    return single(Shape(width, fall, turn, lift, swell))
+    return Shape(*single((width, fall, turn, lift, swell)))
 
 
 class _Course(NamedTuple):

@@ -22,7 +22,7 @@ from vijax.runtime.tiles import places
 _HOUR, _GIGABYTES = 3600.0, 10e9
 # Seconds of a cell and a period where no pace was kept, by two slow cores; of rk4 at 1000 steps. With smaller ones a
 # run that takes the night begins unasked.
-_SLOW = {"exact level": 2e-7, "exact inclined": 2e-6, "ode": 2e-5, "rk4": 2e-6}
+_SLOW = {"exact level": 2e-7, "exact inclined": 5e-7, "ode": 2e-5, "rk4": 2e-6}
 _RECORDED = 1e-5  # The same where the impacts of cells are recorded.
 # Seconds that a run lasts for its pace to be kept: a shorter one says little of a long one.
 _LEAST_TIMED = 2.0
