@@ -43,7 +43,7 @@ from vijax.design import survey
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Ball
 from vijax.engine.quick import quick_step
-from vijax.engine.quick_contact import prepare
+from vijax.engine.quick_wall import prepare
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.orbits import orbit_properties, periodic

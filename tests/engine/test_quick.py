@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.yardstick import EPS, HORIZON, TILE, both_ways, march, pairs, start
-from vijax.engine import contact_search, exact, quick, quick_contact
+from vijax.engine import contact_search, exact, quick, quick_wall
 from vijax.engine.impact import Ball
 
 COUNT = 16 * TILE
@@ -30,7 +30,7 @@ def both(request):
     lane = Ball(*(jnp.asarray(getattr(flat.before, name), float) for name in ("u", "v", "t", "n")))
 
     def program(pair, lane):
-        return quick.quick_step(quick_contact.prepare(pair), jnp.zeros_like(lane.u), lane, deep=True, tangent=True)
+        return quick.quick_step(quick_wall.prepare(pair), jnp.zeros_like(lane.u), lane, deep=True, tangent=True)
 
     hit, _, sure, never = jax.tree.map(np.asarray, jax.jit(program)(pair, lane))
     return request.param, flat, hit, sure, never
@@ -83,7 +83,7 @@ def test_no_crossing_is_missed_beside_a_graze():
     d, u, v, t = (x[:4096] for x in near_grazes(np.random.default_rng(8), 40_000))
     pair = jax.tree.map(jnp.asarray, pairs(d, None, 0.5, 0.0))
     lane = Ball(*map(jnp.asarray, (u, v, t, np.zeros_like(t))))
-    step = jax.jit(lambda pair, lane: quick.quick_step(quick_contact.prepare(pair), jnp.zeros_like(lane.u), lane))
+    step = jax.jit(lambda pair, lane: quick.quick_step(quick_wall.prepare(pair), jnp.zeros_like(lane.u), lane))
     careful = jax.jit(jax.vmap(exact.step, in_axes=(0, 0, None)))
     hit, _, sure, never = jax.tree.map(np.asarray, step(pair, lane))
     out = careful(pair, jax.tree.map(jnp.asarray, start(u, v, t)), HORIZON)

@@ -16,7 +16,7 @@ from benchmarks.yardstick import (
     mp_flight,
     pairs,
 )
-from vijax.engine import quick, quick_contact
+from vijax.engine import quick, quick_wall
 from vijax.engine.ground import Ground, ground_of
 from vijax.engine.impact import Ball
 
@@ -28,20 +28,20 @@ SURE = {0.0: 0.97, 0.1: 0.97, -0.3: 0.95, 0.5: 0.95}
 
 @jax.jit
 def step_on_steep_ground(pair, ball):
-    wall = quick_contact.prepare(pair, ground=Ground.STEEP)
+    wall = quick_wall.prepare(pair, ground=Ground.STEEP)
     found = quick.quick_step(wall, pair.gamma, ball, tangent=True)
     return found.impact, found.arrival, found.sure
 
 
 @jax.jit
 def step_on_level_ground(pair, ball):
-    found = quick.quick_step(quick_contact.prepare(pair), pair.gamma, ball)
+    found = quick.quick_step(quick_wall.prepare(pair), pair.gamma, ball)
     return found.impact, found.arrival, found.sure
 
 
 @jax.jit
 def deep_step(pair, ball):
-    wall = quick_contact.prepare(pair, ground=Ground.GENTLE)
+    wall = quick_wall.prepare(pair, ground=Ground.GENTLE)
     found = quick.quick_step(wall, pair.gamma, ball, deep=True)
     return found.impact, found.arrival, found.sure
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.engine.method import ImpactOutcome, Method
-from vijax.engine.quick_contact import Wall
+from vijax.engine.quick_wall import Wall
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import AnyArray, Lane, Mask, Values

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from vijax.batch import advance
 from vijax.batch.cell import Event, Plan
-from vijax.engine import quick, quick_contact
+from vijax.engine import quick, quick_wall
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Ball
 from vijax.model.pair import ImpactPair
@@ -41,7 +41,7 @@ class Next(eqx.Module):
 
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """Answer by the quick step."""
-    wall = quick_contact.prepare(request.pair, ground=plan.ground)
+    wall = quick_wall.prepare(request.pair, ground=plan.ground)
     impact, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
     no = jnp.zeros_like(sure)
     return advance.Answer(Event(impact, sure, never, no, no), no, sure | never)
@@ -50,7 +50,7 @@ def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
 def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """Answer by certified sampling; of a contact alone where the quick step knows the flight."""
     if advance.knows_arrival(plan):
-        wall = quick_contact.prepare(request.pair, ground=plan.ground)
+        wall = quick_wall.prepare(request.pair, ground=plan.ground)
         known = quick.quick_step(wall, request.pair.gamma, request.ball).arrival
         request = replace(request, arrival=known)
     return advance.sampled_answer(plan, request)

@@ -14,7 +14,7 @@ from vijax.batch import advance, chain, lanes, rows, solver_steps
 from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence, review, settled
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
 from vijax.batch.summary import Summary, shapes, unload
-from vijax.engine import exact, quick_contact
+from vijax.engine import exact, quick_wall
 from vijax.engine.ground import ground_of
 from vijax.engine.impact import Arrival, Ball
 from vijax.engine.method import Method
@@ -54,7 +54,7 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     attractor, method = plan.until == "attractor", settings.method
     return Cell(
         pair=pair,
-        wall=quick_contact.prepare(pair, ground=plan.ground) if method is None else None,
+        wall=quick_wall.prepare(pair, ground=plan.ground) if method is None else None,
         course=None if method is None else solver_steps.set_off(method, plan, pair, ball, held),
         length=entry.length,
         speed=entry.speed,

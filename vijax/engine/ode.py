@@ -4,9 +4,8 @@ One `step` of a lane is one attempt of a solver step, accepted, rejected or cut 
 another's solve. A cell's motion is a chain of smooth spells: flight in the displacement u, contact in the penetration
 w = side u - d/2; `mode` says which, and no sign of a rounded number is asked. The wall is met where the dense output of
 a step first crosses it; the step is then repeated up to there, and what is missing is closed by the Taylor polynomial
-of the repeated step, so that the state has the order of the solver and not that of the dense output.
-
-This is the only file that imports diffrax.
+of the repeated step, so that the state has the order of the solver and not that of the dense output. This is the only
+file that imports diffrax.
 """
 
 from typing import Any
@@ -28,13 +27,13 @@ from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 
 Solver = Any  # a Runge-Kutta solver of diffrax
-
 _LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
 _CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step
 _ATTEMPTS = 6  # repeats after which a crossing is taken as it is: rounding holds it from closing
 # The first step, in half periods of the forcing; in a contact at most 0.1/kappa. The method chooses all others: a
 # longer one is refused where it is too long, a shorter one costs a few steps.
 _FIRST_STEP = 1e-3
+_CREST = 2.0  # an aim that is no wall: the deepest point of a contact
 _VANISHING = 4  # roundings: a shorter step does not advance time
 
 
@@ -96,9 +95,6 @@ class Motion(eqx.Module):
     left_t: Scalar  # when the ball left a wall last
     left_n: Int[Array, ""]
     steps: Int[Array, ""]
-
-
-_CREST = 2.0  # an aim that is no wall: the deepest point of a contact
 
 
 class Ode(Method[Motion]):
@@ -180,7 +176,6 @@ class Ode(Method[Motion]):
         seen, moved = decided((seen, trial.passes & ~seen))
         side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
         y = _meet(m, half, side, wall, trial, landing)
-
         t = trial.t + landing.delay
         over = decided(t >= 2)
         t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)

@@ -11,9 +11,10 @@ from jaxtyping import Array, Bool
 
 from vijax.engine.exact import stick_speed
 from vijax.engine.impact import Arrival, Ball, Lane, LaneImpact
-from vijax.engine.quick_contact import RigidWall, SoftWall, Wall, touch
+from vijax.engine.quick_contact import touch
 from vijax.engine.quick_flight import Flight, fly
 from vijax.engine.quick_inclined_flight import fly as fly_inclined
+from vijax.engine.quick_wall import RigidWall, SoftWall, Wall
 from vijax.model import energy
 
 

@@ -8,217 +8,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from vijax.engine.ground import Ground
 from vijax.engine.impact import Lane
-from vijax.engine.polynomial import EXP_REACH, REACH, exp, long_decay, phase, sine_cosine
+from vijax.engine.polynomial import long_decay, phase
+from vijax.engine.quick_course import Course, Motion, at_reference, in_reach, motion
 from vijax.engine.quick_flight import Flight
-from vijax.engine.quick_inclined_flight import Incline, incline
+from vijax.engine.quick_wall import DEEP_REACH, DOUBT, LONG_REACH, SoftWall
 from vijax.engine.roots import converged_step, householder, single
-from vijax.model import energy
-from vijax.model.flow import PI, horner, membrane
-from vijax.model.pair import ImpactPair
-from vijax.runtime.arrays import AnyArray, present
-from vijax.runtime.xla import once, share, shared
+from vijax.model.flow import PI, horner
+from vijax.runtime.arrays import present
+from vijax.runtime.xla import share, shared
 
 # Rounds in single precision towards the exit and the crest, after the first step from the reference. With fewer, the
 # step in double precision that follows is too long more often, and the lane is declined: it costs time and no digits.
 _EXIT_ROUNDS, _CREST_ROUNDS = 2, 2
-_DOUBT = 1e-3  # a sign or a bound that is closer is not trusted to single precision
-_DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
-_LONG_REACH = 3.0  # with gravity more contacts take longer than that
 
 
-class RigidWall(eqx.Module):
-    """What an impact on a rigid wall needs and no impact changes."""
-
-    half: Lane
-    r: Lane
-    chi: Lane  # greatest depth per speed
-    incline: Incline | None  # None: level
-
-
-class Ebb(eqx.Module):
-    """When and how fast a membrane under gravity and forcing, its swing gone, comes back to where a ball leaves it."""
-
-    phase: Lane  # of the forcing towards the wall
-    arc: Lane  # how long it has been coming from the steady response's other extremum
-    rate: Lane
-    force_cos: Lane  # the forcing then, as in `_Entry`
-    force_sin: Lane
-
-
-class SoftWall(eqx.Module):
-    """What the contact of a cell needs and no impact changes."""
-
-    half: Lane
-    r: Lane
-    kappa: Lane
-    zeta: Lane
-    omega1: Lane
-    gain_in: Lane  # steady response per forcing, in phase
-    gain_out: Lane  # and a quarter turn behind
-    span: Lane  # pi/omega1: the free contact
-    cos_span: Lane
-    sin_span: Lane
-    cos_middle: Lane
-    sin_middle: Lane
-    root_r: Lane
-    hop: Lane  # a contact whose cubic Taylor polynomial ends before this is expanded about half the span
-    crest: Lane  # free time of greatest depth
-    cos_crest: Lane
-    sin_crest: Lane
-    crest_decay: Lane
-    steep: Lane  # least speed at which w' is sure to have its first zero near the free crest
-    lift: Lane  # least -w'' at the crest, per bound of f', that keeps w' negative until the exit
-    long_lift: Lane | None  # likewise for a longer way; None: level
-    usable: Bool[AnyArray, "lane"]
-    incline: Incline | None  # None: level
-    ebb: Ebb | None  # None: contacts that outlast the free one by far are not looked for
-
-
-Wall = RigidWall | SoftWall
-
-
-def prepare(pair: ImpactPair, *, ground: Ground = Ground.LEVEL) -> Wall:
-    """Compute the constants of the quick step for every cell.
-
-    The size certificates, for a forcing of at most 1, or with gravity 1 + |gamma| and that many times the speed: while
-    v h'(s) > h(s), up to half the free time of greatest depth s_a, w' stays positive (Duhamel with h' > 0), and once
-    kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From there -w' starts with slope V = -w'' and is driven by at
-    most max f': it stays positive while V h > max f' H, H the integral of h ("lift"); h/H falls with time since h is
-    log-concave.
-    """
-    level = ground is Ground.LEVEL
-    slope = None if level else incline(pair.gamma)
-    if pair.rigid:
-        return RigidWall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r), incline=slope)
-    wall = membrane(pair)
-    kappa, zeta, omega1 = wall.kappa, wall.zeta, wall.omega1
-    square = kappa * kappa
-    stiffness, loss = square - PI**2, 2 * zeta * PI
-    size = stiffness * stiffness + loss * loss
-    span, theta = PI / omega1, jnp.arctan2(omega1, zeta)
-    crest = theta / omega1
-    bend = zeta * zeta - (2 / 3) * (4 * zeta * zeta - square)
-
-    def response(x):  # h, h' and H at omega1 s = x
-        decay = jnp.exp(-zeta / omega1 * x)
-        h, slope = decay * jnp.sin(x) / omega1, decay * (jnp.cos(x) - zeta / omega1 * jnp.sin(x))
-        return h, slope, (1 - slope - 2 * zeta * h) / square
-
-    h_a, slope_a, static_a = response(0.5 * theta)
-    h_d, _, static_d = response(jnp.full_like(theta, _DEEP_REACH))
-    h_e, _, static_e = response(jnp.full_like(theta, _LONG_REACH))
-    steep = (1 + _DOUBT) * jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a)
-    return SoftWall(
-        half=0.5 * pair.d,
-        r=pair.r,
-        kappa=kappa,
-        zeta=zeta,
-        omega1=omega1,
-        gain_in=stiffness / size,
-        gain_out=loss / size,
-        span=span,
-        cos_span=jnp.cos(PI * span),
-        sin_span=jnp.sin(PI * span),
-        cos_middle=jnp.cos(0.5 * PI * span),
-        sin_middle=jnp.sin(0.5 * PI * span),
-        root_r=jnp.sqrt(pair.r),
-        hop=jnp.where(bend > 0, 1.6 / (jnp.sqrt(jnp.maximum(bend, 0.0)) + zeta), 0.0),  # 0.8 of the free contact's
-        crest=crest,
-        cos_crest=jnp.cos(PI * crest),
-        sin_crest=jnp.sin(PI * crest),
-        crest_decay=jnp.exp(-zeta * crest),
-        steep=steep if level else steep * (1 + jnp.abs(pair.gamma)),
-        lift=(1 + _DOUBT) * static_d / h_d,
-        long_lift=None if level else (1 + _DOUBT) * static_e / h_e,
-        # Near the resonance the steady response is large and cancels.
-        usable=(size > 1.0) & (pair.r > 1e-2),
-        incline=slope,
-        ebb=None if ground is not Ground.STEEP else _ebb(stiffness, loss, jnp.abs(pair.gamma) / square),
-    )
-
-
-def _ebb(stiffness: Lane, loss: Lane, rest: Lane) -> Ebb:
-    """Find where a steady response about `rest`, of the amplitude and lag of (stiffness, loss), falls through 0."""
-    amplitude = 1 / jnp.hypot(stiffness, loss)
-    level = jnp.clip(rest / amplitude, 0.0, 1.0)
-    turn = jnp.arccos(-level) * (1 / PI)
-    phase = turn + jnp.arctan2(loss, stiffness) * (1 / PI)
-    rate = PI * amplitude * jnp.sqrt((1 - level) * (1 + level))
-    return Ebb(phase, turn + 1, rate, jnp.cos(PI * phase), jnp.sin(PI * phase))
-
-
-class _Motion(eqx.Module):
-    """Penetration w and its derivatives at one time of the contact, with the parts they were made of.
-
-    What gravity adds to w, its steady response, is not in `w` (see `_Entry.penetration`): it changes no derivative,
-    since the membrane's force on it is gravity's, only reversed.
-    """
-
-    w: Lane
-    rate: Lane
-    force: Lane  # its periodic part
-    push: Lane  # w''
-    jerk: Lane  # w'''
-    drive: Lane  # derivative of the forcing
-    sine: Lane
-    cosine: Lane
-    decay: Lane
-
-
-class _Course(eqx.Module):
-    """A contact as seen from one reference time: steady part, forcing and free part rotated to it."""
-
-    steady_cos: Lane
-    steady_sin: Lane
-    force_cos: Lane
-    force_sin: Lane
-    free_cos: Lane
-    free_sin: Lane
-    decay: Lane
-
-
-@once
-def _motion(wall: SoftWall, course: _Course, s: Lane) -> _Motion:
-    """Compute the contact at time s from the course's reference."""
-    sine, cosine = sine_cosine(wall.omega1 * s)
-    drive_sine, drive_cosine = sine_cosine(PI * s)
-    decay = course.decay * exp(-wall.zeta * s)
-    along = course.free_cos * cosine + course.free_sin * sine
-    across = course.free_sin * cosine - course.free_cos * sine
-    steady = course.steady_cos * drive_cosine + course.steady_sin * drive_sine
-    steady_rate = PI * (course.steady_sin * drive_cosine - course.steady_cos * drive_sine)
-    force = course.force_cos * drive_cosine - course.force_sin * drive_sine
-    drive = -PI * (course.force_sin * drive_cosine + course.force_cos * drive_sine)
-    w = steady + decay * along
-    rate = steady_rate + decay * (wall.omega1 * across - wall.zeta * along)
-    return _derivatives(wall, w, rate, force, drive, sine, cosine, decay)
-
-
-def _derivatives(wall: SoftWall, w, rate, force, drive, sine, cosine, decay) -> _Motion:
-    push = force - 2 * wall.zeta * rate - wall.kappa * wall.kappa * w
-    jerk = drive - 2 * wall.zeta * push - wall.kappa * wall.kappa * rate
-    return _Motion(w, rate, force, push, jerk, drive, sine, cosine, decay)
-
-
-def _at_reference(wall: SoftWall, course: _Course) -> _Motion:
-    """Give the contact at the course's reference: no sine and no exponential is needed there."""
-    one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
-    w = course.steady_cos + course.decay * course.free_cos
-    rate = PI * course.steady_sin + course.decay * (wall.omega1 * course.free_sin - wall.zeta * course.free_cos)
-    return _derivatives(wall, w, rate, course.force_cos, -PI * course.force_sin, zero, one, course.decay)
-
-
-def _in_reach(wall: SoftWall, s: Lane) -> Bool[Array, "lane"]:
-    """Say whether the polynomials of `_motion` hold at s."""
-    return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
-
-
-def _course(entry: "_Entry", cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> _Course:
+def _course(entry: "_Entry", cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> Course:
     """Rotate the contact to a reference time of given cos and sin of pi s; `free` is its free part there."""
     steady_cos, steady_sin, force_cos, force_sin = entry.parts
-    return _Course(
+    return Course(
         steady_cos * cosine + steady_sin * sine,
         steady_sin * cosine - steady_cos * sine,
         force_cos * cosine - force_sin * sine,
@@ -234,7 +42,7 @@ def _taylor(derivatives: tuple[Lane, ...], order: int, s: Lane) -> Lane:
 
 
 @shared
-def _either(short: Bool[Array, "lane"], near: _Course, far: _Course) -> _Course:
+def _either(short: Bool[Array, "lane"], near: Course, far: Course) -> Course:
     return jax.tree.map(lambda a, b: jnp.where(short, a, b), near, far)
 
 
@@ -261,7 +69,7 @@ class _Entry(eqx.Module):
     pressure: Lane | None  # of gravity, into the wall; None: level
     rest: Lane | None  # the steady response to it
 
-    def penetration(self, at: _Motion) -> Lane:
+    def penetration(self, at: Motion) -> Lane:
         """All of w."""
         return at.w if self.rest is None else at.w + self.rest
 
@@ -344,9 +152,9 @@ def _lasts(wall: SoftWall, entry: _Entry, when: Lane) -> Bool[Array, "lane"]:
     # A forcing into the wall keeps w positive for the time of a free contact.
     force = entry.force_cos * wall.cos_span - entry.force_sin * wall.sin_span + pressure
     drive = entry.force_sin * wall.cos_span + entry.force_cos * wall.sin_span
-    held = (entry.force > _DOUBT) & (force > _DOUBT) & ((entry.force_sin <= 0) | (drive >= 0)) & (wall.span < 1)
+    held = (entry.force > DOUBT) & (force > DOUBT) & ((entry.force_sin <= 0) | (drive >= 0)) & (wall.span < 1)
     # From then on the steady response is beyond what is left of the swing, whose first low is a crest's time later.
-    low = swing * wall.r * wall.crest_decay + _DOUBT * rest
+    low = swing * wall.r * wall.crest_decay + DOUBT * rest
     steady_cos = entry.steady_cos * wall.cos_span + entry.steady_sin * wall.sin_span
     steady_sin = entry.steady_sin * wall.cos_span - entry.steady_cos * wall.sin_span
     later = steady_cos * wall.cos_crest + steady_sin * wall.sin_crest
@@ -356,11 +164,11 @@ def _lasts(wall: SoftWall, entry: _Entry, when: Lane) -> Bool[Array, "lane"]:
 
 
 @shared
-def _long_course(wall: SoftWall, entry: _Entry, when: Lane, cosine: Lane, sine: Lane) -> _Course:
+def _long_course(wall: SoftWall, entry: _Entry, when: Lane, cosine: Lane, sine: Lane) -> Course:
     """Rotate the contact to where its steady response ends, with cos and sin of omega1 s there."""
     ebb = present(wall.ebb)
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
-    return _Course(
+    return Course(
         -present(entry.rest), ebb.rate * (-1 / PI), ebb.force_cos, ebb.force_sin, *free, long_decay(wall.zeta * when)
     )
 
@@ -397,7 +205,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
         guess = replace(guess, short=guess.short & ~long)
     s, reached = _rough_exit(rough, begun, guess, single(course))
     s = share(s.astype(reference.dtype))
-    at = share(_motion(wall, course, s))
+    at = share(motion(wall, course, s))
     step = share(householder(entry.penetration(at), at.rate, at.push, at.jerk))
     out = -(at.rate + step * (at.push + step * (0.5 * at.jerk)))
     duration = reference + s + step
@@ -428,28 +236,28 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
 
 
 @shared
-def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: _Course) -> tuple[Lane, Bool[Array, "lane"]]:
+def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: Course) -> tuple[Lane, Bool[Array, "lane"]]:
     """Find the exit from the course's reference in single precision, and whether the polynomials held on the way."""
-    free = _at_reference(wall, course)
+    free = at_reference(wall, course)
     near = guess.hop - 0.5 * wall.span
     s = share(jnp.where(guess.short, near, householder(entry.penetration(free), free.rate, free.push, free.jerk)))
-    reached = _in_reach(wall, s)
+    reached = in_reach(wall, s)
     for _ in range(_EXIT_ROUNDS):
-        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
+        at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
         s = share(s + householder(entry.penetration(at), at.rate, at.push, at.jerk))
-        reached = reached & _in_reach(wall, s)
+        reached = reached & in_reach(wall, s)
     return jnp.where(reached, s, 0.0), reached
 
 
 @shared
-def _crest_course(wall: SoftWall, entry: _Entry) -> _Course:
+def _crest_course(wall: SoftWall, entry: _Entry) -> Course:
     """Rotate the contact to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
     cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
     return _course(entry, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
 
 
-def _snap(wall: SoftWall, at: _Motion) -> Lane:
+def _snap(wall: SoftWall, at: Motion) -> Lane:
     """Compute the fourth derivative of w."""
     return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
 
@@ -470,53 +278,53 @@ def _rough_crest(
     """
     duration, exit_drive, exit_force = end
     course = _crest_course(wall, entry)
-    free = _at_reference(wall, course)
+    free = at_reference(wall, course)
     near = guess.rise - wall.crest
     s = share(jnp.where(guess.short, near, householder(free.rate, free.push, free.jerk, _snap(wall, free))))
-    reached = _in_reach(wall, s)
+    reached = in_reach(wall, s)
     for _ in range(_CREST_ROUNDS):
-        at = share(_motion(wall, course, jnp.where(reached, s, 0.0)))
+        at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
         step = householder(at.rate, at.push, at.jerk, _snap(wall, at))
         s, step = share((s + step, step))
-        reached = reached & _in_reach(wall, s)
+        reached = reached & in_reach(wall, s)
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
-    converged = reached & (stiffness * jnp.abs(step) < _DOUBT) & (at.push < 0)
+    converged = reached & (stiffness * jnp.abs(step) < DOUBT) & (at.push < 0)
     when = wall.crest + s
     way = duration - when
-    falls, pulled, one_change = at.drive <= -_DOUBT, at.force <= -_DOUBT, duration < 1 - _DOUBT
-    first = falls & ((entry.force_sin >= 0) | ((entry.force > 0) & (course.force_sin >= _DOUBT)))
+    falls, pulled, one_change = at.drive <= -DOUBT, at.force <= -DOUBT, duration < 1 - DOUBT
+    first = falls & ((entry.force_sin >= 0) | ((entry.force > 0) & (course.force_sin >= DOUBT)))
     if entry.pressure is None:
         first = (one_change & (first | ((entry.force <= 0) & pulled))) | (entry.speed > wall.steep)
-        only = one_change & (falls | (exit_drive > _DOUBT) | (pulled & (exit_force <= -_DOUBT)))
+        only = one_change & (falls | (exit_drive > DOUBT) | (pulled & (exit_force <= -DOUBT)))
     else:
         # With gravity the forcing is positive for more than half a period, or for less. Where it is negative at both
         # ends it may be positive between them in the latter case alone, and then where f' has changed its sign.
         pressed = entry.pressure >= 0
-        pulled = at.force + entry.pressure <= -_DOUBT
-        first_pulled = pulled & (pressed | (entry.force_sin >= 0) | (at.drive >= _DOUBT))
-        only_pulled = pulled & pressed & (exit_force + entry.pressure <= -_DOUBT)
-        first = ((when < 1 - _DOUBT) & (first | ((entry.force <= 0) & first_pulled))) | (entry.speed > wall.steep)
-        only = (way < 1 - _DOUBT) & (falls | (exit_drive > _DOUBT) | only_pulled)
+        pulled = at.force + entry.pressure <= -DOUBT
+        first_pulled = pulled & (pressed | (entry.force_sin >= 0) | (at.drive >= DOUBT))
+        only_pulled = pulled & pressed & (exit_force + entry.pressure <= -DOUBT)
+        first = ((when < 1 - DOUBT) & (first | ((entry.force <= 0) & first_pulled))) | (entry.speed > wall.steep)
+        only = (way < 1 - DOUBT) & (falls | (exit_drive > DOUBT) | only_pulled)
     # While its periodic part is positive f' falls, so its value at the crest bounds it.
-    positive = (at.force > _DOUBT) & (exit_force > _DOUBT) & one_change
+    positive = (at.force > DOUBT) & (exit_force > DOUBT) & one_change
     if entry.pressure is not None:
         # Once f' is negative it stays so for half a period.
-        positive = (at.force > _DOUBT) & ((exit_force > _DOUBT) | (exit_drive < -_DOUBT)) & (way < 1 - _DOUBT)
-    most = jnp.where(positive, jnp.maximum(at.drive, 0.0) + _DOUBT, PI)
-    only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < _DEEP_REACH))
+        positive = (at.force > DOUBT) & ((exit_force > DOUBT) | (exit_drive < -DOUBT)) & (way < 1 - DOUBT)
+    most = jnp.where(positive, jnp.maximum(at.drive, 0.0) + DOUBT, PI)
+    only = only | ((-at.push > most * wall.lift) & (wall.omega1 * way < DEEP_REACH))
     if wall.long_lift is not None:
-        only = only | ((-at.push > most * wall.long_lift) & (wall.omega1 * way < _LONG_REACH))
+        only = only | ((-at.push > most * wall.long_lift) & (wall.omega1 * way < LONG_REACH))
     if entry.pressure is not None:
         # A forcing that is never positive allows no minimum.
         outwards = entry.pressure < -1
         first, only = first | outwards, only | outwards
-    inside = (wall.omega1 * when > _DOUBT) & (wall.omega1 * way > _DOUBT) & (way < (1 - _DOUBT) * wall.span)
+    inside = (wall.omega1 * when > DOUBT) & (wall.omega1 * way > DOUBT) & (way < (1 - DOUBT) * wall.span)
     return jnp.where(reached, s, 0.0), converged & first & only & inside
 
 
 def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
     """Find the greatest depth, and whether `crest`, its rough time from the free contact's, was close enough for it."""
-    at = share(_motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
+    at = share(motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
     fourth = _snap(wall, at)
     step = share(householder(at.rate, at.push, at.jerk, fourth))
     depth = entry.penetration(at) + step * (

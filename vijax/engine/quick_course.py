@@ -1,0 +1,77 @@
+"""The course of a contact in closed form, as seen from a reference time, by polynomials that hold about it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from vijax.engine.impact import Lane
+from vijax.engine.polynomial import EXP_REACH, REACH, exp, sine_cosine
+from vijax.engine.quick_wall import SoftWall
+from vijax.model.flow import PI
+from vijax.runtime.xla import once
+
+
+class Motion(eqx.Module):
+    """Penetration w and its derivatives at one time of the contact, with the parts they were made of.
+
+    What gravity adds to w, its steady response, is not in `w` (see `_Entry.penetration`): it changes no derivative,
+    since the membrane's force on it is gravity's, only reversed.
+    """
+
+    w: Lane
+    rate: Lane
+    force: Lane  # its periodic part
+    push: Lane  # w''
+    jerk: Lane  # w'''
+    drive: Lane  # derivative of the forcing
+    sine: Lane
+    cosine: Lane
+    decay: Lane
+
+
+class Course(eqx.Module):
+    """A contact as seen from one reference time: steady part, forcing and free part rotated to it."""
+
+    steady_cos: Lane
+    steady_sin: Lane
+    force_cos: Lane
+    force_sin: Lane
+    free_cos: Lane
+    free_sin: Lane
+    decay: Lane
+
+
+@once
+def motion(wall: SoftWall, course: Course, s: Lane) -> Motion:
+    """Compute the contact at time s from the course's reference."""
+    sine, cosine = sine_cosine(wall.omega1 * s)
+    drive_sine, drive_cosine = sine_cosine(PI * s)
+    decay = course.decay * exp(-wall.zeta * s)
+    along = course.free_cos * cosine + course.free_sin * sine
+    across = course.free_sin * cosine - course.free_cos * sine
+    steady = course.steady_cos * drive_cosine + course.steady_sin * drive_sine
+    steady_rate = PI * (course.steady_sin * drive_cosine - course.steady_cos * drive_sine)
+    force = course.force_cos * drive_cosine - course.force_sin * drive_sine
+    drive = -PI * (course.force_sin * drive_cosine + course.force_cos * drive_sine)
+    w = steady + decay * along
+    rate = steady_rate + decay * (wall.omega1 * across - wall.zeta * along)
+    return _derivatives(wall, w, rate, force, drive, sine, cosine, decay)
+
+
+def _derivatives(wall: SoftWall, w, rate, force, drive, sine, cosine, decay) -> Motion:
+    push = force - 2 * wall.zeta * rate - wall.kappa * wall.kappa * w
+    jerk = drive - 2 * wall.zeta * push - wall.kappa * wall.kappa * rate
+    return Motion(w, rate, force, push, jerk, drive, sine, cosine, decay)
+
+
+def at_reference(wall: SoftWall, course: Course) -> Motion:
+    """Give the contact at the course's reference: no sine and no exponential is needed there."""
+    one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
+    w = course.steady_cos + course.decay * course.free_cos
+    rate = PI * course.steady_sin + course.decay * (wall.omega1 * course.free_sin - wall.zeta * course.free_cos)
+    return _derivatives(wall, w, rate, course.force_cos, -PI * course.force_sin, zero, one, course.decay)
+
+
+def in_reach(wall: SoftWall, s: Lane) -> Bool[Array, "lane"]:
+    """Say whether the polynomials of `motion` hold at s."""
+    return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
