@@ -6,6 +6,7 @@ import pytest
 
 from benchmarks.yardstick import TILE, march, pairs, start
 from vijax.batch.impact_map import next_impacts
+from vijax.engine.ground import Ground, ground_of
 from vijax.model.pair import impact_pair
 
 
@@ -15,7 +16,9 @@ def test_it_agrees_with_the_careful_step(wall, gamma):
     d, kappa = rng.uniform(0.05, 0.3, TILE), np.exp(rng.uniform(1, 6, TILE))
     pair = pairs(d, kappa if wall == "soft" else None, 0.5, gamma)
     side, speed, t = rng.choice([-1.0, 1.0], TILE), rng.uniform(0.001, 0.6, TILE), rng.uniform(0, 2, TILE)
-    found = next_impacts(pair, jnp.asarray(side), jnp.asarray(speed), jnp.asarray(t), level=gamma == 0)
+    found = next_impacts(
+        pair, jnp.asarray(side), jnp.asarray(speed), jnp.asarray(t), ground=ground_of(gamma, deep=True)
+    )
     out = march(pair, start(0.5 * side * d, -side * speed, t)).out
     impact = out.impact
     assert found.real.all()
@@ -34,5 +37,7 @@ def test_it_agrees_with_the_careful_step(wall, gamma):
 def test_a_contact_that_never_ends_is_told():
     # Three times the forcing holds the ball in a soft, damped wall; the stiff one throws it back.
     pair = impact_pair(np.full(2, 0.3), np.array([3.0, 400.0]), np.array([0.05, 0.5]), 3.0)
-    found = next_impacts(pair, jnp.array([-1.0, -1.0]), jnp.array([0.1, 0.1]), jnp.array([0.0, 0.0]), level=False)
+    found = next_impacts(
+        pair, jnp.array([-1.0, -1.0]), jnp.array([0.1, 0.1]), jnp.array([0.0, 0.0]), ground=Ground.GENTLE
+    )
     np.testing.assert_array_equal(found.real, [False, True])

@@ -80,6 +80,18 @@ def test_a_folder_that_cannot_be_trusted_is_not_used(tmp_path, monkeypatch, spoi
         cache_folder.keep_programs.__wrapped__()
 
 
+def test_a_user_without_a_home_keeps_nothing(monkeypatch):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(cache_folder.Path, "home", homeless)
+    with monkeypatch.context() as patch:
+        patch.setattr(cache_folder.jax.config, "update", lambda *_: pytest.fail("a folder was set"))
+        patch.setitem(cache_folder.jax.config.values, "jax_compilation_cache_dir", None)
+        cache_folder.keep_programs.__wrapped__()
+
+
 def test_the_folder_is_that_of_compiled_programs(tmp_path):
     before = {name: jax.config.values[name] for name in ("jax_compilation_cache_dir", "jax_enable_compilation_cache")}
     try:

@@ -10,14 +10,13 @@ import jax.numpy as jnp
 
 from vijax.batch.cell import Cell, Event, Lane, Mask, Plan, Settings
 from vijax.batch.cell_end import last_period
-from vijax.batch.lanes import choose
 from vijax.batch.tally import add_event
 from vijax.engine import exact, quick, sampled
 from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
-from vijax.runtime.arrays import present
+from vijax.runtime.arrays import choose, present
 
 # Forcing periods beyond the last one in which the end of a flight is still looked for. With fewer, a slow ball that has
 # a wall ahead of it is told to meet none.

@@ -10,10 +10,9 @@ from jaxtyping import Array, Float
 from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally
 from vijax.batch.cell_end import failed
 from vijax.batch.chain import depart
-from vijax.batch.lanes import choose
 from vijax.engine.impact import Ball, LaneImpact
 from vijax.model import flow
-from vijax.runtime.arrays import present
+from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share
 
 # Longest recurrence, in forcing periods, that counts as periodic; what takes longer is chaos, or undecided. With a

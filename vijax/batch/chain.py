@@ -10,13 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from vijax.batch.cell import Cell, Lane, Mask, Relay, Settings
-from vijax.batch.lanes import choose
 from vijax.engine.impact import Ball, LaneImpact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import START_REACH
 from vijax.model.records import Status
-from vijax.runtime.arrays import present
+from vijax.runtime.arrays import choose, present
 
 
 class Handover(eqx.Module):

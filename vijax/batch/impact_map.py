@@ -83,7 +83,7 @@ def next_impacts(
     speed: Float[AnyArray, "ball"],
     t: Float[AnyArray, "ball"],
     *,
-    level: bool,
+    ground: Ground,
 ) -> Next:
     """Fly every ball from the end of a contact to and through the next one.
 
@@ -92,9 +92,8 @@ def next_impacts(
         side: Wall that the ball leaves, -1 or +1.
         speed: Its speed away from there.
         t: Phase, in [0, 2).
-        level: Whether gamma is 0 everywhere.
+        ground: That of all cells with which one program is shared.
     """
-    ground = Ground.LEVEL if level else Ground.GENTLE
     plan = Plan(until="window", rigid=pair.rigid, ground=ground, deep=True, tangent=False)
     pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
     zero: Any = np.zeros_like(t)

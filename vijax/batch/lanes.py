@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vijax.runtime.arrays import choose
 from vijax.runtime.xla import in_blocks, kernel, put, shared, whole_blocks
 
 P = ParamSpec("P")
@@ -38,14 +39,14 @@ class Service(NamedTuple):
         declined, hard: Carry -> which lanes are; a hard lane needs the careful try.
         request: Carry -> the part of it that serving a lane needs.
         second, careful: Requests -> answers; what `second` is not sure of is left to `careful`, which would hold up a
-            whole batch. None: every declined lane is hard.
+            whole batch.
         settle: Carry, an answer for every lane, which lanes were served -> carry; unsure answers mark the lane hard.
     """
 
     declined: Callable[[Carry], Bool[Array, "lane"]]
     hard: Callable[[Carry], Bool[Array, "lane"]]
     request: Callable[[Carry], Any]
-    second: Callable[[Any], Any] | None
+    second: Callable[[Any], Any]
     careful: Callable[[Any], Any]
     settle: Callable[[Carry, Any, Bool[Array, "lane"]], Carry]
 
@@ -108,11 +109,6 @@ def _first(mask: Bool[Array, "lane"], width: int) -> _Batch:
 
 def _take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
     return jax.tree.map(lambda leaf: leaf[rows], carry)
-
-
-def choose(mask: Bool[Array, "lane"], new: Carry, old: Carry) -> Carry:
-    """Take `new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
-    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
 class _AtWork(NamedTuple):
@@ -180,11 +176,7 @@ def _service_due(
 def _serve(program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Give a batch of easy lanes their second try, or a batch of hard ones the careful try."""
     easy, batch, requests = program.kernel(partial(_ask, program, service, width))(cell, carry)
-    careful = program.kernel(service.careful)
-    if service.second is None:
-        answers = careful(requests)
-    else:
-        answers = lax.cond(easy, program.kernel(service.second), careful, requests)
+    answers = lax.cond(easy, program.kernel(service.second), program.kernel(service.careful), requests)
     return program.kernel(partial(_settle, service))(carry, answers, batch)
 
 

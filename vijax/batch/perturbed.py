@@ -19,7 +19,7 @@ from vijax.batch import lanes, rows
 from vijax.batch.cell import TRANSIENT_SHARE, Entry, Plan, Settings
 from vijax.batch.simulate import compiled, program, width_of
 from vijax.batch.summary import Summary, shapes
-from vijax.engine.ground import Ground
+from vijax.engine.ground import Ground, ground_of
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.runtime import checks
@@ -59,7 +59,7 @@ def averages(
     given = table, count, settings
     plans = [_plan(ground, length.size) for ground in (Ground.LEVEL, Ground.GENTLE)]
     if checks.is_concrete(given):
-        plan = plans[0 if not np.any(pair.gamma) else 1]
+        plan = _plan(ground_of(pair.gamma, deep=True), length.size)
         found = compiled(plan, width_of(table.shape[0]))(*given)
     else:
         # Rows of padding may hold anything.

@@ -10,13 +10,12 @@ from vijax.batch.advance import QUIET, neutral
 from vijax.batch.attractor_search import review
 from vijax.batch.cell import Cell, Course, Event, Lane, Plan, Settings
 from vijax.batch.cell_end import last_period, out_of_steps
-from vijax.batch.lanes import choose
 from vijax.batch.tally import add_event
 from vijax.engine.impact import Ball, LaneImpact
 from vijax.engine.method import Method
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
-from vijax.runtime.arrays import present
+from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share
 
 

@@ -20,10 +20,9 @@ from vijax.batch.cell import (
 )
 from vijax.batch.cell_end import ended, last_period
 from vijax.batch.chain import note
-from vijax.batch.lanes import choose
 from vijax.engine.impact import LaneImpact
 from vijax.model import energy
-from vijax.runtime.arrays import present
+from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share
 
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from vijax.model.device import Harvester
 
 _FILES = ("design.json", "design.png")
-_OVER_TOLERANCES = ("mean", "worst", "expected")
-_MOST_POINTS = 100_000  # of the picture, which is computed at each
+_OF_SCATTER = ("mean", "worst", "expected")  # objectives that ask what devices give that are off by the tolerances
+_MOST_POINTS = 100_000  # The picture is computed at so many points at most; each is a flight or an orbit.
 _STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the last
 
 
@@ -99,7 +99,7 @@ def _asked(
     along, devices = _devices(over, take_axes(given, {}), device(constants), names)
     scatter = _tolerances(tolerance)
     within = _bounds(bounds)
-    weighed = scatter if objective in _OVER_TOLERANCES else ()
+    weighed = scatter if objective in _OF_SCATTER else ()
     optimise.check(devices, names, within, objective, weighed)
     share = optimise.check_motion(motion, objective, part("reliability", reliability))
     search: dict[str, Any] = {"tune": names, "bounds": within, "objective": objective, "tolerances": weighed}

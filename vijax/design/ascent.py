@@ -16,10 +16,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax.design.design_settings import DEFAULT, DesignSettings
+from vijax.runtime.arrays import choose
 
-_CONVERGED = 1e-6  # weight at which a maximum is one to six digits
-_ARRIVED = 1e-8  # a step this short is the last
-_STUCK = 1e-9  # so is a trial refused this near
+_CONVERGED = 1e-6  # At this weight of the barrier a maximum is right to six digits.
+_ARRIVED = 1e-8  # A step this short is the last.
+_STUCK = 1e-9  # So is a trial that is refused this near.
 
 
 class Look(NamedTuple):
@@ -149,9 +150,9 @@ def _advance(task: _Task, c: Climb) -> Climb:
     # it turns.
     state = c.state._replace(updates=-_gradient(c.seen, weight))
     afresh = turns | (better & ~_inside(c.seen) & _inside(seen))
-    state = _choose_all(afresh, _forgotten(task, c.z), state)
-    z, now = _choose_all(better, (trial, seen), (c.z, c.seen))
-    step, state = _choose_all(better | turns, _aim(task, z, now, weight, state), (c.step, c.state))
+    state = choose(afresh, _forgotten(task, c.z), state)
+    z, now = choose(better, (trial, seen), (c.z, c.seen))
+    step, state = choose(better | turns, _aim(task, z, now, weight, state), (c.step, c.state))
     length = jnp.abs(step).max(axis=1)
     settled = better & (length <= _ARRIVED) & (weight <= task.settings.last_barrier)
     refused = 0.5 * c.pace * jnp.abs(c.step).max(axis=1) / jnp.maximum(length, _STUCK)
@@ -214,21 +215,13 @@ def _aim(task: _Task, z, seen: Look, weight, state):
     # Optax mixes whole numbers and truths, which callers may have forbidden.
     with jax.numpy_dtype_promotion("standard"):
         found, straight = (jax.vmap(task.lbfgs.update)(-ahead, of, z) for of in (state, _forgotten(task, z)))
-    step, after = _choose_all((found[0] * ahead).sum(axis=1) < 0, found, straight)
+    step, after = choose((found[0] * ahead).sum(axis=1) < 0, found, straight)
     return _shortened(task, -step, seen), after
 
 
 def converged(c: Climb) -> Bool[Array, "start"]:
     """Say which ended with a barrier that no longer matters; the others stalled, or lost their point."""
     return c.weight <= _CONVERGED
-
-
-def _choose(which: Bool[Array, "start"], a: Array, b: Array) -> Array:
-    return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-
-def _choose_all(which: Bool[Array, "start"], a: Any, b: Any) -> Any:
-    return jax.tree.map(partial(_choose, which), a, b)
 
 
 def _inside(seen: Look) -> Bool[Array, "start"]:
@@ -241,7 +234,7 @@ def _gradient(seen: Look, weight: Float[Array, "start"]) -> Float[Array, "start 
     barrier = weight[:, None] * (seen.slopes / safe[..., None]).sum(axis=1)
     worst = seen.margins.argmin(axis=1)[:, None, None]
     least = jnp.take_along_axis(seen.slopes, worst, axis=1)[:, 0]
-    return jnp.nan_to_num(_choose(_inside(seen), seen.gradient + barrier, least))
+    return jnp.nan_to_num(choose(_inside(seen), seen.gradient + barrier, least))
 
 
 def _higher(c: Climb, trial: Look) -> Bool[Array, "start"]:

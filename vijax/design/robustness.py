@@ -21,7 +21,7 @@ from vijax.runtime import checks
 from vijax.runtime.context import door
 
 _SAME = 1e-6  # relative difference of P within which an attractor is the optimum's own orbit
-_MOST_POINTS = 10_000  # of a line search, which flies `starts` balls at each
+_MOST_POINTS = 10_000  # A line search flies `starts` balls at each of its points; it has so many at most.
 _STEPS = 8  # an orbit follows its device in so many steps
 
 

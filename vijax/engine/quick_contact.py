@@ -4,7 +4,6 @@ import math
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
@@ -15,7 +14,7 @@ from vijax.engine.quick_flight import Flight
 from vijax.engine.quick_wall import DEEP_REACH, DOUBT, LONG_REACH, SoftWall
 from vijax.engine.roots import converged_step, householder, single
 from vijax.model.flow import PI, horner
-from vijax.runtime.arrays import present
+from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share, shared
 
 # Rounds in single precision towards the exit and the crest, after the first step from the reference. With fewer, the
@@ -41,11 +40,6 @@ def _taylor(derivatives: tuple[Lane, ...], order: int, s: Lane) -> Lane:
     return horner(tuple(d * (1 / math.factorial(k + order)) for k, d in enumerate(derivatives)), s)
 
 
-@shared
-def _either(short: Bool[Array, "lane"], near: Course, far: Course) -> Course:
-    return jax.tree.map(lambda a, b: jnp.where(short, a, b), near, far)
-
-
 class Exit(eqx.Module):
     """The end of a contact: duration and outward speed; sin, cos of omega1 s and exp(-zeta s) there."""
 
@@ -66,8 +60,8 @@ class _Entry(eqx.Module):
     steady_sin: Lane
     free_cos: Lane
     free_sin: Lane
-    pressure: Lane | None  # of gravity, into the wall; None: level
-    rest: Lane | None  # the steady response to it
+    pressure: Lane | None  # Gravity presses the ball into the wall by this much; None on level ground.
+    rest: Lane | None  # The membrane's steady response to that pressure.
 
     def penetration(self, at: Motion) -> Lane:
         """All of w."""
@@ -191,7 +185,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     guess = _guess(rough, begun)
     middle = _course(entry, wall.cos_middle, wall.sin_middle, (entry.free_sin, -entry.free_cos), wall.root_r)
     far = _course(entry, wall.cos_span, wall.sin_span, (-entry.free_cos, -entry.free_sin), wall.r)
-    course = _either(guess.short, middle, far)
+    course = share(choose(guess.short, middle, far))
     reference = jnp.where(guess.short, 0.5 * wall.span, wall.span)
     long = None
     if wall.ebb is not None:
@@ -200,7 +194,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
         long = _lasts(rough, begun, when.astype(jnp.float32))
         turns = wall.omega1 * when * (1 / PI)
         wide_sine, wide_cosine = share(phase(turns - 2 * jnp.floor(0.5 * turns)))
-        course = _either(long, _long_course(wall, entry, when, wide_cosine, wide_sine), course)
+        course = share(choose(long, _long_course(wall, entry, when, wide_cosine, wide_sine), course))
         reference = jnp.where(long, when, reference)
         guess = replace(guess, short=guess.short & ~long)
     s, reached = _rough_exit(rough, begun, guess, single(course))

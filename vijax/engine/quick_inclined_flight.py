@@ -11,11 +11,9 @@ once; else it does so if its maximum is beyond; else it crosses the lower wall o
 U - wall with U' towards the wall is that crossing, there being no other, so what finds it needs no proof.
 """
 
-from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32
 
@@ -24,14 +22,13 @@ from vijax.engine.polynomial import phase
 from vijax.engine.quick_flight import Flight, reflected
 from vijax.engine.roots import householder, single
 from vijax.model.flow import PI
+from vijax.runtime.arrays import choose
 from vijax.runtime.xla import share, shared
 
 _PIECES = 3  # a flight that is not over after so many is declined: one of a thousand at gamma 0.1, of 200 at 0
 _ROUNDS = 2  # so many run in single precision, before the one in double
 _NEAR = 8  # roundings within which an end or a maximum may be on either side of a wall
 _STEP = 2e-3  # longest last step: the Taylor polynomial of fifth order leaves out 1e-19 of it
-
-T = TypeVar("T")
 
 Flags = Bool[Array, "lane"]
 Rough = Float32[Array, "lane"]
@@ -101,10 +98,6 @@ class _Point(NamedTuple):
     y: Rough
     f: Rough
     v: Rough
-
-
-def _choose(mask: Flags, one: T, other: T) -> T:
-    return jax.tree.map(partial(jnp.where, mask), one, other)
 
 
 def _about(course: _Course, odd: Flags, begin: Lane) -> _Motion:
@@ -179,8 +172,8 @@ def _find(course: _Course, incline: Incline, flip: Rough, speed: Rough) -> Rough
     size = course.half + jnp.abs(course.place) + reach * (jnp.abs(course.drift) + 0.5 * reach * jnp.abs(course.slope))
     margin = share(_NEAR * float(jnp.finfo(size.dtype).eps) * size)
     near, far = course.half - margin, course.half + margin
-    even = _choose(flip > 0, incline.concave, incline.convex)
-    odd = _choose(flip > 0, incline.convex, incline.concave)
+    even = choose(flip > 0, incline.concave, incline.convex)
+    odd = choose(flip > 0, incline.convex, incline.concave)
     one = share(_about(course, jnp.zeros_like(flip, bool), course.begin))
     two = _next(one, even, odd)
     three = _next(two, odd, even)
@@ -190,8 +183,8 @@ def _find(course: _Course, incline: Incline, flip: Rough, speed: Rough) -> Rough
     at_first, at_second = first != _NONE, second != _NONE
     number = jnp.where(at_first, 1.0, jnp.where(at_second, 2.0, 3.0))
     kind = jnp.where(at_first, first, jnp.where(at_second, second, third))
-    motion = _choose(at_first, one, _choose(at_second, two, three))
-    summit = _summit(motion, _choose(number == 2, odd, even), near, far)
+    motion = choose(at_first, one, choose(at_second, two, three))
+    summit = _summit(motion, choose(number == 2, odd, even), near, far)
     unsure = (kind == _PEAK) | (kind == _PEAK_OR_DOWN)
     # Where the maximum is not beyond the wall the flight goes on.
     on = (kind == _PEAK) & (summit < 0)
@@ -269,11 +262,11 @@ def fly(half: Lane, incline: Incline, lane: Ball) -> Flight:
     away = centre + (number.astype(t.dtype) - 1) - t
     motion = _about(course, odd, -PI * away)
     goal = share(motion._replace(level=motion.level - wall * course.half))
-    shape = _choose(odd ^ convex, incline.convex, incline.concave)
+    shape = choose(odd ^ convex, incline.convex, incline.concave)
     rough, width = single(goal), shape.width
     begun = _Point(*single((course.begin, u - wall * course.half, v)))
     end = _Point(-width, rough.level - shape.fall - width * rough.rate, rough.rate + shape.turn)
-    root = _root(goal, _guess(share(_choose(number == 1, begun, end)), rough.slope, rough_wall, width), width)
+    root = _root(goal, _guess(share(choose(number == 1, begun, end)), rough.slope, rough_wall, width), width)
     speed = wall * (goal.rate - goal.slope * root.y - root.sine) * (1 / PI)
     elapsed = away + root.y * (1 / PI)
     # A short hop loses its leading digits in the phases.

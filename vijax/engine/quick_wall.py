@@ -15,9 +15,9 @@ from vijax.model.flow import PI, membrane
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import AnyArray
 
-DOUBT = 1e-3  # a sign or a bound that is closer is not trusted to single precision
-DEEP_REACH = 2.6  # longest way from the deepest point to the exit, in radians of omega1
-LONG_REACH = 3.0  # with gravity more contacts take longer than that
+DOUBT = 1e-3  # A sign or a bound that is closer is not trusted to single precision.
+DEEP_REACH = 2.6  # The way from the deepest point to the exit is this long at most, in radians of omega1.
+LONG_REACH = 3.0  # With gravity more contacts take longer than that; this is their bound.
 
 
 class RigidWall(eqx.Module):
@@ -25,17 +25,17 @@ class RigidWall(eqx.Module):
 
     half: Lane
     r: Lane
-    chi: Lane  # greatest depth per speed
-    incline: Incline | None  # None: level
+    chi: Lane  # The greatest depth per speed.
+    incline: Incline | None  # None on level ground.
 
 
 class Ebb(eqx.Module):
     """When and how fast a membrane under gravity and forcing, its swing gone, comes back to where a ball leaves it."""
 
-    phase: Lane  # of the forcing towards the wall
-    arc: Lane  # how long it has been coming from the steady response's other extremum
+    phase: Lane  # The phase of the forcing towards the wall.
+    arc: Lane  # How long the membrane has been coming from the steady response's other extremum.
     rate: Lane
-    force_cos: Lane  # the forcing then, as in `_Entry`
+    force_cos: Lane  # The forcing then, as in `_Entry`.
     force_sin: Lane
 
 
@@ -47,7 +47,7 @@ class SoftWall(eqx.Module):
     kappa: Lane
     zeta: Lane
     omega1: Lane
-    gain_in: Lane  # steady response per forcing, in phase
+    gain_in: Lane  # The steady response per forcing, in phase.
     gain_out: Lane  # and a quarter turn behind
     span: Lane  # pi/omega1: the free contact
     cos_span: Lane
@@ -60,12 +60,12 @@ class SoftWall(eqx.Module):
     cos_crest: Lane
     sin_crest: Lane
     crest_decay: Lane
-    steep: Lane  # least speed at which w' is sure to have its first zero near the free crest
-    lift: Lane  # least -w'' at the crest, per bound of f', that keeps w' negative until the exit
-    long_lift: Lane | None  # likewise for a longer way; None: level
+    steep: Lane  # The least speed at which w' is sure to have its first zero near the free crest.
+    lift: Lane  # The least -w'' at the crest, per bound of f', that keeps w' negative until the exit.
+    long_lift: Lane | None  # Likewise for a longer way; None on level ground.
     usable: Bool[AnyArray, "lane"]
-    incline: Incline | None  # None: level
-    ebb: Ebb | None  # None: contacts that outlast the free one by far are not looked for
+    incline: Incline | None  # None on level ground.
+    ebb: Ebb | None  # None where contacts that outlast the free one by far are not looked for.
 
 
 Wall = RigidWall | SoftWall

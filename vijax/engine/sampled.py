@@ -31,8 +31,8 @@ Zeros = Float[Array, "zero lane"]  # the exit, and the crest where it is asked f
 Rows = Float[Array, "*row lane"]
 Powers = Float[Array, "sample *row lane"]
 
-_SAMPLES = 32  # of a pass; a power of two, as `_powers` doubles them
-_PASSES = 6  # after which a lane is declined, for the careful step to do: more keep the others waiting
+_SAMPLES = 32  # A pass takes so many; a power of two, as `_powers` doubles them.
+_PASSES = 6  # After these a lane is declined, for the careful step to do: more keep the others waiting.
 _ZOOM = 1 / 16  # where a pass met a doubt, the next one samples so much more closely
 _FINEST = 1 / 16  # longest sampling step, in half periods of the forcing and of the membrane
 _NONE = float(_SAMPLES)

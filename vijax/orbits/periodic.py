@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from vijax.batch.impact_map import Next, next_impacts
+from vijax.engine.ground import Ground, ground_of
 from vijax.model import flow
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
@@ -98,7 +99,7 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit im
 
 def solved(pair: ImpactPair, sequence: Sequence, knots: Any) -> Orbit:
     """Do what `solve` does, with arguments that are known to be right."""
-    return _by_tiles(partial(_tile, _compiled(_shoot), _level(pair)), (pair, sequence, knots))
+    return _by_tiles(partial(_tile, _compiled(_shoot), _ground(pair)), (pair, sequence, knots))
 
 
 def guessed(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.ndarray) -> tuple[Sequence, Array]:
@@ -110,7 +111,7 @@ def guessed(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.
 @door
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Orbit:
     """Make orbits of knots that solve the equations already, even where Newton is singular: points of a branch."""
-    return _by_tiles(partial(_tile, _compiled(_measured), _level(pair)), (pair, sequence, knots))
+    return _by_tiles(partial(_tile, _compiled(_measured), _ground(pair)), (pair, sequence, knots))
 
 
 @door
@@ -119,8 +120,8 @@ def concatenate(found: list[Orbit]) -> Orbit:
     return tiles.arrays(jax.tree.map(lambda *leaves: np.concatenate(leaves), *found))
 
 
-def _level(pair: ImpactPair) -> bool:
-    return bool((np.asarray(pair.gamma) == 0).all())
+def _ground(pair: ImpactPair) -> Ground:
+    return ground_of(pair.gamma, deep=True)
 
 
 def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
@@ -172,14 +173,14 @@ def _compiled(work: Callable[..., _Claim]) -> Callable[..., _Claim]:
     return jax.jit(work, compiler_options=xla.compiler_options())
 
 
-def _tile(solved: Callable[..., _Claim], level: bool, rows: tuple) -> Orbit:
+def _tile(solved: Callable[..., _Claim], ground: Ground, rows: tuple) -> Orbit:
     """Fly from the end of every contact: the impact map must meet the next impact, and end its contact in time."""
     pair, sequence, guess = rows
     claim = solved(pair, sequence, guess)
     shape = sequence.side.shape
     wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf[:, None], shape), pair)
     balls = (wide, claim.departure.side, claim.departure.speed, claim.phase)
-    flown = next_impacts(*jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1), balls), level=level)
+    flown = next_impacts(*jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1), balls), ground=ground)
     return _judged(pair, sequence, claim, jax.tree.map(lambda leaf: leaf.reshape(shape), flown))
 
 

@@ -22,7 +22,7 @@ from vijax.runtime.arrays import AnyArray
 Knots = Float[Array, "impact 3"]
 """Onset time, speed into the wall (> 0) and contact time of each impact."""
 
-_MOST_ITERATIONS = 80  # of a damped search; a neighbour's orbit needs 4 or 5
+_MOST_ITERATIONS = 80  # A damped search ends after these; a neighbour's orbit needs 4 or 5.
 _LAST_STEP = 1e-9  # a Newton step this small is the last: the next one would be its square
 _FLOOR = 1e-12  # residual at which rounding may keep a search from improving
 _LEAST_PACE = 1e-4  # share of Newton's step below which the search has stalled

@@ -16,7 +16,7 @@ from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
-MOST_SWITCHES = 64  # in a row: each may find several branches from every one before
+MOST_SWITCHES = 64  # So many switches in a row at most: each may find several branches from every one before.
 
 
 @door

@@ -84,7 +84,7 @@ def units(coordinate: "xr.DataArray") -> str:
 
 NEEDS = ("P", "period", "admissible")
 LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
-MOST_PANELS = 36  # of a map: more are too small to read
+MOST_PANELS = 36  # A map has so many at most: more are too small to read.
 
 
 def layout(sizes: Mapping[str, int]) -> tuple[int, int]:

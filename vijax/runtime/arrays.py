@@ -8,6 +8,7 @@ jaxtyping that nothing but JAX comes there; both are checked when tests run.
 from typing import TYPE_CHECKING, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -34,3 +35,8 @@ def present(value: T | None) -> T:
     """
     assert value is not None
     return value
+
+
+def choose(mask: Bool[Array, "lane"], new: T, old: T) -> T:
+    """Take `new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)

@@ -5,6 +5,7 @@ and with `jax_enable_compilation_cache` off nothing is kept.
 """
 
 import os
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -20,13 +21,13 @@ def keep_programs() -> None:
     """Keep programs in the user's folder from now on, unless JAX was told of another, or to keep none.
 
     JAX knows one folder: other programs of this process are kept there too. Where the folder cannot be made, or where
-    somebody else could put programs into it, none are kept.
+    somebody else could put programs into it, none are kept. The folder is cut to `MOST_BYTES` here, once a process.
     """
     asked = jax.config.values
     if asked["jax_compilation_cache_dir"] or not asked["jax_enable_compilation_cache"]:
         return
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vijax"
-    if not _private(folder):
+    folder = _folder()
+    if folder is None or not _private(folder):
         return
     trim(folder, MOST_BYTES)
     jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -58,8 +59,17 @@ def trim(folder: Path, most: int) -> None:
     for _, size, path in sorted(used):
         if left <= most:
             return
-        path.unlink(missing_ok=True)
+        with suppress(OSError):  # it is gone, or may not go
+            path.unlink()
         left -= size
+
+
+def _folder() -> Path | None:
+    """Name the folder for this user; None where the user has no home."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vijax"
+    except RuntimeError:
+        return None
 
 
 def _private(folder: Path) -> bool:
