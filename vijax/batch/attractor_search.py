@@ -160,7 +160,7 @@ def _newton(cell: Cell) -> _Newton:
     m = jnp.stack([jnp.stack(tangent[:2], -1), jnp.stack(tangent[2:], -1)], -2) * grown[:, None, None]
     # The round ended at an exit; fly on (or back) to the phase at which it began.
     rest = 2 * (c.base.n + c.period - cell.ball.n) + (c.base.t - cell.ball.t)
-    rise, v = jax.vmap(flow.flight)(cell.pair.gamma, cell.ball.t, cell.ball.v, rest)
+    rise, v = flow.flight(flow.flight_force(cell.pair.gamma, cell.ball.t), cell.ball.v, rest)
     m = jax.vmap(flow.flight_matrix)(rest) @ m
     miss_u, miss_v = cell.ball.u + rise - c.base.u, v - c.base.v
     a, b, e, d = 1 - m[:, 0, 0], -m[:, 0, 1], -m[:, 1, 0], 1 - m[:, 1, 1]

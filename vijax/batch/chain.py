@@ -84,7 +84,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     last = choose(periodic, old.last, cell.ball)
     aloft = last.n < end
     left = jnp.where(aloft, 2 * (end - last.n) - last.t, 0.0)
-    rise, v = jax.vmap(flow.flight)(pair.gamma, last.t, last.v, left)
+    rise, v = flow.flight(flow.flight_force(pair.gamma, last.t), last.v, left)
     ball = Ball(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
     ball = choose(permanent, resting(pair, end), ball)
     first = end - present(settings.recorded_periods)

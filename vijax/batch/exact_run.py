@@ -32,7 +32,7 @@ def _time(state: State) -> Float[AnyArray, "..."]:
 def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[AnyArray, ""]) -> tuple:
     """Compute displacement, velocity and mode at a time `when` after the start of a step."""
     aloft = (when <= out.flight) | out.quiet
-    rise, v = flow.flight(pair.gamma, start.t, start.v, jnp.where(aloft, when, 0.0))
+    rise, v = flow.flight(flow.flight_force(pair.gamma, start.t), start.v, jnp.where(aloft, when, 0.0))
     held = start.mode != 0
     side = jnp.where(held, start.mode, out.impact.side).astype(rise.dtype)
     inside = jnp.where(aloft, 0.0, when - out.flight)

@@ -214,11 +214,16 @@ def turning_points(
     seen = end.seen
     # The steady response is highest at this phase and lowest half a period later: each once, the first still ahead.
     known = -jnp.arctan2(steady.q, steady.c) / PI
-    for when, low in ((known, no), (known + 1, ~no)):
+
+    def look(low: Array, seen: Turns) -> Turns:
+        when = known + low.astype(known.dtype)
         ahead = when + 2 * jnp.ceil(0.5 * (end.s - when))
         there = end.settled & (ahead > 0) & (ahead < seen.exit)
         w, _ = flow.oscillate(m, force, w0, z0, jnp.where(there, ahead, 0.0))
-        seen = _compared(seen, ahead, w, there, there & low)
+        return _compared(seen, ahead, w, there, there & (low == 1))
+
+    # A loop, so that a program holds the membrane's flow once for both.
+    seen = lax.fori_loop(0, 2, look, seen)
     return eqx.tree_at(lambda t: t.lost, seen, end.going | seen.lost)
 
 

@@ -85,8 +85,8 @@ def _penetration_rate(s, args):
 
 
 def _crossing(s, args):
-    gamma, side, distance, t0, v0 = args
-    return distance - side * flow.flight(gamma, t0, v0, s)[0]
+    force, side, distance, v0 = args
+    return distance - side * flow.flight(force, v0, s)[0]
 
 
 def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, held: Flag):
@@ -130,13 +130,14 @@ def step(
     held = state.mode != 0
     room = (0.5 * pair.d + state.u, 0.5 * pair.d - state.u)
     wanted = ~held & (horizon > 0)
-    sought = lax.stop_gradient((pair.gamma, room, state.t, state.v, horizon))
+    force = flow.flight_force(pair.gamma, state.t)
+    sought = lax.stop_gradient((force, room, state.v, horizon))
     flight, side = next_wall(*sought, wanted)
     reached = wanted & (side != 0)
     side = jnp.where(held, state.mode.astype(flight.dtype), jnp.where(reached, side, 1.0))
-    args = (pair.gamma, side, jnp.where(side > 0, room[1], room[0]), state.t, state.v)
+    args = (force, side, jnp.where(side > 0, room[1], room[0]), state.v)
     flight = jnp.where(reached, implicit_root(_crossing, jnp.where(reached, flight, 1.0), args), 0.0)
-    _, v_in = flow.flight(pair.gamma, state.t, state.v, flight)
+    _, v_in = flow.flight(force, state.v, flight)
     t, periods = flow.wrap_phase(state.t + flight)
     meets = reached | held
     if pair.rigid:

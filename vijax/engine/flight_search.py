@@ -33,19 +33,19 @@ LONGEST_PIECE = 1.0
 
 
 def monotone_piece(
-    gamma: Scalar, force: Force, t0: Scalar, v0: Scalar, s: Scalar, v: Scalar, end: Scalar, wanted: Flag
+    force: Force, v0: Scalar, s: Scalar, v: Scalar, end: Scalar, wanted: Flag
 ) -> tuple[Scalar, Flag, Scalar]:
     """Find the velocity at the end of a piece without a zero of the acceleration, and whether and when the ball turns.
 
     Args:
-        gamma, t0, v0: Of the flight; `force` is its `flow.flight_force`.
+        force, v0: Of the flight, as in `flow.flight`.
         s, v: Where the piece begins, and the velocity there.
         end: Where it ends.
         wanted: Whether to look for the turn.
     """
 
     def velocity(s):
-        return flow.flight(gamma, t0, v0, s)[1]
+        return flow.flight(force, v0, s)[1]
 
     v_end = velocity(end)
     turns = v * v_end < 0
@@ -57,22 +57,21 @@ def monotone_piece(
 
 
 def next_wall(
-    gamma: Scalar, room: tuple[Scalar, Scalar], t0: Scalar, v0: Scalar, horizon: Scalar, wanted: Flag
+    force: Force, room: tuple[Scalar, Scalar], v0: Scalar, horizon: Scalar, wanted: Flag
 ) -> tuple[Scalar, Scalar]:
     """Find the time to the first wall crossing and its side (0: none before `horizon`).
 
     Between zeros of the acceleration (analytic) the velocity is monotone, so each velocity zero is bracketed; between
     those the position is monotone, so each crossing is bracketed. `room` holds the room to the left and right wall.
     """
-    force = flow.flight_force(gamma, t0)
 
     def scan(c: _Scan) -> _Scan:
         end = jnp.minimum(c.turn, c.s + LONGEST_PIECE)
-        v_end, turns, turn = monotone_piece(gamma, force, t0, v0, c.s, c.v, end, wanted)
+        v_end, turns, turn = monotone_piece(force, v0, c.s, c.v, end, wanted)
         middle = jnp.where(turns, turn, end)
         heading = jnp.where(c.v == 0, jnp.sign(v_end), jnp.sign(c.v))
-        first = _beyond(gamma, room, t0, v0, heading, middle)
-        second = _beyond(gamma, room, t0, v0, jnp.sign(v_end), end)
+        first = _beyond(force, room, v0, heading, middle)
+        second = _beyond(force, room, v0, jnp.sign(v_end), end)
         side = jnp.where(first != 0, first, second)
         low, high = jnp.where(first != 0, c.s, middle), jnp.where(first != 0, middle, end)
         return _Scan(end, v_end, next_turn(force, end), side, low, high)
@@ -83,15 +82,15 @@ def next_wall(
     distance = jnp.where(found.side > 0, room[1], room[0])
 
     def gap(s):
-        rise, v = flow.flight(gamma, t0, v0, s)
+        rise, v = flow.flight(force, v0, s)
         return distance - found.side * rise, -found.side * v
 
     reached = wanted & (found.side != 0)
     return bracketed_root(gap, found.low, found.high, 0.5 * (found.low + found.high), reached), found.side
 
 
-def _beyond(gamma, room, t0, v0, heading, s):
+def _beyond(force, room, v0, heading, s):
     """Give `heading` if the ball, moving that way, is past the wall there at time s, else 0."""
-    rise, _ = flow.flight(gamma, t0, v0, s)
+    rise, _ = flow.flight(force, v0, s)
     past = jnp.where(heading > 0, rise > room[1], rise < -room[0])
     return jnp.where(past & (heading != 0), heading, 0.0)

@@ -142,8 +142,8 @@ def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
     half, gamma = 0.5 * pair.d, pair.gamma
     eps = jnp.finfo(half.dtype).eps
     bend = 1 + jnp.abs(gamma)
-    sin0, cos0, _, _ = flow.half_turn(lane.t)
-    level, drift = lane.u + cos0 / PI**2, lane.v - sin0 / PI
+    force = share(flow.flight_force(gamma, lane.t))
+    level, drift = lane.u + force.c / PI**2, lane.v - force.q / PI
     order = jnp.arange(1, _SAMPLES + 1, dtype=half.dtype)[:, None]
 
     def advance(at: _Pass) -> _Pass:
@@ -170,12 +170,12 @@ def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
     distance = half - found.side * lane.u
     at = _chord(found)
     for _ in range(2):
-        rise, v = flow.flight(gamma, lane.t, lane.v, at)
+        rise, v = flow.flight(force, lane.v, at)
         sine, cosine, _, _ = flow.half_turn(lane.t + at)
         push, jerk = gamma - cosine, PI * sine
         step = householder(distance - found.side * rise, -found.side * v, found.side * push, found.side * jerk)
         at, step = share((at + step, step))
-    speed = found.side * flow.flight(gamma, lane.t, lane.v, at)[1]
+    speed = found.side * flow.flight(force, lane.v, at)[1]
     sure = (found.side != 0) & (jnp.abs(step) < converged_step(eps)) & (speed > 0) & (at > 0)
     return Arrival(at, speed, found.side, sure)
 

@@ -144,12 +144,17 @@ def _squared_speed_short(
             scale = scale * half
             jet.append(now)
         jets.append(jet)
-    total = jnp.zeros_like(half)
-    for matrix, sign in ((_EVEN, 1.0), (_ODD, -1.0)):
-        part = [0.5 * (last + sign * (-1.0) ** j * first) for j, (first, last) in enumerate(zip(*jets, strict=True))]
-        for row in matrix:
-            total = total + sum(float(weight) * value for weight, value in zip(row, part, strict=True)) ** 2
-    return half * total
+    sums = [last + first for first, last in zip(*jets, strict=True)]
+    differences = [last - first for first, last in zip(*jets, strict=True)]
+    # At +1 a derivative of even order of the polynomial's even part is half the sum of the ends', one of odd order half
+    # their difference; with the odd part it is the other way round.
+    even, odd = ([(sums, differences)[(j + parity) % 2][j] for j in range(_MATCHED)] for parity in (0, 1))
+    squares = [
+        sum(float(weight) * value for weight, value in zip(row, part, strict=True)) ** 2
+        for matrix, part in ((_EVEN, even), (_ODD, odd))
+        for row in 0.5 * matrix
+    ]
+    return half * sum(squares)
 
 
 @door

@@ -81,6 +81,7 @@ _LAG = _alternating(3, 8)
 _SINHC = tuple(1.0 / math.factorial(2 * k + 1) for k in range(8))
 # The exponentials of a contact with max(kappa, pi) s < 1 need this many Taylor terms for 1e-17.
 _CONTACT_TERMS = 20
+_OVER_FACTORIAL = tuple(1.0 / math.factorial(n) for n in range(_CONTACT_TERMS + 1))
 _SERIES_REACH = 1.0
 
 
@@ -129,16 +130,15 @@ def wrap_phase(t: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array
 
 @once
 @shared
-def flight(gamma: Values, t0: Values, v0: Values, s: Values) -> tuple[Values, Values]:
-    """Compute displacement from the start and velocity after a flight of length s from phase t0 at velocity v0.
+def flight(force: Force, v0: Values, s: Values) -> tuple[Values, Values]:
+    """Compute displacement from the start and velocity after a flight of length s under `flight_force` at velocity v0.
 
-    u - u0 = v0 s - gamma s^2/2 + (cos(pi t0)(1 - cos pi s) - sin(pi t0)(pi s - sin pi s))/pi^2
+    u - u0 = v0 s - g s^2/2 + (c (1 - cos pi s) - q (pi s - sin pi s))/pi^2
     Source: Eqs. (6)-(7) scaled, derived again (physics.md).
     """
-    sin0, cos0, _, _ = half_turn(t0)
     sin_s, _, versine, lag = half_turn(s)
-    rise = (v0 - 0.5 * gamma * s) * s + (cos0 * versine - sin0 * lag) / PI**2
-    return rise, v0 - gamma * s + (cos0 * sin_s - sin0 * versine) / PI
+    rise = (v0 - 0.5 * force.g * s) * s + (force.c * versine - force.q * lag) / PI**2
+    return rise, v0 - force.g * s + (force.c * sin_s - force.q * versine) / PI
 
 
 def acceleration(gamma: Values, t: Values) -> Values:
@@ -147,25 +147,33 @@ def acceleration(gamma: Values, t: Values) -> Values:
 
 
 def _contact_series(m: Membrane, force: Force, w0: Values, z0: Values, s: Values) -> tuple[Values, Values]:
-    """Compute (w, w') by Taylor series in s; accurate for max(kappa, pi) s < 1, where the closed form cancels."""
+    """Compute (w, w') by Taylor series in s; accurate for max(kappa, pi) s < 1, where the closed form cancels.
+
+    Sums b_n s/n! and b_n/(n - 1)! of b_n = s^(n - 1) d^n w/ds^n from n = 1, which obey b_(n + 2) = e_n - mu s b_(n + 1)
+    - (kappa s)^2 b_n, where e_n = s^(n + 1) d^n f/ds^n comes back times -(pi s)^2 after two steps. With the factorials
+    in the sums alone a term is a handful of operations, of which every program of a contact holds many copies.
+    """
     s = share(s)
+    loss, stiffness, turn = share((m.mu * s, (m.kappa * s) ** 2, -((PI * s) ** 2)))
 
     def add(n, carry):
-        w, z, w_term, z_term, drive, next_drive, steady = carry
-        h = s / (n + 1)
-        square = m.kappa * m.kappa
-        w_term, z_term = z_term * h, (drive - steady - m.mu * z_term - square * w_term) * h
-        # The n-th derivative of the forcing times s^n/n!: two steps on it is -(pi s)^2/((n + 1)(n + 2)) of itself.
-        after = -drive * (PI * s) ** 2 / ((n + 1) * (n + 2))
-        return w + w_term, z + z_term, w_term, z_term, next_drive, after, jnp.zeros_like(steady)
+        w, z, b, after, drive, next_drive = carry
+        # A loop counts in whole numbers, in which its factorials are looked up.
+        over = _OVER_FACTORIAL if isinstance(n, int) else jnp.asarray(_OVER_FACTORIAL, s.dtype)
+        w, z = w + over[n] * b, z + over[n - 1] * b
+        return w, z, after, next_drive - loss * after - stiffness * b, next_drive, turn * drive
 
-    start = (w0, z0, w0, z0, force.c, -force.q * PI * s, force.g)
+    # The first two terms feel gravity and the first displacement, which are no part of what recurs.
+    first, drive, next_drive = z0, s * force.c, -(PI * s) * (s * force.q)
+    second = drive - s * force.g - loss * first - (m.kappa * m.kappa * s) * w0
+    start = (jnp.zeros_like(second), jnp.zeros_like(second), first + jnp.zeros_like(second), second, drive, next_drive)
     if m.rolled:
-        w, z, *_ = lax.fori_loop(0, _CONTACT_TERMS, add, start)
-        return w, z
-    for n in range(_CONTACT_TERMS):
-        start = add(n, start)
-    return start[0], start[1]
+        w, z, *_ = lax.fori_loop(1, _CONTACT_TERMS + 1, add, start)
+    else:
+        for n in range(1, _CONTACT_TERMS + 1):
+            start = add(n, start)
+        w, z, *_ = start
+    return w0 + s * w, z
 
 
 @once

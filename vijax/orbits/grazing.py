@@ -43,8 +43,8 @@ def _flight_room(pair: ImpactPair, side, speed, t, length, real):
 
     def onward(at: _Flight) -> _Flight:
         end = jnp.minimum(jnp.minimum(flight_search.next_turn(force, at.s), at.s + flight_search.LONGEST_PIECE), length)
-        v_end, turns, turn = flight_search.monotone_piece(pair.gamma, force, t, v0, at.s, at.v, end, real)
-        rise, _ = flow.flight(pair.gamma, t, v0, turn)
+        v_end, turns, turn = flight_search.monotone_piece(force, v0, at.s, at.v, end, real)
+        rise, _ = flow.flight(force, v0, turn)
         # Where the velocity changes from rising to falling the wall ahead is the right one.
         room = 0.5 * pair.d - jnp.sign(at.v) * (0.5 * side * pair.d + rise)
         return _Flight(end, v_end, jnp.where(turns, jnp.minimum(at.room, room), at.room))

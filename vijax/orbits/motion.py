@@ -90,7 +90,8 @@ def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, 
     """Compute where the ball is a time after each impact."""
     inside = when - t <= duration
     u, v = jax.vmap(partial(_contact, pair))(t, side, v_in, jnp.where(inside, when - t, 0.0))
-    rise, speed = flow.flight(pair.gamma, t + duration, v_out, jnp.where(inside, 0.0, when - t - duration))
+    force = flow.flight_force(pair.gamma, t + duration)
+    rise, speed = flow.flight(force, v_out, jnp.where(inside, 0.0, when - t - duration))
     return jnp.where(inside, u, 0.5 * side * pair.d + rise), jnp.where(inside, v, speed)
 
 
@@ -101,7 +102,7 @@ def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int
     held, aloft = duration[:, None] * parts, (until - t - duration)[:, None] * parts
     over_parts = jax.vmap(partial(_contact, pair), in_axes=(None, None, None, 0))
     u, v = jax.vmap(over_parts)(t, side, v_in, held)
-    rise, w = flow.flight(pair.gamma, (t + duration)[:, None], v_out[:, None], aloft)
+    rise, w = flow.flight(flow.flight_force(pair.gamma, (t + duration)[:, None]), v_out[:, None], aloft)
     clock = jnp.concatenate([t[:, None] + held, (t + duration)[:, None] + aloft], axis=1)
     wall = (0.5 * side * pair.d)[:, None]
     return clock, jnp.concatenate([u, wall + rise], axis=1), jnp.concatenate([v, w], axis=1)

@@ -97,7 +97,7 @@ def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Fl
     t, _, stay, next_t, next_speed = knot
     contact = _contact(pair, side, knot)
     leave, length, speed = t + stay, next_t - t - stay, side * contact.rate
-    rise, v = flow.flight(pair.gamma, leave, speed, length)
+    rise, v = flow.flight(flow.flight_force(pair.gamma, leave), speed, length)
     # In (onset, speed, stay, next onset, next speed): how each end of the flight moves.
     unit = jnp.eye(5, dtype=knot.dtype)
     d_leave, d_next, d_next_speed = unit[0] + unit[2], unit[3], unit[4]
