@@ -16,6 +16,7 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
 from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray
+from vijax.runtime.xla import jitted
 
 # The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
 # call, and few enough that the host waits for no long one after every ball has arrived.
@@ -66,7 +67,7 @@ class _Reached(NamedTuple):
     over: Bool[AnyArray, "row"]
 
 
-@jax.jit
+@jitted
 def _set_out(pair: ImpactPair, u0, v0, t0) -> _Reached:
     return _Reached(jax.vmap(begin)(pair, u0, v0, t0), jnp.zeros(u0.shape, bool))
 
@@ -96,7 +97,7 @@ def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArr
     return reached, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), flown)
 
 
-_stretch = jax.jit(partial(_onward, count=_STRETCH))
+_stretch = jitted(partial(_onward, count=_STRETCH))
 
 
 def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Reached, _Flown]:
@@ -142,7 +143,7 @@ def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Traj
     return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
 
 
-exact_traced = jax.jit(exact_run, static_argnames="room")
+exact_traced = jitted(exact_run, static_argnames="room")
 
 
 def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:
@@ -161,13 +162,14 @@ def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:
     when = own.where(known, 2.0 * (k - first.n).astype(clock.dtype) - first.t, 0.0)
     wide = jax.tree.map(lambda leaf: own.broadcast_to(leaf[:, None], k.shape), pair)
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1), (wide, first, happened, when))
-    u, v, mode = jax.tree.map(lambda leaf: leaf.reshape(k.shape), tiles.map_tiles(_balls_at, rows, _STROBES))
+    u, v, mode = jax.tree.map(lambda leaf: leaf.reshape(k.shape), tiles.map_tiles(balls_at, rows, _STROBES))
     blank = own.where(known, 0.0, own.nan).astype(u.dtype)
     return State(u + blank, v + blank, own.zeros_like(u), k, mode)
 
 
-@jax.jit
-def _balls_at(rows: tuple) -> tuple:
+@jitted
+def balls_at(rows: tuple) -> tuple:
+    """Do what `ball_at` does, for many balls: of each what that takes."""
     return jax.vmap(ball_at)(*rows)
 
 

@@ -1,6 +1,5 @@
 """Every impact of a stretch of periods, and the ball at phase 0 in between, of many balls at once."""
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -8,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from vijax.batch.exact_run import ball_at
+from vijax.batch.exact_run import balls_at
 from vijax.engine import exact
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
-from vijax.runtime import tiles, xla
+from vijax.runtime import tiles
+from vijax.runtime.xla import jitted
 
 # No result depends on these: how many balls fly together, how many at phase 0 are found together, and after how many
 # impacts of each those that have arrived make room. Fewer are more calls, more are more rows that nobody needs.
@@ -75,31 +75,28 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     return Record(*_impacts(ball, flown, count, periods), *_strobes(pair, ball, flown, count, periods))
 
 
-@lru_cache(maxsize=1)
-def _compiled():
-    """Compile some steps of a tile of balls."""
+@jitted
+def _some_steps(pair: ImpactPair, states: State, over: Any, periods: Any):
+    """Take a tile of balls some steps on: where they are, which have arrived, the steps, which of these are real."""
 
-    def steps(pair, states, over, periods):
-        def one(carry, _):
-            state, over = carry
-            left = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(state.t.dtype) - state.t)
-            out = jax.vmap(exact.step)(pair, state, left)
-            ends = over | out.quiet | out.permanent | (left <= 0) | (out.impact.n >= periods)
-            after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
-            return (after, ends), (_Step(state, out), ~over & (left > 0))
+    def one(carry, _):
+        state, over = carry
+        left = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(state.t.dtype) - state.t)
+        out = jax.vmap(exact.step)(pair, state, left)
+        ends = over | out.quiet | out.permanent | (left <= 0) | (out.impact.n >= periods)
+        after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
+        return (after, ends), (_Step(state, out), ~over & (left > 0))
 
-        return lax.scan(one, (states, over), None, length=_STEPS)
-
-    return jax.jit(steps, compiler_options=xla.compiler_options())
+    return lax.scan(one, (states, over), None, length=_STEPS)
 
 
 def _advance(pair: ImpactPair, states: State, periods: int) -> tuple[State, np.ndarray, _Step, np.ndarray]:
     """Take balls some steps on: where they are, which have arrived, the steps [ball, step], which of these are real."""
     parts = []
     for tile in tiles.tiles(states.u.size, (_TILE,)):
-        args = jax.tree.map(lambda x, rows=tile.rows: x[rows], (pair, states))
+        own, begun = jax.tree.map(lambda x, rows=tile.rows: x[rows], (pair, states))
         idle = np.arange(_TILE) >= tile.real
-        (after, over), (steps, real) = _compiled()(*args, idle, np.int32(periods))
+        (after, over), (steps, real) = _some_steps(own, begun, idle, np.int32(periods))
         steps, real = jax.tree.map(lambda x: np.asarray(x).swapaxes(0, 1), (steps, real))
         parts.append(jax.tree.map(lambda x, real=tile.real: np.asarray(x)[:real], (after, over, steps, real)))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
@@ -136,17 +133,6 @@ def _strobes(pair: ImpactPair, ball: np.ndarray, steps: Any, count: int, periods
     for some, _ in tiles.tiles(cell.size, (_STROBES,)):
         taken = jax.tree.map(lambda x, some=some: x[index[some]], steps)
         own = jax.tree.map(lambda x, some=some: x[cell[some]], pair)
-        at = _compiled_balls()(own, taken, when[some])
+        at = balls_at((own, taken.begun, taken.out, when[some]))[:2]
         u[cell[some], period[some] - 1], v[cell[some], period[some] - 1] = (np.asarray(x) for x in at)
     return u, v
-
-
-@lru_cache(maxsize=1)
-def _compiled_balls():
-    """Compile displacement and velocity of balls at a time `when` after the start of their steps."""
-
-    def balls(pair, steps, when):
-        u, v, _ = jax.vmap(ball_at)(pair, steps.begun, steps.out, when)
-        return u, v
-
-    return jax.jit(balls, compiler_options=xla.compiler_options())

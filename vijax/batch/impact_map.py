@@ -17,8 +17,9 @@ from vijax.engine import quick, quick_wall
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Ball
 from vijax.model.pair import ImpactPair
-from vijax.runtime import tiles, xla
+from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray
+from vijax.runtime.xla import jitted
 
 # Forcing periods in which an impact must come; the map tells of none that comes later, and no orbit may have such a
 # flight.
@@ -65,7 +66,7 @@ def _compiled(answer: Callable, plan: Plan):
         seen = impact.side, impact.v_in, impact.v_out, impact.duration, impact.depth, impact.work
         return Next(onset, *seen, real), given.sure
 
-    return jax.jit(work, compiler_options=xla.compiler_options())
+    return jitted(work)
 
 
 def _answered(work: Callable, requests: advance.Request) -> tuple[Next, np.ndarray]:
@@ -99,9 +100,12 @@ def next_impacts(
     zero: Any = np.zeros_like(t)
     ball = Ball(0.5 * side * pair.d, -side * speed, t, zero)
     requests = advance.Request(pair, ball, zero, zero + _HORIZON)
-    # What one step is not sure of is left to the next, which costs several times as much.
-    found, sure = _answered(_compiled(_quick_answer, plan), requests)
-    for step in (_sampled_answer, advance.careful_answer):
+    # What one step is not sure of is left to the next, which costs several times as much. For a few balls that is less
+    # than what the programs of the others take to compile.
+    few = requests.held.size <= _TILES[0]
+    first, *others = [advance.careful_answer] if few else [_quick_answer, _sampled_answer, advance.careful_answer]
+    found, sure = _answered(_compiled(first, plan), requests)
+    for step in others:
         rest = np.flatnonzero(~sure)
         if rest.size:
             again, certain = _answered(_compiled(step, plan), jax.tree.map(partial(np.take, indices=rest), requests))

@@ -4,6 +4,7 @@ The orbit's equations go on through grazing into orbits that are none (`shooting
 marks a bifurcation, are smooth functions along the curve: its test functions.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting
 from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
-from vijax.runtime import linear_solve, tiles
+from vijax.runtime import linear_solve, tiles, xla
 
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
 
@@ -138,7 +139,7 @@ class Place(NamedTuple):
     corrections: np.ndarray
 
 
-@jax.jit
+@partial(xla.jitted, often=True)
 def _compiled(arcs: Arc, y, tangent, length):
     def one(arc, y, tangent, length):
         at = _correct(arc, y + length * tangent, tangent)

@@ -20,6 +20,7 @@ from vijax.orbits.symmetry import unfolded
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
+from vijax.runtime.xla import jitted
 
 
 class Counts(NamedTuple):
@@ -63,7 +64,7 @@ def impacts(orbit: Orbit) -> Impact:
     return tiles.arrays(tiles.map_tiles(_hits, unfolded(orbit), TILES))
 
 
-@jax.jit
+@jitted
 def _hits(full: Orbit) -> Impact:
     """Compute the impacts of orbits that are in full."""
     departure = jax.vmap(shooting.departures)(full.pair, full.sequence, full.knots)
@@ -122,7 +123,7 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
     return clock, u, v
 
 
-@partial(jax.jit, static_argnames="samples")
+@partial(jitted, static_argnames="samples")
 def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
     """Compute (t, u, v) [orbit, impact, instant] of orbits that are in full."""
     until = jax.vmap(shooting.departures)(full.pair, full.sequence, full.knots).next_t
@@ -134,8 +135,13 @@ def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
 @door
 def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
     """Sum over the impacts what tells orbits of one pair apart, mirror images too."""
-    t, speed, stay = np.moveaxis(np.asarray(orbit.knots), -1, 0)
-    signed = np.asarray(orbit.sequence.side) * speed
+    return marks_of_knots(orbit.sequence.side, orbit.knots)
+
+
+def marks_of_knots(side: Any, knots: Any) -> Float[np.ndarray, "orbit 6"]:
+    """Do what `marks` does, with the walls and knots of orbits that need not be proved."""
+    t, speed, stay = np.moveaxis(np.asarray(knots), -1, 0)
+    signed = np.asarray(side) * speed
     # Odd harmonics are alike for mirror images, (side, t) -> (-side, t + 1); even ones change sign.
     waves = [wave(np.pi * order * t) for order in (1, 2) for wave in (np.cos, np.sin)]
     parts = [*(signed * wave for wave in waves), signed + speed, stay * speed]

@@ -12,8 +12,8 @@ from jaxtyping import ArrayLike
 from vijax.batch.trajectory import trajectory
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.model.records import Status
-from vijax.orbits.orbit_properties import marks
-from vijax.orbits.periodic import SAME, Orbit, check_orbit, concatenate, guessed, solved
+from vijax.orbits.orbit_properties import marks_of_knots
+from vijax.orbits.periodic import SAME, Orbit, check_orbit, concatenate, guessed, judged, shot, solved
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
@@ -149,13 +149,23 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
     wide = jax.tree.map(lambda x: np.broadcast_to(x, guesses), pair)
     side = np.broadcast_to(np.asarray(walls, np.int32), (guesses, count))
-    return solved(wide, *guessed(side, np.full(guesses, 2.0 * period), np.zeros(guesses, bool), knots))
+    sequence, near = guessed(side, np.full(guesses, 2.0 * period), np.zeros(guesses, bool), knots)
+    claim = shot(wide, sequence, near)
+    # Most guesses lead to the same few orbits, of which each is proved once.
+    first = _each_once(side, claim.knots, np.flatnonzero(np.isfinite(claim.residual)))
+    kept = first if first.size else np.zeros(1, int)
+    return judged(*jax.tree.map(lambda leaf: np.asarray(leaf)[kept], (wide, sequence, claim)))
+
+
+def _each_once(side: Any, knots: Any, good: np.ndarray) -> np.ndarray:
+    """List the first row of each different orbit among the good ones, in their order."""
+    rounded = np.round(marks_of_knots(side, knots)[good] / SAME)
+    _, first = np.unique(rounded, axis=0, return_index=True)
+    return np.sort(good[first])
 
 
 @door
 def distinct(orbit: Orbit) -> Orbit:
     """Keep the orbits that are there, each once whichever impact it was begun with."""
     good = np.flatnonzero(np.asarray(check_orbit(orbit).status) == Status.OK)
-    rounded = np.round(np.asarray(marks(orbit))[good] / SAME)
-    _, first = np.unique(rounded, axis=0, return_index=True)
-    return orbit[np.sort(good[first])]
+    return orbit[_each_once(orbit.sequence.side, orbit.knots, good)]

@@ -1,8 +1,8 @@
 """Periodic orbits, stable and unstable: the record, Newton from guesses, and the proof by the impact map."""
 
 from collections.abc import Callable
-from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,10 @@ from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.orbits import shooting
 from vijax.orbits.shooting import Sequence
-from vijax.runtime import checks, context, tiles, xla
+from vijax.runtime import checks, context, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
+from vijax.runtime.xla import jitted
 
 _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
 # How closely the impact map must meet the next impact of a real orbit, in time, speed and duration together; marks of
@@ -26,6 +27,8 @@ _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion tha
 # them are born.
 SAME = 1e-6
 TILES = (32, 256, 4096)  # orbits of one compiled call
+
+T = TypeVar("T")
 
 
 class Orbit(WithStatus):
@@ -99,7 +102,12 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit im
 
 def solved(pair: ImpactPair, sequence: Sequence, knots: Any) -> Orbit:
     """Do what `solve` does, with arguments that are known to be right."""
-    return _by_tiles(partial(_tile, _compiled(_shoot), _ground(pair)), (pair, sequence, knots))
+    return judged(pair, sequence, shot(pair, sequence, knots))
+
+
+def shot(pair: ImpactPair, sequence: Sequence, knots: Any) -> "Claim":
+    """Do Newton's part of `solved` alone."""
+    return _by_tiles(lambda rows: _shoot(*rows), (pair, sequence, knots))
 
 
 def guessed(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.ndarray) -> tuple[Sequence, Array]:
@@ -111,26 +119,27 @@ def guessed(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.
 @door
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Orbit:
     """Make orbits of knots that solve the equations already, even where Newton is singular: points of a branch."""
-    return _by_tiles(partial(_tile, _compiled(_measured), _ground(pair)), (pair, sequence, knots))
+    return judged(pair, sequence, _by_tiles(lambda rows: _measured(*rows), (pair, sequence, knots)))
+
+
+def judged(pair: ImpactPair, sequence: Sequence, claim: "Claim") -> Orbit:
+    """Prove claims by the impact map, or say what they lack."""
+    return _by_tiles(partial(_prove, ground_of(pair.gamma, deep=True)), (pair, sequence, claim))
 
 
 @door
-def concatenate(found: list[Orbit]) -> Orbit:
-    """Join orbits of one number of impacts to one batch."""
+def concatenate(found: list[T]) -> T:
+    """Join orbits of one number of impacts, or claims to be some, to one batch."""
     return tiles.arrays(jax.tree.map(lambda *leaves: np.concatenate(leaves), *found))
 
 
-def _ground(pair: ImpactPair) -> Ground:
-    return ground_of(pair.gamma, deep=True)
-
-
-def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
+def _by_tiles(work: Callable[[Any], T], rows: Any) -> T:
     """Do the work on every row, in padded tiles of few sizes so that few programs are compiled, a thread a core."""
     # Rows are cut and joined by numpy: an eager JAX operation costs more than what it does to a tile.
     rows = jax.tree.map(np.asarray, rows)
 
-    def part(tile: tiles.Tile) -> Orbit:
-        found = work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))
+    def part(tile: tiles.Tile) -> T:
+        found: Any = work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: tile.real], found)
 
     with context.pool(tiles.workers()) as pool:
@@ -138,7 +147,7 @@ def _by_tiles(work: Callable[[Any], Orbit], rows: Any) -> Orbit:
     return concatenate(found)
 
 
-class _Claim(NamedTuple):
+class Claim(NamedTuple):
     """Knots that are to be an orbit's, and where the ball is to fly from the end of every contact."""
 
     knots: Float[AnyArray, "orbit impact 3"]
@@ -149,34 +158,28 @@ class _Claim(NamedTuple):
     periods: Float[AnyArray, "orbit impact"]
 
 
-def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[AnyArray, "orbit impact 3"]) -> _Claim:
+@jitted
+def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[AnyArray, "orbit impact 3"]) -> Claim:
     knots, residual = shooting.newton(pair, sequence, guess)
     touches = (sequence.real & (knots[..., 1] < _TOUCH)).any(axis=1)
     return _claim(pair, sequence, knots, jnp.where(touches, jnp.inf, residual))
 
 
-def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> _Claim:
+@jitted
+def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Claim:
     residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
     return _claim(pair, sequence, knots, residual)
 
 
-def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"]) -> _Claim:
+def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"]) -> Claim:
     around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
     departure = jax.vmap(shooting.departures)(pair, sequence, knots)
-    return _Claim(
-        knots, residual, shooting.floquet(around, sequence.mirrored), departure, *flow.wrap_phase(departure.t)
-    )
+    return Claim(knots, residual, shooting.floquet(around, sequence.mirrored), departure, *flow.wrap_phase(departure.t))
 
 
-@lru_cache(maxsize=2)
-def _compiled(work: Callable[..., _Claim]) -> Callable[..., _Claim]:
-    return jax.jit(work, compiler_options=xla.compiler_options())
-
-
-def _tile(solved: Callable[..., _Claim], ground: Ground, rows: tuple) -> Orbit:
+def _prove(ground: Ground, rows: tuple) -> Orbit:
     """Fly from the end of every contact: the impact map must meet the next impact, and end its contact in time."""
-    pair, sequence, guess = rows
-    claim = solved(pair, sequence, guess)
+    pair, sequence, claim = rows
     shape = sequence.side.shape
     wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf[:, None], shape), pair)
     balls = (wide, claim.departure.side, claim.departure.speed, claim.phase)
@@ -184,8 +187,8 @@ def _tile(solved: Callable[..., _Claim], ground: Ground, rows: tuple) -> Orbit:
     return _judged(pair, sequence, claim, jax.tree.map(lambda leaf: leaf.reshape(shape), flown))
 
 
-@jax.jit
-def _judged(pair: ImpactPair, sequence: Sequence, claim: _Claim, flown: Next) -> Orbit:
+@jitted
+def _judged(pair: ImpactPair, sequence: Sequence, claim: Claim, flown: Next) -> Orbit:
     """Judge the claims by what the flights say of them."""
     real, departure = sequence.real, claim.departure
     found = jnp.isfinite(claim.residual) & real.any(axis=1)

@@ -25,6 +25,7 @@ from vijax.orbits.shooting import Knots, Sequence
 from vijax.orbits.validity import validity
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
+from vijax.runtime.xla import jitted
 
 
 class Steady(WithStatus):
@@ -109,7 +110,7 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
     return _near(device, pair, orbit.sequence, orbit.knots, wall)
 
 
-@partial(jax.jit, static_argnames="wall")
+@partial(jitted, static_argnames="wall")
 def _near(device: Harvester, pair: ImpactPair | None, sequence: Sequence, guess: Knots, wall: str) -> Steady:
     """Find the steady state near a guess.
 

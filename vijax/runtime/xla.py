@@ -13,11 +13,12 @@ long.
 
 import os
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Int
@@ -28,11 +29,18 @@ T = TypeVar("T")
 _CPU_OPTIONS = {
     # Half again the throughput where the CPU has 512-bit registers; elsewhere LLVM splits them.
     "xla_cpu_prefer_vector_width": 512,
-    # Of 3, the default, programs compile a quarter longer and run no faster.
-    "xla_backend_optimization_level": 2,
-    # Tiles already keep every core at work.
-    "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+    # Of 3, the default, programs compile a third longer and run no faster.
+    "xla_backend_optimization_level": 1,
+    # XLA's newer way to emit a fusion takes twice as long to compile, and what it makes runs no faster.
+    "xla_cpu_use_fusion_emitters": False,
+    # Tiles already keep every core at work. The others walk a program again and again and change nothing: one looks for
+    # mistakes of XLA's own, one for numbers of 16 bits.
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,hlo-verifier,float-normalization-bf16",
 }
+# A program that runs for milliseconds costs what it takes to compile: LLVM leaves it as it is, which takes half the
+# time, and it runs three to five times as long.
+_BRIEF = {"xla_backend_optimization_level": 0}
+_FEW = 64  # A program for so many rows at most is one that runs briefly.
 _STAYS = {"inlineable": "false"}  # a call that XLA does not see through
 _ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
 _BLOCK = 64  # lanes: what a step stores of them stays in the first cache; with 32 LLVM runs out of registers
@@ -66,10 +74,46 @@ def _in_kernels() -> bool:
     return KERNELS and _on_cpu()
 
 
-def compiler_options() -> dict[str, Any]:
-    """Choose the options of `jax.jit` for the backend that JAX will use; what XLA_FLAGS says comes first."""
+def compiler_options(*, brief: bool = False) -> dict[str, Any]:
+    """Choose the options of `jax.jit` for the backend that JAX will use; what XLA_FLAGS says comes first.
+
+    Args:
+        brief: Whether the program runs so briefly that its compilation is what it costs.
+    """
     said = os.environ.get("XLA_FLAGS", "")
-    return {name: value for name, value in _CPU_OPTIONS.items() if name not in said} if _on_cpu() else {}
+    options = _CPU_OPTIONS | (_BRIEF if brief else {})
+    return {name: value for name, value in options.items() if name not in said} if _on_cpu() else {}
+
+
+def _rows(leaf: Any) -> int:
+    return max(np.shape(leaf)[:1], default=0)
+
+
+def jitted(work: Callable[P, T], *, often: bool = False, **settings: Any) -> Callable[P, T]:
+    """Compile a function as `jax.jit` does, with our options of the compiler where it is a program of its own.
+
+    Within a program that JAX traces it is a part of that, to which the options of that one apply.
+
+    Args:
+        work: The function.
+        often: Whether it is called so often that it must run fast on few rows, too.
+        settings: Those of `jax.jit`.
+    """
+    part = jax.jit(work, **settings)
+
+    @cache  # JAX must not look for its backend before a program is called
+    def program(brief: bool) -> Callable[P, T]:
+        return jax.jit(work, compiler_options=compiler_options(brief=brief), **settings)
+
+    @wraps(work)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        # Of what JAX makes of constants it says whether it traces a program here.
+        given = jax.tree.leaves((args, kwargs, jnp.zeros(())))
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in given):
+            return part(*args, **kwargs)
+        return program(not often and max(map(_rows, given)) <= _FEW)(*args, **kwargs)
+
+    return call
 
 
 @jax.jit
