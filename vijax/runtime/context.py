@@ -16,6 +16,7 @@ from jax.extend import backend
 from vijax.runtime import forks
 from vijax.runtime.cache_folder import keep_programs
 from vijax.runtime.garbage import seldom_collected
+from vijax.runtime.waiting import compilation_told
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -39,7 +40,7 @@ def door(function: Callable[P, T]) -> Callable[P, T]:
                 'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep'
             )
         keep_programs()
-        with _held(args, kwargs), seldom_collected():
+        with _held(args, kwargs), seldom_collected(), compilation_told():
             try:
                 return function(*args, **kwargs)
             except (AssertionError, RuntimeError):
