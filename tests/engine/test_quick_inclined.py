@@ -131,6 +131,53 @@ def test_contacts_that_gravity_prolongs_are_among_the_sure_ones():
     assert np.max(below_sure_contacts(cell, late, np.ones(late.side.size, bool))) < 1e-9
 
 
+# Gap, stiffness, restitution, slope, speed off the wall and phase of slow hops. Their next contact ends early, though
+# the steady response alone would keep it for ten times as long. That its forcing turns early tells it from one.
+NEARLY_LONG = [
+    (
+        0.09769151101812427,
+        8.983241475600678,
+        0.4774772566022934,
+        -0.9504588500865234,
+        0.00464474098489999,
+        0.801595990986,
+    ),
+    (0.18499865226534512, 17.887727440505305, 0.5850326532550695, 0.9448425881764022, 0.01871693440651, 1.718001376041),
+    (0.059136088117309124, 7.066155106384688, 0.5049333049239175, 0.9608683519930614, 0.00639741025976, 1.788136555970),
+    (0.12047851446010861, 7.700194743124476, 0.37310926302323405, -0.911603259236315, 0.00706358916863, 0.757377278949),
+    (
+        0.14461671539316412,
+        6.345877364379319,
+        0.22732226554070195,
+        0.740580223108932,
+        0.2443496757864018,
+        1.2840452909820,
+    ),
+    (
+        0.09382196747766709,
+        14.34812188056068,
+        0.24696775025768763,
+        -0.8758107850090455,
+        0.08954656383757936,
+        0.5228460582,
+    ),
+]
+
+
+def test_a_contact_that_gravity_nearly_prolongs_is_not_taken_for_a_long_one():
+    rng = np.random.default_rng(5)
+    d, r, t = rng.uniform(0.05, 0.3, COUNT), rng.uniform(0.05, 0.98, COUNT), rng.uniform(0, 2, COUNT)
+    kappa, speed = np.exp(rng.uniform(np.log(3.2), np.log(60), COUNT)), np.exp(rng.uniform(-7, -1.2, COUNT))
+    gamma = rng.uniform(0.2, 1.5, COUNT) * rng.choice([-1, 1], COUNT)
+    for column, some in zip((d, kappa, r, gamma, speed, t), np.transpose(NEARLY_LONG), strict=True):
+        column[: some.size] = some
+    pair, side = pairs(d, kappa, r, gamma), -np.sign(gamma)
+    hit, _, sure = fly(pair, 0.5 * side * d, -side * speed, t)
+    assert sure.mean() > 0.3
+    assert (sure & (hit.duration * kappa > 5)).mean() > 0.05
+    assert np.max(below_sure_contacts(pair, hit, sure)) < 1e-9
+
+
 @pytest.mark.parametrize("gamma", SURE)
 def test_it_is_sure_of_nearly_every_step_on_planes(gamma):
     rng = np.random.default_rng(5)
