@@ -164,12 +164,75 @@ NEARLY_LONG = [
 ]
 
 
+# Likewise, of soft walls that keep a fifteenth of the speed: the contact ends early, and one that rounds its first low
+# would end three times as late.
+NEARLY_THROUGH = [
+    (0.1806364603711412, 1.753245446030099, 0.06515900264725029, 0.2503359712573118, 0.00119832823709, 1.8480344756086),
+    (
+        0.1741111303055059,
+        1.649148763962492,
+        0.05699372768707366,
+        -0.2379354556810591,
+        0.02451526696121,
+        0.7437774940658,
+    ),
+    (
+        0.1482849772290655,
+        1.840305057433640,
+        0.07000360978359962,
+        -0.3267056297901997,
+        0.00251900292992,
+        0.7678838675564,
+    ),
+    (
+        0.1370349825961795,
+        1.694805573084724,
+        0.07641313428401897,
+        -0.2197116578437022,
+        0.00708611996220,
+        0.7664016963788,
+    ),
+    (
+        0.2359122956262592,
+        1.744218917399056,
+        0.06856935377344796,
+        -0.2574120859016283,
+        0.27017760699591,
+        0.9386880826061,
+    ),
+    (
+        0.2919486893086132,
+        1.514772938110213,
+        0.07535951967645819,
+        0.24765181935945250,
+        0.05165070101440,
+        1.6060727886461,
+    ),
+    (
+        0.1173583211072449,
+        1.534176200389585,
+        0.06838918483132826,
+        0.21239559057598150,
+        0.01171436966984,
+        1.7073110606103,
+    ),
+    (
+        0.2051868072250058,
+        1.627288021978345,
+        0.05918528492203827,
+        0.26792674408244520,
+        0.00102540081111,
+        1.7280903879169,
+    ),
+]
+
+
 def test_a_contact_that_gravity_nearly_prolongs_is_not_taken_for_a_long_one():
     rng = np.random.default_rng(5)
     d, r, t = rng.uniform(0.05, 0.3, COUNT), rng.uniform(0.05, 0.98, COUNT), rng.uniform(0, 2, COUNT)
     kappa, speed = np.exp(rng.uniform(np.log(3.2), np.log(60), COUNT)), np.exp(rng.uniform(-7, -1.2, COUNT))
     gamma = rng.uniform(0.2, 1.5, COUNT) * rng.choice([-1, 1], COUNT)
-    for column, some in zip((d, kappa, r, gamma, speed, t), np.transpose(NEARLY_LONG), strict=True):
+    for column, some in zip((d, kappa, r, gamma, speed, t), np.transpose(NEARLY_LONG + NEARLY_THROUGH), strict=True):
         column[: some.size] = some
     pair, side = pairs(d, kappa, r, gamma), -np.sign(gamma)
     hit, _, sure = fly(pair, 0.5 * side * d, -side * speed, t)
