@@ -10,9 +10,13 @@ os.environ["XLA_FLAGS"] = " ".join(
     (
         "--xla_backend_optimization_level=0",
         "--xla_cpu_use_fusion_emitters=false",
-        # The first as always (`runtime.xla`); the others walk a program again and again for what no test waits for.
-        "--xla_disable_hlo_passes=cpu-parallel-task-assigner,algsimp,simplify-while-loops,"
-        "while-loop-invariant-code-motion",
+        # Workers keep the cores busy already; cutting a program into parts to compile them side by side costs a tenth.
+        "--xla_cpu_parallel_codegen_split_count=1",
+        # The first as always (`runtime.xla`); the others walk a program again and again, to check it or to look for
+        # what ours do not contain, and no test waits for what they find.
+        "--xla_disable_hlo_passes=cpu-parallel-task-assigner,hlo-verifier,algsimp,simplify-while-loops,"
+        "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-conditional,reshape-mover,"
+        "tree_reduction_rewriter,zero_sized_hlo_elimination",
         os.environ.get("XLA_FLAGS", ""),
     )
 )
