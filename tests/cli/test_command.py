@@ -22,7 +22,8 @@ from vijax.plots import branch_diagrams, orbit_diagrams
 ROOT = SCRIPTS.parent
 DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram", "basins": "basins", "branch": "branch", "design": "design"}
 PAGES = [*DOORS, "compare"]
-PLANE = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
+# As many kappa as make the programs of `planes/test_compare`.
+PLANE = ["--d", "0.2,0.3", "--kappa", "100:400:5:log", "--periods", "40"]
 # The other pages are the same functions with the same options, as the next test holds.
 RUNS = {
     "sweep": (PLANE, "grid", PLANE),

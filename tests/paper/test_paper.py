@@ -18,7 +18,8 @@ from vijax.model.records import Status
 CLAIMS = {c["id"]: c for c in json.loads((Path(__file__).parents[1] / "data" / "claims.json").read_text())}
 TABLE_2 = Harvester()
 STARTS = [(u, v) for u in (-0.04, 0.0, 0.04) for v in (-0.6, -0.47898, -0.3, 0.3, 0.5)]
-TILE = 256
+# The smallest tile of a plane, whose programs serve here, too, where the device is named as planes name it.
+TILE = 1024
 
 
 def attractors(gaps, kappa=None, r=0.5):
@@ -41,6 +42,7 @@ def attractors(gaps, kappa=None, r=0.5):
         TABLE_2,
         outputs=frozenset({"P"}),
         count=count,
+        on=jax.devices()[0],
     )
     found = jax.tree.map(lambda leaf: np.asarray(leaf)[:count].reshape(len(gaps), len(STARTS), -1), found)
     return [row(found, i) for i in range(len(gaps))]
