@@ -26,7 +26,8 @@ def checked(function):
 def planes(vijax, np, jax):
     """Inclined and rigid maps, basins on level ground."""
     vijax.sweep(d=[0.1, 0.2], kappa=10, r=0.5, gamma=[0.05, 0.3], periods=40)
-    vijax.sweep(d=[0.1, 0.2], wall="rigid", r=0.5, periods=40, A=[1.0, 2.0], omega=3.0)
+    # With as many variants as make a program of `planes/test_compare`.
+    vijax.sweep(d=[0.1, 0.2], wall="rigid", r=0.5, periods=40, A=[1.0, 1.5, 2.0, 2.5, 3.0], omega=3.0)
     vijax.basins(d=0.2, kappa=3.0, r=0.5, u0=[0.0, 0.05], v0=[0.1, 0.3], periods=60)
 
 
@@ -46,9 +47,10 @@ def motions(vijax, np, jax):
     """Trajectories by every engine, many at once, and the derivative of one."""
     pair = vijax.impact_pair(0.2, 5.0, 0.5)
     for method in ("exact", "ode", "rk4"):
-        vijax.trajectory(pair, 0.0, 0.3, periods=3, method=method)
-    vijax.trajectory(vijax.impact_pair([0.2, 0.3], None, 0.5), np.array([0.0, 0.1]), 0.3, periods=3, t0=0.5)
-    jax.grad(lambda v: vijax.trajectory(pair, 0.0, v, periods=1).states.v[-1])(0.3)
+        vijax.trajectory(pair, 0.0, 0.3, periods=5, method=method)
+    vijax.trajectory(vijax.impact_pair([0.2, 0.3], None, 0.5), np.array([0.0, 0.1]), 0.3, periods=5, t0=0.5)
+    # `runtime/test_programs` compiles the same.
+    jax.grad(lambda v: vijax.trajectory(pair, 0.0, v, periods=5).states.u[-1])(0.3)
 
 
 def orbits(vijax, np, jax):
@@ -83,11 +85,12 @@ def main(names):
 
         import vijax.public
         from vijax.model import flow
-        from vijax.runtime import cache_folder
+        from vijax.runtime import export_cache
     with suppress(TypeCheckError):
         flow.wrap_phase(0.5)  # no array
         raise SystemExit("annotations are not checked")
-    cache_folder.kept = lambda: None
+    # All is traced here, and none of it kept; what was compiled of the same programs JAX may find on the disk.
+    export_cache._read = export_cache._write = lambda *_: None
     for name in names or KINDS:
         KINDS[name](vijax, np, jax)
 

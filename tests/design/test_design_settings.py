@@ -1,6 +1,7 @@
 """Settings of a design: each of them is read, none is taken that cannot be."""
 
 import dataclasses
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -55,6 +56,7 @@ UNIT = vijax.Harvester(A=2.460536, omega=9.218106, r=0.854762)
 DEVICE = dataclasses.replace(UNIT, s=0.073195 * UNIT.length_unit)
 
 
+@cache
 def surveyed(tune=("kappa", "r"), points=64, orbits_alone=True, **settings):
     """Where ascents begin."""
     box = optimise.check([DEVICE], tune, {"kappa": (3.0, 400.0)}, "P", ())
@@ -63,11 +65,13 @@ def surveyed(tune=("kappa", "r"), points=64, orbits_alone=True, **settings):
     return met.z.tolist(), looked[0].orbits
 
 
+@cache
 def rivalled(**settings):
     """Where ascents begin, where any motion may win."""
     return surveyed(orbits_alone=False, **settings)
 
 
+@cache
 def climbed(**settings):
     """Every point of an ascent along a curved ridge, up to a disc."""
     chosen = DesignSettings(**settings)
