@@ -125,10 +125,11 @@ def test_derivatives_and_batches_of_other_periods_compile_slices_alone():
         slope = jax.jvp(lambda v: vijax.trajectory(pair(0), 0.02, v, periods), (0.3,), (1.0,))
         return slope, jax.vmap(lambda v: vijax.trajectory(pair(0), 0.02, v, periods))(np.full(3, 0.3))
 
-    moved(5)
+    # As many periods as in the next test, whose batch is of the same program.
+    moved(40)
     with compilations() as programs:
-        moved(6)
-        moved(7)
+        moved(41)
+        moved(42)
     # What is traced can only be cut to size by JAX, which has a program for each shape.
     assert not set(programs) - {"jit(dynamic_slice)", "jit(broadcast_in_dim)"}
 
