@@ -95,7 +95,12 @@ CALLS = {
     "switching.family": lambda i, known: switching.family(known, "d", (0.1 + 0.001 * i, 0.3), points=20 + i),
     "curve": lambda i, known: motion.curve(pair(i), *impacts(5 + i)),
     "motion.states": lambda i, known: motion.states(pair(i), *impacts(5 + i), when=np.linspace(1, 3, 9 + i)),
-    "sweep": lambda i, known: vijax.sweep(d=np.linspace(0.1, 0.2, 3 + i), kappa=40.0 + i, r=0.5),
+    "sweep": lambda i, known: vijax.sweep(
+        d=np.linspace(0.1, 0.2, 3 + i),
+        kappa=40.0 + i,
+        r=0.5,
+        device=vijax.Harvester(penetration_limit=(None, 0.01, 0.02)[i]),
+    ),
     "sweep, rigid": lambda i, known: vijax.sweep(d=0.2, kappa=np.linspace(40, 50, 5 + i), r=0.5, wall="rigid"),
     "basins": lambda i, known: vijax.basins(d=0.2, kappa=40.0 + i, v0=np.linspace(-0.5, 0.5, 3 + i)),
     "basin_fractions": lambda i, known: vijax.basin_fractions(d=0.2, kappa=40.0 + i, starts=5 + i),

@@ -220,7 +220,8 @@ def summarise(
     settings = Settings(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
-        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        # Not what decides the motion, or what is admissible: a device with a limit needs no other program.
+        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), electrical(device)),
         method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
         length_variant=scale.length_variant.astype(dtype),
         speed_variant=scale.speed_variant.astype(dtype),
@@ -286,7 +287,7 @@ def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, recorde
     return Settings(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(jnp.floor(TRANSIENT_SHARE * periods), dtype),
-        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), device),
+        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), electrical(device)),
         method=None,
         length_variant=one,
         speed_variant=one,
