@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from vijax.design.ensemble import pairs
 from vijax.design.response_surface import fit, unknown
@@ -55,6 +56,18 @@ def test_no_ball_has_less_room_than_the_plane_says_and_a_share_of_them_has():
     most = fit(x, P, room[:, None], share=0.9)
     below = room < most.margins[0] + x @ most.slopes[0] - 1e-12
     assert below.mean() == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_line_below_all_balls_is_that_of_a_linear_program():
+    rng = np.random.default_rng(7)
+    for count in (9, 64):
+        x, room = rng.uniform(-0.02, 0.02, (count, 1)), rng.uniform(0, 1, count)
+        terms = np.column_stack([np.ones(count), x])
+        best = linprog(-terms.mean(axis=0), A_ub=terms, b_ub=room, bounds=[(None, None)] * 2, method="highs").x
+        found = fit(x, np.ones(count), room[:, None])
+        np.testing.assert_allclose([found.margins[0], found.slopes[0, 0]], best, rtol=1e-6, atol=1e-6)
+    level = fit(np.full((9, 1), 0.01), np.ones(9), np.arange(1.0, 10.0)[:, None])
+    assert (level.margins[0], level.slopes[0, 0]) == (1, 0)
 
 
 def test_what_is_unknown_is_worth_less_than_anything():

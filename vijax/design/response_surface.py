@@ -85,11 +85,13 @@ def fit(offsets: np.ndarray, values: np.ndarray, margins: np.ndarray, *, share: 
 
 
 def _below(x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
-    """Fit the highest plane that lies on or below so many of the points, by linear programming.
+    """Fit the highest plane that lies on or below so many of the points.
 
     All of them: its mean over the points is largest. A share: quantile regression, in which room above the plane costs
     1 - share and room below it costs share.
     """
+    if share >= 1 and x.shape[1] == 1:
+        return _line_below(x[:, 0], y)
     from scipy.optimize import linprog  # here, as importing vijax must not load it
 
     count, terms = len(y), np.column_stack([np.ones(len(y)), x])
@@ -103,3 +105,20 @@ def _below(x: np.ndarray, y: np.ndarray, share: float) -> np.ndarray:
         found = linprog(price, A_eq=parts, b_eq=y, bounds=steep + [(0, None)] * (2 * count), method="highs")
     # Where too few balls fix no slope the plane is level.
     return found.x[: terms.shape[1]] if found.success else np.append(np.quantile(y, 1 - share), np.zeros(x.shape[1]))
+
+
+def _line_below(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Fit the highest line on or below all points, by the edge of their lower hull at the mean of x.
+
+    Of all lines through a point on either side of the mean that edge is the lowest there. A linear program gives the
+    same and takes fifty times as long.
+    """
+    middle = x.mean()
+    left, right = np.flatnonzero(x <= middle), np.flatnonzero(x > middle)
+    if not right.size:
+        return np.array([y.min(), 0.0])
+    before, after = middle - x[left][:, None], x[right] - middle
+    height = (y[left][:, None] * after + y[right] * before) / (before + after)
+    i, j = np.unravel_index(height.argmin(), height.shape)
+    slope = np.clip((y[right[j]] - y[left[i]]) / (x[right[j]] - x[left[i]]), -_STEEP, _STEEP)
+    return np.array([(y - slope * x).min(), slope])
