@@ -31,7 +31,12 @@ CLIMBED = {
     "barrier_factor": (0.5, {"barrier_power": 1.0}),
     "barrier_power": (1.1, {}),
 }
-RIVALS = {"min_rival": (1.0, {}), "max_excess": (1e-6, {})}
+RIVALS = {
+    "min_rival": (1.0, {}),
+    "max_excess": (1e-6, {}),
+    "max_excess_steps": (15, {"tune": ("kappa",), "points": 256}),
+    "first_periods": (5, {}),
+}
 CHANGED = SURVEYED | CLIMBED | RIVALS | {"active_margin": (0.9, {})}
 # Changed where designs of aperiodic motion are tested.
 ELSEWHERE = (

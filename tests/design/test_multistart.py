@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vijax.design import multistart, optimise
+from vijax.design.design_settings import DesignSettings
 from vijax.design.multistart import Effort
 from vijax.model.device import Harvester
 
@@ -55,6 +56,18 @@ def test_only_the_best_of_a_kind_within_reach_climbs(reach, chosen):
     kind = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [0, 1], [0, 2], [1, 1]])
     step, score = np.array([0, 3, 4, 20, 20, 3, 3]), np.array([1.0, 3.0, 2.0, 5.0, 6.0, 0.0, 0.0])
     np.testing.assert_array_equal(multistart.highest(kind, step, score, reach), chosen)
+
+
+def test_giving_up_early_loses_no_start_that_may_win():
+    def starts(**settings):
+        box = optimise.check([BEYOND], ("kappa",), {"kappa": (2.0, 400.0)}, "P", ())
+        far = Effort(128, 2, 16, 200)._replace(settings=DesignSettings(**settings))
+        begun, unrest, _ = multistart.find([BEYOND], ("kappa",), box, "P", far, orbits_alone=False)
+        return begun.z, np.asarray(unrest.ended.periods_run).sum()
+
+    (soon, flown), (late, more) = starts(), starts(first_periods=200)
+    np.testing.assert_array_equal(soon, late)
+    assert flown < 0.8 * more
 
 
 def test_starts_of_one_device_do_not_depend_on_the_others():

@@ -15,11 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.batch.simulate import Starts
-from vijax.design import multistart
 from vijax.design.ascent import Box, Look, ascend
 from vijax.design.design_settings import DesignSettings
 from vijax.design.ensemble import AVERAGED, Ensemble, Task, alike, fly
-from vijax.design.multistart import Met
+from vijax.design.met import Met, promise
 from vijax.design.response_surface import Surface, fit, unknown
 from vijax.runtime import tiles, xla
 
@@ -97,12 +96,12 @@ def search(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
 def _begun(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
     """Choose the most promising places of every device, apart from each other."""
     settings, places = task.settings, []
-    promise = multistart.promise(unrest, task.objective)
+    hope = promise(unrest, task.objective)
     least = known + np.log(settings.min_chaos)
     for owner in np.unique(unrest.owner).tolist():
         own = np.flatnonzero(unrest.owner == owner)
         z, which = np.unique(unrest.z[own], axis=0, return_inverse=True)
-        value, lacks = _told(task, which.ravel(), np.exp(promise.value[own]), promise.lacks[own])
+        value, lacks = _told(task, which.ravel(), np.exp(hope.value[own]), hope.lacks[own])
         score = value + settings.limit_price * lacks
         score[lacks < -_FAR] = -np.inf
         reach = settings.places_apart * settings.ensemble_radius * task.unit(owner)

@@ -6,18 +6,18 @@ found, for narrow windows of periodic motion lie there -> the best of every kind
 
 import itertools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from vijax.batch.simulate import Starts
-from vijax.design.averages import LIMITS, Averages, averages
+from vijax.design.averages import LIMITS, averages
 from vijax.design.design_settings import DEFAULT, DesignSettings
+from vijax.design.met import Met, highest_promise, near_limits, promise
 from vijax.design.survey import Flown, Survey, flown, survey
-from vijax.design.variables import cells, moving, values
+from vijax.design.variables import LINEAR, cells, moving, values
 from vijax.model.device import Harvester
-from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.runtime import tiles
 
@@ -68,29 +68,6 @@ class Looked(NamedTuple):
     silent: float
 
 
-class Met(NamedTuple):
-    """Motions that were met, [motion]: what each gave, how it ended, the device there and its variables; where it was.
-
-    Attributes:
-        pair, ended: Parameters, and the `Summary`.
-        owner: Which of the devices given.
-        level, step: Of the survey's values of the other quantities together, and of the first one.
-    """
-
-    found: Averages
-    pair: ImpactPair
-    ended: Any
-    device: Harvester
-    z: np.ndarray
-    owner: np.ndarray
-    level: np.ndarray
-    step: np.ndarray
-
-    def some(self, index: np.ndarray) -> "Met":
-        """Pick those with the given indices."""
-        return jax.tree.map(lambda x: x[index], self)
-
-
 class Begun(NamedTuple):
     """Where ascents begin, [start]: an orbit as it was flown, its device and variables, which of the devices it is."""
 
@@ -139,13 +116,14 @@ def find(
         orbits_alone: Whether chaos is no answer, but a place where narrow windows may hide an orbit.
     """
     scene = _Scene(devices, tune, box, effort)
-    seen = _first_look(scene)
+    seen = _first_look(scene) if orbits_alone else _in_two_flights(scene, objective)
     met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
     if _first(tune) is not None:
-        most = _most(promise(met, objective), met.owner, len(devices))
-        if not orbits_alone:
-            most = np.maximum(most, _most(promise(unrest, objective), unrest.owner, len(devices)))
-        again = _closer(unrest, most, objective, effort, scene.cells)
+        most = highest_promise(objective, len(devices), *((met,) if orbits_alone else (met, unrest)))
+        good = promise(unrest, objective).total > most[unrest.owner] + math.log(effort.settings.min_promise)
+        # An orbit that keeps its limits may hide in chaos that is far beyond them; the best motion of all does not.
+        good &= orbits_alone | near_limits(unrest.some(good), unrest, objective, effort.settings)
+        again = _closer(unrest.some(good), effort, scene.cells)
         if again.owner.size:
             closer = _look(scene, again, 1)
             more = closer.orbits(effort.max_impacts), closer.restless(effort.max_impacts)
@@ -153,7 +131,7 @@ def find(
     looked = [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
     chosen = met.some(_promising(met, objective, len(devices), scene.points, effort.settings))
     if not orbits_alone:
-        chosen = chosen.some(_rivals(chosen, unrest, objective, len(devices), effort.settings))
+        chosen = chosen.some(_rivals(chosen, unrest, objective, scene))
     flights = flown(chosen.pair, chosen.ended, effort.max_impacts)
     return Begun(flights, chosen.device, chosen.z, chosen.owner), unrest, looked
 
@@ -174,6 +152,22 @@ def _first_look(scene: "_Scene") -> "_Seen":
     owner, level, step, _ = (x.ravel() for x in np.indices(shape))
     number = np.arange(owner.size) % scene.cells
     return _look(scene, _Places(owner, level, step / max(scene.points - 1, 1), number), 0)
+
+
+def _in_two_flights(scene: "_Scene", objective: str) -> "_Seen":
+    """Survey coarsely, where any motion may win: what has not settled soon flies on where it may be the best."""
+    effort, devices = scene.effort, len(scene.devices)
+    short = min(effort.settings.first_periods, effort.periods)
+    seen = _first_look(scene._replace(effort=effort._replace(periods=short)))
+    cells = seen.found.restless(effort.max_impacts)
+    met, unrest = seen.orbits(effort.max_impacts), seen.motions(cells)
+    hope = promise(unrest, objective)
+    most = highest_promise(objective, devices, met, unrest)
+    good = hope.total > most[unrest.owner] + math.log(effort.settings.min_rival)
+    good = near_limits(unrest.some(good), unrest, objective, effort.settings)
+    if short == effort.periods or not good.any():
+        return seen
+    return seen._replace(found=seen.found.onward(cells[good], seen.device, effort.periods))
 
 
 def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
@@ -243,17 +237,18 @@ class _Seen(NamedTuple):
 
     def orbits(self, impacts: int) -> Met:
         """Find the periodic attractors of at most so many impacts."""
-        return self._met(self.found.closing(impacts))
+        return self.motions(self.found.closing(impacts))
 
     def restless(self, impacts: int) -> Met:
         """Find what was met that is no such orbit."""
-        return self._met(self.found.restless(impacts))
+        return self.motions(self.found.restless(impacts))
 
     def every(self) -> Met:
         """Give all that was met."""
-        return self._met(np.arange(self.step.size))
+        return self.motions(np.arange(self.step.size))
 
-    def _met(self, cells: np.ndarray) -> Met:
+    def motions(self, cells: np.ndarray) -> Met:
+        """Tell what some cells met, by their indices."""
         run = (self.found.pair, self.found.ended)
         (pair, ended), device, z, places, step = jax.tree.map(lambda x: x[cells], (run, *self[1:]))
         return Met(averages(device, ended), pair, ended, device, z, places.owner, places.level, step)
@@ -280,13 +275,12 @@ def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
     return _Seen(found, every, z, places, step)
 
 
-def _closer(unrest: Met, most: np.ndarray, objective: str, effort: Effort, most_cells: int) -> _Places:
-    """Choose places about the steps where what is no orbit promises about as much as the best orbit, or more.
+def _closer(unrest: Met, effort: Effort, most_cells: int) -> _Places:
+    """Choose places about the steps of motion that is no orbit.
 
     Cells of a device, so many at most, are spread evenly over these steps, and over each of them.
     """
-    good = promise(unrest, objective).total > most[unrest.owner] + math.log(effort.settings.min_promise)
-    owner, level, step = np.unique(np.column_stack([unrest.owner, unrest.level, unrest.step])[good], axis=0).T
+    owner, level, step = np.unique(np.column_stack([unrest.owner, unrest.level, unrest.step]), axis=0).T
     places = [_Places(*np.zeros((4, 0), int))]
     for one in np.unique(owner):
         here = np.flatnonzero(owner == one)
@@ -307,7 +301,7 @@ def _promising(met: Met, objective: str, devices: int, points: int, settings: De
     left, right = _impacts(met)
     kind = np.column_stack([met.owner, met.level, met.ended.period, left, right])
     found = highest(kind, met.step, score, max(1, points // settings.max_hills))
-    enough = hope.total > _most(hope, met.owner, devices)[met.owner] + math.log(settings.min_promise)
+    enough = hope.total > highest_promise(objective, devices, met)[met.owner] + math.log(settings.min_promise)
     return found[(enough | (left + right <= settings.max_sure_impacts))[found]]
 
 
@@ -339,38 +333,25 @@ def _impacts(met: Met) -> tuple[np.ndarray, np.ndarray]:
     return np.where(swap, right, left), np.where(swap, left, right)
 
 
-class _Promise(NamedTuple):
-    """Of every motion the logarithm of the objective, and what is lacking to the worst constraint: 0 if nothing."""
-
-    value: np.ndarray
-    lacks: np.ndarray
-
-    @property
-    def total(self) -> np.ndarray:
-        """Compute what may be left where no constraint is broken any more."""
-        return self.value + self.lacks
-
-
-def promise(met: Met, objective: str) -> _Promise:
-    """Judge motions: what they gave, and what they lacked."""
-    with np.errstate(divide="ignore"):
-        value = np.log(np.nan_to_num(met.found.value(objective, met.device)))
-    return _Promise(value, np.nanmin(met.found.margins(met.device), axis=1, initial=0.0))
-
-
-def _rivals(met: Met, unrest: Met, objective: str, devices: int, settings: DesignSettings) -> np.ndarray:
+def _rivals(met: Met, unrest: Met, objective: str, scene: _Scene) -> np.ndarray:
     """Choose the attractors that may lead to the best design, where any motion may win.
 
     What promises too little, or exceeds a limit by far, never did.
     """
-    hope = promise(met, objective)
-    most = np.maximum(_most(hope, met.owner, devices), _most(promise(unrest, objective), unrest.owner, devices))
-    near = hope.lacks >= -settings.max_excess
+    devices, settings, hope = len(scene.devices), scene.effort.settings, promise(met, objective)
+    most = highest_promise(objective, devices, met, unrest)
+    near = hope.lacks >= -_excess(scene)[met.owner]
     return np.flatnonzero(near & (hope.total >= most[met.owner] + math.log(settings.min_rival)))
 
 
-def _most(hope: _Promise, owner: np.ndarray, devices: int) -> np.ndarray:
-    """Find what the best admissible attractor of every device promises; -inf where there is none."""
-    most = np.full(devices, -np.inf)
-    np.maximum.at(most, owner, np.where(hope.lacks < 0, -np.inf, hope.value))
-    return most
+def _excess(scene: _Scene) -> np.ndarray:
+    """Say by how much an orbit of every device may exceed a limit to be climbed from, as a logarithm.
+
+    Where the first quantity alone moves the ball, the survey has met the orbit nearer to where it keeps its limits.
+    """
+    first, settings = _first(scene.tune), scene.effort.settings
+    most = np.full(len(scene.devices), settings.max_excess)
+    if first is None or scene.tune[first] in LINEAR or len(_levels(scene.tune, scene.effort)) > 1:
+        return most
+    step = (scene.box[:, 1, first] - scene.box[:, 0, first]) / (scene.points - 1)
+    return np.minimum(most, settings.max_excess_steps * step)

@@ -78,6 +78,19 @@ class Survey(NamedTuple):
         going = np.isin(self.ended.status, (*_SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
         return np.flatnonzero(going & ~self._closing(impacts))
 
+    def onward(self, cells: np.ndarray, device: Harvester, periods: int) -> "Survey":
+        """Run some cells on from where they were left, for so many periods; `device` are those of all cells."""
+        pair, own, ended = jax.tree.map(lambda x: x[cells], (self.pair, device, self.ended))
+        left = ended.handover
+        again = survey(pair, own, Starts(left.u, left.v, left.t), longest=self.longest, periods=periods).ended
+
+        def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+            whole = np.array(old)
+            whole[cells] = new
+            return whole
+
+        return self._replace(ended=jax.tree.map(put, self.ended, again))
+
     def _closing(self, impacts: int) -> np.ndarray:
         """Say which cells ended on an orbit that is wanted."""
         ended, count = self.ended, self.ended.impacts_left + self.ended.impacts_right

@@ -1,0 +1,72 @@
+"""Motions that a survey met, and what they promise: the objective, and what each lacks to the limits."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from vijax.design.averages import Averages
+from vijax.design.design_settings import DesignSettings
+from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
+
+
+class Met(NamedTuple):
+    """Motions that were met, [motion]: what each gave, how it ended, the device there and its variables; where it was.
+
+    Attributes:
+        pair, ended: Parameters, and the `Summary`.
+        owner: Which of the devices given.
+        level, step: Of the survey's values of the other quantities together, and of the first one.
+    """
+
+    found: Averages
+    pair: ImpactPair
+    ended: Any
+    device: Harvester
+    z: np.ndarray
+    owner: np.ndarray
+    level: np.ndarray
+    step: np.ndarray
+
+    def some(self, index: np.ndarray) -> "Met":
+        """Pick those with the given indices."""
+        return jax.tree.map(lambda x: x[index], self)
+
+
+class Promise(NamedTuple):
+    """Of every motion the logarithm of the objective, and what is lacking to the worst constraint: 0 if nothing."""
+
+    value: np.ndarray
+    lacks: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """Compute what may be left where no constraint is broken any more."""
+        return self.value + self.lacks
+
+
+def promise(met: Met, objective: str) -> Promise:
+    """Judge motions: what they gave, and what they lacked."""
+    with np.errstate(divide="ignore"):
+        value = np.log(np.nan_to_num(met.found.value(objective, met.device)))
+    return Promise(value, np.nanmin(met.found.margins(met.device), axis=1, initial=0.0))
+
+
+def highest_promise(objective: str, devices: int, *met: Met) -> np.ndarray:
+    """Find what the best motion of every device promises that breaks no limit; -inf where there is none."""
+    most = np.full(devices, -np.inf)
+    for some in met:
+        hope = promise(some, objective)
+        np.maximum.at(most, some.owner, np.where(hope.lacks < 0, -np.inf, hope.value))
+    return most
+
+
+def near_limits(met: Met, where: Met, objective: str, settings: DesignSettings) -> np.ndarray:
+    """Say which motions are at a step, or beside one, where one of some exceeds no limit by far."""
+    good = met.some(promise(met, objective).lacks >= -settings.max_excess)
+    shape = [1 + int(x.max(initial=0)) for x in (where.owner, where.level)]
+    near = np.zeros((*shape, 3 + int(where.step.max(initial=0))), bool)
+    for beside in range(3):
+        near[good.owner, good.level, good.step + beside] = True
+    return near[where.owner, where.level, where.step + 1]
