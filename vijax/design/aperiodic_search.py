@@ -18,7 +18,7 @@ from vijax.batch.simulate import Starts
 from vijax.design.ascent import Box, Look, ascend
 from vijax.design.design_settings import DesignSettings
 from vijax.design.ensemble import AVERAGED, Ensemble, Task, alike, fly
-from vijax.design.met import Met, promise
+from vijax.design.promise import Met, promise
 from vijax.design.response_surface import Surface, fit, unknown
 from vijax.runtime import tiles, xla
 

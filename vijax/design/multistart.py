@@ -14,7 +14,7 @@ import numpy as np
 from vijax.batch.simulate import Starts
 from vijax.design.averages import LIMITS, averages
 from vijax.design.design_settings import DEFAULT, DesignSettings
-from vijax.design.met import Met, highest_promise, near_limits, promise
+from vijax.design.promise import Met, highest_promise, near_limits, promise
 from vijax.design.survey import Flown, Survey, flown, survey
 from vijax.design.variables import LINEAR, cells, moving, values
 from vijax.model.device import Harvester
@@ -353,5 +353,5 @@ def _excess(scene: _Scene) -> np.ndarray:
     most = np.full(len(scene.devices), settings.max_excess)
     if first is None or scene.tune[first] in LINEAR or len(_levels(scene.tune, scene.effort)) > 1:
         return most
-    step = (scene.box[:, 1, first] - scene.box[:, 0, first]) / (scene.points - 1)
+    step = (scene.box[:, 1, first] - scene.box[:, 0, first]) / max(scene.points - 1, 1)
     return np.minimum(most, settings.max_excess_steps * step)

@@ -21,10 +21,10 @@ from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
 from vijax.design.design_settings import DEFAULT, DesignSettings, check_settings
 from vijax.design.ensemble import Task
-from vijax.design.met import Met
 from vijax.design.multistart import Begun, Effort, Looked, every_start, find
 from vijax.design.objective import OBJECTIVES, Batch, Scene
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, End, Optimum, verified
+from vijax.design.promise import Met
 from vijax.design.tolerance import Nodes, Spread, Tolerance, check_samples, check_tolerances, nodes
 from vijax.design.variables import NAMES, check_names, limits, values, variables
 from vijax.model.choices import Motion, Objective
