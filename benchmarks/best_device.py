@@ -10,6 +10,7 @@ the peer in time, are 256 x 4 x 400, 64 x 4 x 2,000 about each of the three best
 
 import argparse
 import math
+import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -32,6 +33,7 @@ SEED = 28
 KAPPA = (3.0, 400.0)
 SEARCH: dict[str, Any] = {"tune": ("kappa",), "bounds": {"kappa": KAPPA}}
 WANTED = ("P", "admissible", "period", "max_penetration", "status")
+_ROUNDS = 3  # of each in turn, where times are compared
 SAME_DEPTH = 0.02  # aperiodic cells of one device whose depths differ by less, as logarithms, are one attractor
 FLOWN = 16, 20_000  # balls and periods that an answer is flown again
 # The first two devices of which designs once missed the chaos, and what a dense scan says of them.
@@ -193,17 +195,29 @@ def cost(count: int) -> None:
     """Measure the seconds a device of many in one call, beside the nested sweeps."""
     devices = [device(number) for number in range(count)]
     optimise_all(devices, **SEARCH)
-    some = devices[: max(count // 10, 5)]
+    # What nested sweeps cost depends on the device: one of ten, from first to last, stands for all.
+    some = devices[:: max(min(10, count // 5), 1)]
     nested(some[0])
-    begun = time.perf_counter()
-    optimise_all(devices, **SEARCH)
-    own = (time.perf_counter() - begun) / count
-    begun = time.perf_counter()
-    for of in some:
-        nested(of)
-    peer = (time.perf_counter() - begun) / len(some)
+    took = [(_seconds([partial(optimise_all, devices, **SEARCH)]) / count, _sweeps(some)) for _ in range(_ROUNDS)]
+    own, peer = (statistics.median(column) for column in zip(*took, strict=True))
+    ratios = sorted(own / peer for own, peer in took)
     say(f"cost: seconds a device, {count} in one call; of nested sweeps", f"{own:.3f}; {peer:.3f}")
-    say("cost: part of the nested sweeps' (at most 0.5)", f"{own / peer:.2f}")
+    say(
+        "cost: part of the nested sweeps' (at most 0.5), median; least, largest",
+        f"{statistics.median(ratios):.2f}; {ratios[0]:.2f}, {ratios[-1]:.2f}",
+    )
+
+
+def _sweeps(some: list[Harvester]) -> float:
+    """Time nested sweeps: seconds a device."""
+    return _seconds([partial(nested, of) for of in some]) / len(some)
+
+
+def _seconds(calls: list[Callable[[], Any]]) -> float:
+    begun = time.perf_counter()
+    for call in calls:
+        call()
+    return time.perf_counter() - begun
 
 
 PARTS: dict[str, Callable[[int], None]] = {"two": two, "scan": scan, "orbits": orbits, "cost": cost}

@@ -10,7 +10,6 @@ import dataclasses
 from functools import lru_cache, partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,7 +19,8 @@ from vijax.design.design_settings import DesignSettings
 from vijax.design.ensemble import AVERAGED, Ensemble, Task, alike, fly
 from vijax.design.promise import Met, promise
 from vijax.design.response_surface import Surface, fit, unknown
-from vijax.runtime import tiles, xla
+from vijax.runtime import tiles
+from vijax.runtime.xla import jitted
 
 _FITS = (16, 128)  # surfaces that are climbed in one compiled call
 _LOOKS = 60  # evaluations of a surface, which cost next to nothing
@@ -225,7 +225,7 @@ def _compiled(settings: DesignSettings):
         look, box = partial(_look, centre, surface), Box(low, high, settings.max_step)
         return ascend(look, jnp.clip(centre, low, high), centre, box, _LOOKS, settings).z
 
-    return jax.jit(climb, compiler_options=xla.compiler_options())
+    return jitted(climb, often=True)
 
 
 def _look(centre, surface: Any, z, near, memory) -> Look:

@@ -27,6 +27,7 @@ from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import present
 from vijax.runtime.context import door
 from vijax.runtime.lattice import lattice
+from vijax.runtime.xla import jitted
 
 _LEAST_BALLS = 32  # fewer give no standard error that could be trusted
 _MOST_BALLS = 2**20
@@ -222,7 +223,7 @@ def _fly(at: _Inputs, design: _Design, periods: int, width: float) -> _Flown:
     return _gathered(reach, x, ended, steps, count)
 
 
-@jax.jit
+@jitted
 def _spread(at: _Inputs, width: Float[Array, ""], offsets: Float[Array, "ball 4"]):
     """Spread balls: offsets and pairs; units of length, electrical constants and the steps between them [variant]."""
     pair, moved = at.pair, width * offsets
@@ -247,7 +248,7 @@ def _electrical_and_mass(device: Harvester) -> list[Any]:
     return [getattr(device, name) for name in (*_ELECTRICAL, "m_b")]
 
 
-@jax.jit
+@jitted
 def _gathered(width, x, ended: Summary, steps, count) -> _Flown:
     there = jnp.arange(x.shape[0], dtype=count.dtype) < count
     found, errors = present(ended.P), present(ended.P_stderr)
@@ -301,7 +302,7 @@ def _fit(x: Float[Array, "ball 4"], y: Float[Array, "ball column"], some: Bool[A
     return _Fit(found, added * jnp.sqrt(count / left), rest, left)
 
 
-@partial(jax.jit, static_argnames="second")
+@partial(jitted, static_argnames="second")
 def _concluded(device: Harvester, at: _Inputs, flown: _Flown, second: bool) -> Average:
     """Make the record of an ensemble."""
     fit = _fit(flown.x, jnp.column_stack([flown.P, flown.fixed]), flown.real, second)

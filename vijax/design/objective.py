@@ -16,6 +16,7 @@ from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.orbits import shooting, steady
 from vijax.orbits.shooting import Sequence
+from vijax.runtime.xla import jitted
 
 OBJECTIVES: dict[Objective, str] = {
     "P": "energy harvested per half forcing period [J]",
@@ -158,7 +159,7 @@ def look(scene: Scene, batch: Batch, z, near, known: Known) -> Look:
     )
 
 
-@jax.jit
+@jitted
 def spread(scene: Scene, batch: Batch) -> tuple[Array, ...]:
     """Compute mean and worst value of designs over tolerances, shares of those lost and inadmissible; see `Spread`."""
     knots, residual = _orbits(scene, batch, batch.z, batch.z, begin(scene, batch))

@@ -31,8 +31,9 @@ from vijax.model.choices import Motion, Objective
 from vijax.model.device import Harvester, one_device
 from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
-from vijax.runtime import checks, context, tiles, xla
+from vijax.runtime import checks, context, tiles
 from vijax.runtime.context import door
+from vijax.runtime.xla import jitted
 
 OVER_TOLERANCES = ("mean", "worst")
 _LOG = logging.getLogger(__name__)
@@ -316,7 +317,7 @@ def _compiled(max_evaluations: int, settings: DesignSettings):
         look = partial(aims.look, scene, batch)
         return ascend(look, batch.z, aims.begin(scene, batch), box, max_evaluations, settings)
 
-    return jax.jit(climb, compiler_options=xla.compiler_options())
+    return jitted(climb, often=True)
 
 
 def _climbed(scene: Scene, starts: Begun, box: np.ndarray, max_evaluations: int, settings: DesignSettings) -> list[End]:

@@ -6,7 +6,6 @@ kept.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -23,8 +22,9 @@ from vijax.model.records import Status
 from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.steady import Steady, steady
-from vijax.runtime import tiles, xla
+from vijax.runtime import tiles
 from vijax.runtime.context import door
+from vijax.runtime.xla import jitted
 
 _FEW = (16, 256)  # optima of one compiled call
 
@@ -201,9 +201,7 @@ def apart(good: list[int], ends: list[End], owner: np.ndarray, same: float) -> I
         yield kept
 
 
-@lru_cache(maxsize=1)
-def _compiled_states():
-    return jax.jit(jax.vmap(steady), compiler_options=xla.compiler_options())
+_steady_states = jitted(jax.vmap(steady))
 
 
 @door
@@ -211,7 +209,7 @@ def states(devices: list[Harvester], orbit: Orbit) -> list[Steady]:
     """Find the steady state of every device on its known orbit, in padded tiles."""
     given, found = jax.tree.map(lambda *x: np.array(x), *devices), []
     for tile in tiles.tiles(len(orbit), _FEW):
-        some = _compiled_states()(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
+        some = _steady_states(jax.tree.map(lambda x, rows=tile.rows: x[rows], given), orbit[tile.rows])
         some = jax.tree.map(np.asarray, some)
         found += [jax.tree.map(lambda x, row=row: x[row], some) for row in range(tile.real)]
     return found

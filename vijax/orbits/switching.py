@@ -15,8 +15,12 @@ from vijax.orbits.parameter import check_bounds, tilts
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks
 from vijax.runtime.context import door
+from vijax.runtime.xla import jitted
 
 MOST_SWITCHES = 64  # So many switches in a row at most: each may find several branches from every one before.
+
+
+_linearised = jitted(shooting.linearise)
 
 
 @door
@@ -56,7 +60,7 @@ def switch(
     arcs, y = set_out(doubled, along, within, device, settings)
     knots = y[0, :-1].reshape(-1, 3)
     pair, sequence = jax.tree.map(lambda x: x[0], (doubled.pair, doubled.sequence))
-    slope = np.asarray(jax.jit(shooting.linearise)(pair, sequence, knots).slope)
+    slope = np.asarray(_linearised(pair, sequence, knots).slope)
     away = np.append(np.linalg.svd(slope)[2][-1], 0.0)[None]
     # Test functions that vanish here would be met again at once.
     first = Place(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
