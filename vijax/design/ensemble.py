@@ -124,7 +124,7 @@ def fly(
 
 def _cells(device: Harvester, z: np.ndarray, names: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
     """Make devices with tuned quantities, and their pairs, as NumPy's arrays."""
-    found = tiles.map_tiles(lambda rows: cells(*rows, names=names), (device, z), _TILES)
+    found = tiles.map_tiles(lambda rows: cells(rows[0], rows[1], names), (device, z), _TILES)
     return jax.tree.map(np.asarray, found)
 
 

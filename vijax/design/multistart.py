@@ -266,7 +266,7 @@ def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
     low, high = box[places.owner].swapaxes(0, 1)
     z = low + parts * (high - low)
     given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
-    every, pair = tiles.map_tiles(lambda rows: cells(*rows, names=tune), (given, z), _TILES)
+    every, pair = tiles.map_tiles(lambda rows: cells(rows[0], rows[1], tune), (given, z), _TILES)
     draw = np.random.default_rng(seed).uniform(-1, 1, (2, scene.cells))
     u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
     starts = Starts(u0 * pair.d, v0, np.zeros_like(v0))
