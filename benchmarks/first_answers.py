@@ -69,8 +69,10 @@ def answer(code: str, folder: Path, tree: Path = HERE.parent) -> Answer:
     # What this process was told of JAX is not what a user's process is told.
     told = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XLA_"))}
     told |= {"XDG_CACHE_HOME": str(folder), "PYTHONPATH": str(tree)}
+    command = [sys.executable, "-c", code]
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True, check=False)
+    # Python looks for a module where it is started, before it looks anywhere else.
+    done = subprocess.run(command, cwd=tree, env=told, capture_output=True, text=True, check=False)
     clock, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode:
         raise RuntimeError(f"a question must have an answer; got\n{done.stderr}")
