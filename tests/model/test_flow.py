@@ -148,3 +148,12 @@ def test_flight_and_rigid_matrices():
     assert np.linalg.det(flow.flight_matrix(jnp.asarray(0.3))) == 1
     matrix = flow.rigid_matrix(jnp.asarray(0.4), jnp.asarray(0.7), jnp.asarray(-1e-6))
     assert np.linalg.det(matrix) == pytest.approx(0.16, rel=1e-12)
+
+
+def test_a_short_contact_in_which_gravity_balances_the_forcing_keeps_its_digits():
+    c, less, s = 0.7, 2.0**-40, 3.7e-8
+    wall = flow.membrane(ImpactPair(*(jnp.asarray(x) for x in (0.3, 2.0, 1.0, 0.0))))
+    force = flow.Force(*(jnp.asarray(x) for x in (c, 0.0, c - less)))
+    w, _ = flow.oscillate(wall, force, jnp.zeros(()), jnp.zeros(()), jnp.asarray(s))
+    # Undamped from rest: the Taylor polynomial up to s^4, whose next term is smaller than its rounding.
+    assert float(w) == pytest.approx(0.5 * less * s**2 - (np.pi**2 * c + 4.0 * less) * s**4 / 24, rel=1e-14, abs=0.0)

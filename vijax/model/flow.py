@@ -163,9 +163,10 @@ def _contact_series(m: Membrane, force: Force, w0: Values, z0: Values, s: Values
         w, z = w + over[n] * b, z + over[n - 1] * b
         return w, z, after, next_drive - loss * after - stiffness * b, next_drive, turn * drive
 
-    # The first two terms feel gravity and the first displacement, which are no part of what recurs.
+    # The first two terms feel gravity and the first displacement, which are no part of what recurs. Where gravity all
+    # but balances the forcing their difference is what counts: it must be made before anything is rounded.
     first, drive, next_drive = z0, s * force.c, -(PI * s) * (s * force.q)
-    second = drive - s * force.g - loss * first - (m.kappa * m.kappa * s) * w0
+    second = s * (force.c - force.g - m.mu * z0 - m.kappa * m.kappa * w0)
     start = (jnp.zeros_like(second), jnp.zeros_like(second), first + jnp.zeros_like(second), second, drive, next_drive)
     if m.rolled:
         w, z, *_ = lax.fori_loop(1, _CONTACT_TERMS + 1, add, start)
