@@ -143,7 +143,7 @@ def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Traj
     return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
 
 
-exact_traced = jitted(exact_run, static_argnames="room")
+exact_traced = jax.jit(exact_run, static_argnames="room")
 
 
 def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:

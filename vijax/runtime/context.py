@@ -16,7 +16,7 @@ from jax.extend import backend
 from vijax.runtime import forks
 from vijax.runtime.cache_folder import keep_programs
 from vijax.runtime.garbage import seldom_collected
-from vijax.runtime.waiting import compilation_told
+from vijax.runtime.waiting import tell_of_compilation
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -40,7 +40,8 @@ def door(function: Callable[P, T]) -> Callable[P, T]:
                 'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep'
             )
         keep_programs()
-        with _held(args, kwargs), seldom_collected(), compilation_told():
+        tell_of_compilation()
+        with _held(args, kwargs), seldom_collected():
             try:
                 return function(*args, **kwargs)
             except (AssertionError, RuntimeError):

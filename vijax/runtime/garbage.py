@@ -17,6 +17,11 @@ _inside = 0
 _before = gc.get_threshold()
 
 
+def public_function_runs() -> bool:
+    """Say whether one does, in any thread."""
+    return _inside > 0
+
+
 @contextmanager
 def seldom_collected() -> Iterator[None]:
     """Let the collector look seldom; as the program around has it again once the last thread is out."""

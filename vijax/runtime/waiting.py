@@ -3,11 +3,11 @@
 import logging
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 
 import jax
+
+from vijax.runtime.garbage import public_function_runs
 
 PATIENCE = 2.0  # seconds after which a wait is worth a line
 # What JAX says of itself as it begins to compile a program, and when it has compiled it.
@@ -16,34 +16,19 @@ _LINE = "vijax: compiling, which takes seconds the first time; it is kept for th
 
 _lock = threading.Lock()
 _own = threading.local()
-_inside = 0
 _said = False
 
 
-@contextmanager
-def compilation_told() -> Iterator[None]:
-    """Say within that a program is compiled, where that takes long, stderr is a terminal, and no bar says so."""
-    global _inside
-    _listen()
-    with _lock:
-        _inside += 1
-    try:
-        yield
-    finally:
-        with _lock:
-            _inside -= 1
-
-
 @cache
-def _listen() -> None:
-    """Hear from JAX when it compiles, if anybody would read of it."""
+def tell_of_compilation() -> None:
+    """Say so from now on where a public function waits long, stderr is a terminal, and no bar says it."""
     if sys.stderr is not None and sys.stderr.isatty():
         jax.monitoring.register_event_listener(_begin)
         jax.monitoring.register_event_duration_secs_listener(_end)
 
 
 def _begin(event: str, **_: object) -> None:
-    if event == _BEGINS and _inside and not _said:
+    if event == _BEGINS and public_function_runs() and not _said:
         _own.timer = threading.Timer(PATIENCE, _say)
         _own.timer.daemon = True
         _own.timer.start()
