@@ -14,9 +14,10 @@ import jax, vijax
 from vijax.runtime import waiting
 jax.config.update("jax_compilation_cache_dir", sys.argv[2])
 waiting.PATIENCE = float(sys.argv[1])
+pair = vijax.impact_pair(0.3, None, 0.5)
 jax.jit(lambda x: x + 1)(1.0)
 print("vijax", file=sys.stderr)
-vijax.trajectory(vijax.impact_pair(0.3, None, 0.5), 0.0, 0.3, periods=1)
+vijax.trajectory(pair, 0.0, 0.3, periods=1)
 """
 
 
