@@ -244,8 +244,8 @@ def test_both_scalings_are_one_motion():
             begin,
             begin + span,
             1e-3,
-            dense_output.Point(x, z),
-            ode.Spell(pair.gamma, jnp.int32(mode), wall),
+            dense_output.SolverState(x, z),
+            ode.FieldArguments(pair.gamma, jnp.int32(mode), wall),
             stepsize_controller=control,
         ).ys
         speed = per_length / per_time
@@ -255,7 +255,7 @@ def test_both_scalings_are_one_motion():
             begin / per_time,
             (begin + span) / per_time,
             1e-3,
-            dense_output.Point(u / per_length, v / speed),
+            dense_output.SolverState(u / per_length, v / speed),
             (second, jnp.int32(mode)),
             stepsize_controller=control,
         ).ys

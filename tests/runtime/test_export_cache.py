@@ -46,7 +46,7 @@ def folder(tmp_path, monkeypatch):
 def called(name="wave", x=X):
     """The result of a fresh program, as a new process would make it, and how often that traced."""
     work = Work()
-    program = export_cache.Program(work, name)
+    program = export_cache.TracedProgram(work, name)
     given = {"x": x, "y": jnp.asarray(3.0, x.dtype)}
     first = np.asarray(program(given))
     np.testing.assert_array_equal(program(given), first)
@@ -80,10 +80,10 @@ def test_programs_of_somebody_elses_records_are_traced_every_time(folder):
     """What the record does may have changed since."""
     for _ in range(2):
         work = Work()
-        export_cache.Program(lambda x, theirs, work=work: work({"x": x, "y": theirs.y}), "wave")(X, Theirs(X))
+        export_cache.TracedProgram(lambda x, theirs, work=work: work({"x": x, "y": theirs.y}), "wave")(X, Theirs(X))
         assert work.traced == 1
     assert not folder.exists()
-    export_cache.Program(lambda x, ours: ours.u * x, "wave")(X, State(X, X, X, X, X))
+    export_cache.TracedProgram(lambda x, ours: ours.u * x, "wave")(X, State(X, X, X, X, X))
     assert len(list(folder.iterdir())) == 1
 
 
@@ -97,7 +97,9 @@ def test_a_program_without_kernels_is_another_one(folder, monkeypatch):
 @pytest.mark.parametrize("kept", [True, False])
 def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
     monkeypatch.setattr(cache_folder, "kept", lambda: tmp_path if kept else None)
-    program = export_cache.Program(lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop")
+    program = export_cache.TracedProgram(
+        lambda x: jax.lax.fori_loop(0, 3, lambda _, y: jnp.sin(y) + jnp.cos(y), x), "loop"
+    )
     compiled, ready = [], threading.Barrier(4)
 
     def count(event, *_, fun_name="", **__):

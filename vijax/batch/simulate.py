@@ -117,14 +117,14 @@ def program(plan: Plan, settings: Settings) -> lanes.Program:
 
 
 @lru_cache(maxsize=32)
-def compiled(plan: Plan, width: int) -> export_cache.Program:
+def compiled(plan: Plan, width: int) -> export_cache.TracedProgram:
     """Compile the program of a plan: a whole tile of cells in one call."""
 
     def tile(cells, count, settings):
         outputs = rows.width(shapes(plan, cells.dtype))
         return lanes.run(program(plan, settings), cells, count, outputs, width)
 
-    return export_cache.Program(tile, f"{tile.__qualname__} {plan} {width}")
+    return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width}")
 
 
 def width_of(cells: int) -> int:
@@ -326,7 +326,7 @@ def _start(plan: Plan, table: Float[AnyArray, "lane in"], u: Lane, v: Lane, t: L
 
 
 @lru_cache(maxsize=32)
-def _compiled_chains(plan: Plan) -> export_cache.Program:
+def _compiled_chains(plan: Plan) -> export_cache.TracedProgram:
     """Compile the program of chains: all their links in one call."""
 
     def follow(links, starts, count, length, settings):
@@ -336,7 +336,7 @@ def _compiled_chains(plan: Plan) -> export_cache.Program:
         outputs = rows.width(shapes(plan, links.dtype))
         return lanes.chain(program(plan, settings), succeed, links, count, length, outputs)
 
-    return export_cache.Program(follow, f"{follow.__qualname__} {plan}")
+    return export_cache.TracedProgram(follow, f"{follow.__qualname__} {plan}")
 
 
 @door

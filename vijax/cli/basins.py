@@ -19,7 +19,7 @@ from vijax.planes.sweep_settings import SPEED, START_POINTS, SweepSettings
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.planes.dataset import Plan
+    from vijax.planes.dataset import SweepPlan
 
 _CELL = {"d": "0.2", "kappa": "3"}
 _FILES = ("basins.zarr", "basins.png")
@@ -68,7 +68,7 @@ def _plan(
     seed: int | None,
     merge_mirrors: bool,
     given: dict[str, Any],
-) -> "Plan":
+) -> "SweepPlan":
     from vijax.planes.basins import plan_basins, plan_fractions
 
     settings = SweepSettings(**given)
@@ -82,14 +82,14 @@ def _plan(
     return plan_basins(axes, device, settings, merge_mirrors=merge_mirrors)
 
 
-def _agree(planned: "Plan", yes: bool) -> None:
+def _agree(planned: "SweepPlan", yes: bool) -> None:
     from vijax.planes import estimate, sweep
 
     sweep.check_room(planned)
     process.agree(estimate.of(planned), yes)
 
 
-def _check_picture(path: Path, planned: "Plan") -> None:
+def _check_picture(path: Path, planned: "SweepPlan") -> None:
     from vijax.plots.style import check_format, layout_of_kinds
 
     check_format(path)

@@ -31,7 +31,7 @@ _PARTS = (1 / 2, 1 / 4, 3 / 4, 1 / 8, 3 / 8, 5 / 8, 7 / 8)
 
 
 @dataclass(frozen=True)
-class Asked:
+class BranchRequest:
     """Branches that are asked for.
 
     Attributes:
@@ -90,7 +90,7 @@ def branches(
 
 def _asked(
     constants: tuple[str, ...], along: str, impacts: str, guesses: int, max_switches: int, wall: str, **given: Any
-) -> Asked:
+) -> BranchRequest:
     from vijax.orbits import orbit_search, parameter, switching
     from vijax.runtime import checks
 
@@ -105,7 +105,7 @@ def _asked(
     with about("along"):
         parameter.check_along(pair, name, within)
     places = list(_places(float(parameter.value_at(pair, name, made)), name, within, chosen))
-    return Asked(pair, made, impacts, guesses, max_switches, name, within, places)
+    return BranchRequest(pair, made, impacts, guesses, max_switches, name, within, places)
 
 
 def _check_picture(path: Path | None, quantity: str) -> None:
@@ -139,7 +139,7 @@ def _places(own: float, name: str, within: tuple[float, float], chosen: bool) ->
         yield from (low + part * (high - low) for part in _PARTS)
 
 
-def _found(asked: Asked) -> "Orbit":
+def _found(asked: BranchRequest) -> "Orbit":
     """Search for orbits, and take those at the first place that has any."""
     from vijax.orbits import orbit_search, parameter
 

@@ -32,7 +32,7 @@ _STAGES = 3  # ascent, diagram, surroundings; along an axis the first and the la
 
 
 @dataclass(frozen=True)
-class Asked:
+class DesignRequest:
     """Designs that are asked for.
 
     Attributes:
@@ -90,7 +90,7 @@ def _asked(
     diagram_points: int,
     basin_starts: int,
     **given: Any,
-) -> Asked:
+) -> DesignRequest:
     from vijax.design import optimise
     from vijax.planes.basins import MOST_STARTS
     from vijax.runtime import checks
@@ -107,17 +107,17 @@ def _asked(
     search |= {"survey_points": survey_points, "starts": starts, "max_impacts": max_impacts}
     points = checks.whole("diagram_points", diagram_points, 2, _MOST_POINTS)
     balls = checks.whole("basin_starts", basin_starts, 1, MOST_STARTS)
-    return Asked(devices, along, scatter, points, balls, search)
+    return DesignRequest(devices, along, scatter, points, balls, search)
 
 
-def _agree(asked: Asked, yes: bool) -> None:
+def _agree(asked: DesignRequest, yes: bool) -> None:
     from vijax.design import optimise
 
     effort = optimise.effort(*(asked.search[name] for name in ("survey_points", "starts", "max_impacts")))
     process.agree(optimise.expected(len(asked.devices), effort), yes)
 
 
-def _run(asked: Asked) -> "tuple[dict[str, Any], xr.Dataset | None, str]":
+def _run(asked: DesignRequest) -> "tuple[dict[str, Any], xr.Dataset | None, str]":
     """Find the designs; give the report, the diagram along the first tuned axis, and how long the ascents took."""
     from vijax.design import optimise, report
 
@@ -233,7 +233,7 @@ def _diagram(found: "Design", device: "Harvester", points: int) -> "xr.Dataset":
     return orbit_diagram(along=along, values=values, direction="both", device=device)
 
 
-def _judged(found: "Design", asked: Asked, alone: bool) -> dict[str, Any]:
+def _judged(found: "Design", asked: DesignRequest, alone: bool) -> dict[str, Any]:
     """Find what becomes of the best design over the tolerances; what lies around it, where it is the only one."""
     from vijax.design.off_design import arrival, extents
     from vijax.design.optimise import under

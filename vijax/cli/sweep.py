@@ -19,7 +19,7 @@ from vijax.model.choices import SolverName
 if TYPE_CHECKING:
     import xarray as xr
 
-    from vijax.planes.dataset import Plan
+    from vijax.planes.dataset import SweepPlan
 
 PLANE = {"d": "0.05:0.3:128", "kappa": "3:400:128:log"}
 _LONG = 9  # From this period on cells are counted together.
@@ -56,7 +56,7 @@ def power_map(
     finish(dataset, f"{pace}\n{_summary(dataset)}", out, plot, partial(_draw, show), overwrite, kept=True)
 
 
-def _crew(planned: "Plan", workers: int | None, scheduler: str | None, out: Path | None) -> int | str | None:
+def _crew(planned: "SweepPlan", workers: int | None, scheduler: str | None, out: Path | None) -> int | str | None:
     """Say who runs the tiles, unless this process does."""
     from vijax.planes.sweep import check_workers
 
@@ -68,7 +68,7 @@ def _crew(planned: "Plan", workers: int | None, scheduler: str | None, out: Path
     return crew
 
 
-def _check_room(planned: "Plan", out: Path | None, overwrite: bool) -> None:
+def _check_room(planned: "SweepPlan", out: Path | None, overwrite: bool) -> None:
     from vijax.planes import sweep as sweeps
 
     if out is None:
@@ -77,7 +77,7 @@ def _check_room(planned: "Plan", out: Path | None, overwrite: bool) -> None:
         sweeps.check(planned, out, overwrite)
 
 
-def _agree(planned: "Plan", yes: bool) -> None:
+def _agree(planned: "SweepPlan", yes: bool) -> None:
     from vijax.planes import estimate
 
     process.agree(estimate.of(planned), yes)
@@ -101,7 +101,7 @@ def _wanted(outputs: str | None, show: str) -> list[str] | None:
     return [name for name in OUTPUTS if name not in ON_REQUEST or name == shown]
 
 
-def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: dict[str, Any]) -> "Plan":
+def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: dict[str, Any]) -> "SweepPlan":
     from vijax.planes.sweep import plan
     from vijax.planes.sweep_settings import SweepSettings
 
@@ -125,7 +125,7 @@ def _membrane(name: str | None, chi: float | None, exponent: float | None) -> An
     return None if name is None else Linear()
 
 
-def _check_picture(path: Path, planned: "Plan", show: str) -> None:
+def _check_picture(path: Path, planned: "SweepPlan", show: str) -> None:
     from vijax.planes.dataset import specimen
     from vijax.plots import style
 

@@ -109,7 +109,7 @@ class _Inputs(NamedTuple):
     device: Harvester
 
 
-class _Flown(NamedTuple):
+class _FlownBalls(NamedTuple):
     """An ensemble: where its balls were, and what they gave.
 
     Attributes:
@@ -212,7 +212,7 @@ def _design(balls: int, seed: int | None) -> _Design:
     return _Design(np.stack([some, -some], axis=1).reshape(balls, 4), np.repeat(2 * start - 1, 2, axis=0))
 
 
-def _fly(at: _Inputs, design: _Design, periods: int, width: float) -> _Flown:
+def _fly(at: _Inputs, design: _Design, periods: int, width: float) -> _FlownBalls:
     """Fly the ensemble about a device."""
     balls = len(design.offsets)
     offsets, square = (jnp.asarray(np.resize(x, (tiles.padded(balls), x.shape[1]))) for x in design)
@@ -249,7 +249,7 @@ def _electrical_and_mass(device: Harvester) -> list[Any]:
 
 
 @jitted
-def _gathered(width, x, ended: Summary, steps, count) -> _Flown:
+def _gathered(width, x, ended: Summary, steps, count) -> _FlownBalls:
     there = jnp.arange(x.shape[0], dtype=count.dtype) < count
     found, errors = present(ended.P), present(ended.P_stderr)
     real = there & jnp.isfinite(found[:, 0])
@@ -257,7 +257,7 @@ def _gathered(width, x, ended: Summary, steps, count) -> _Flown:
     real = jnp.repeat(real.reshape(-1, 2).all(axis=1), 2)
     P, P_stderr = (jnp.where(real[:, None], y, 0.0) for y in (found, errors))
     fixed = (P[:, 1:] - P[:, :1]) / steps
-    return _Flown(width, x, real, (there & ~real).any(), P[:, 0], P_stderr[:, 0], fixed, real & (ended.period > 0))
+    return _FlownBalls(width, x, real, (there & ~real).any(), P[:, 0], P_stderr[:, 0], fixed, real & (ended.period > 0))
 
 
 # --- the fit ----------------------------------------------------------------------------------------------------------
@@ -303,7 +303,7 @@ def _fit(x: Float[Array, "ball 4"], y: Float[Array, "ball column"], some: Bool[A
 
 
 @partial(jitted, static_argnames="second")
-def _concluded(device: Harvester, at: _Inputs, flown: _Flown, second: bool) -> Average:
+def _concluded(device: Harvester, at: _Inputs, flown: _FlownBalls, second: bool) -> Average:
     """Make the record of an ensemble."""
     fit = _fit(flown.x, jnp.column_stack([flown.P, flown.fixed]), flown.real, second)
     value = fit.found[0, 0]
@@ -338,7 +338,7 @@ def _concluded(device: Harvester, at: _Inputs, flown: _Flown, second: bool) -> A
     )
 
 
-def _verdict(flown: _Flown, fit: _Fit, second: bool) -> Int[Array, ""]:
+def _verdict(flown: _FlownBalls, fit: _Fit, second: bool) -> Int[Array, ""]:
     """Judge whether the averages of all balls lie on one smooth surface."""
     value, periodic = fit.found[0, 0], _share(flown)
     within = (flown.P_stderr**2).sum() / flown.real.sum(dtype=value.dtype)
@@ -358,7 +358,7 @@ def _verdict(flown: _Flown, fit: _Fit, second: bool) -> Int[Array, ""]:
     return jnp.select(list(doubts.values()), codes, jnp.asarray(Smoothness.SMOOTH, jnp.int32))
 
 
-def _share(flown: _Flown) -> Float[Array, ""]:
+def _share(flown: _FlownBalls) -> Float[Array, ""]:
     """Count the share of the balls that ended on orbits."""
     return flown.periodic.sum(dtype=flown.P.dtype) / flown.real.sum(dtype=flown.P.dtype)
 

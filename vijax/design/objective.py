@@ -59,7 +59,7 @@ class Scene(eqx.Module):
         return eqx.tree_at(lambda d: [getattr(d, n) for n in off], tuned, list(off.values())) if off else tuned
 
 
-class _Seen(NamedTuple):
+class _SeenOrbit(NamedTuple):
     """Of one device: logarithm of the objective and of the margins, and the knots."""
 
     value: Float[Array, ""]
@@ -76,7 +76,7 @@ def _measure(scene: Scene, device: Harvester, sequence: Sequence, factors, knots
     deep = jnp.log(own.depth_limit / jnp.where(real, there.depth, one))
     rich = jnp.log(jnp.where(real, there.work, one) / jnp.where(real, there.energy, one))
     margins = jnp.concatenate([jnp.where(real, x, _MOST) for x in (deep, rich)])
-    seen = _Seen(jnp.log(value), jnp.minimum(margins, _MOST), there.knots)
+    seen = _SeenOrbit(jnp.log(value), jnp.minimum(margins, _MOST), there.knots)
     return seen, (seen, there.status)
 
 

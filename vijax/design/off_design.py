@@ -60,7 +60,7 @@ class Extent(NamedTuple):
         return min(self.below.percent, self.above.percent)
 
 
-class Arrival(NamedTuple):
+class ArrivalStatistics(NamedTuple):
     """How balls that start anywhere arrive at the motion: the share that do, and after how many forcing periods.
 
     Attributes:
@@ -140,7 +140,7 @@ def _go_on(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...], going: l
 
 
 @door
-def arrival(optimum: Optimum | AperiodicOptimum) -> Arrival:
+def arrival(optimum: Optimum | AperiodicOptimum) -> ArrivalStatistics:
     """Find how many of the balls that start anywhere arrive at the motion of a design, and when."""
     checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     balls, periods = _ARRIVING
@@ -153,7 +153,7 @@ def arrival(optimum: Optimum | AperiodicOptimum) -> Arrival:
         when = (float(np.median(ran)), float(np.quantile(ran, 0.9))) if ran.size else (math.nan, math.nan)
     else:
         when = (math.nan, math.nan)
-    return Arrival(float(there.mean()), *when, periods)
+    return ArrivalStatistics(float(there.mean()), *when, periods)
 
 
 def scattered(optimum: AperiodicOptimum, tolerances: tuple[Tolerance, ...], samples: int | None) -> Spread:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vijax.design.objective import OBJECTIVES
-from vijax.design.off_design import Arrival, Extent
+from vijax.design.off_design import ArrivalStatistics, Extent
 from vijax.design.optimise import Design
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.robustness import Surroundings
@@ -32,7 +32,7 @@ def describe(
     *,
     surroundings: Surroundings | None = None,
     extents: Sequence[Extent] = (),
-    arrival: Arrival | None = None,
+    arrival: ArrivalStatistics | None = None,
     diagram: "xr.Dataset | None" = None,
     tolerances: Sequence[Tolerance] = (),
     spread: Spread | None = None,

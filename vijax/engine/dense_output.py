@@ -9,7 +9,7 @@ from vijax.runtime.xla import share
 _ROUNDS = 5  # a root takes so many; a crossing that they miss is located again, on a shorter step
 
 
-class Point(eqx.Module):
+class SolverState(eqx.Module):
     """A state of the solver: u and u' in flight, w and w' in contact; where asked for, the work and the tangent map."""
 
     x: Scalar
@@ -48,7 +48,7 @@ class Dense(eqx.Module):
         return 6 * self.c3 + s * (24 * self.c4 + s * (60 * self.c5))
 
 
-def dense_output(h: Scalar, y0: Point, f0: Point, y1: Point, f1: Point) -> Dense:
+def dense_output(h: Scalar, y0: SolverState, f0: SolverState, y1: SolverState, f1: SolverState) -> Dense:
     """Make the dense output of a step of length h from the states at its ends and their derivatives."""
     z, a = y0.z * h, f0.z * h * h
     rise, gain, change = y1.x - y0.x - z - 0.5 * a, y1.z * h - z - a, f1.z * h * h - a

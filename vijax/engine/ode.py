@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from vijax.engine.dense_output import Dense, Point, dense_output, root
+from vijax.engine.dense_output import Dense, SolverState, dense_output, root
 from vijax.engine.method import ImpactOutcome, Method, decided
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
@@ -37,7 +37,7 @@ _CREST = 2.0  # an aim that is no wall: the deepest point of a contact
 _VANISHING = 4  # roundings: a shorter step does not advance time
 
 
-class Spell(eqx.Module):
+class FieldArguments(eqx.Module):
     """What a smooth spell of the motion depends on: the wall it is at, and its side (0: flight)."""
 
     gamma: Scalar
@@ -45,7 +45,7 @@ class Spell(eqx.Module):
     wall: Wall
 
 
-def _field(t: Any, y: Point, spell: Spell) -> Point:
+def _field(t: Any, y: SolverState, spell: FieldArguments) -> SolverState:
     held = spell.mode != 0
     force = jnp.where(spell.mode < 0, -1.0, 1.0) * (jnp.cos(PI * t) - spell.gamma)
     pull = jnp.where(held, spell.wall(y.x, y.z), 0.0)
@@ -56,28 +56,28 @@ def _field(t: Any, y: Point, spell: Spell) -> Point:
         a, b, c, d = y.tangent
         rows = [jax.jvp(spell.wall, (y.x, y.z), column)[1] for column in ((a, c), (b, d))]
         tangent = (c, d, *(jnp.where(held, row, 0.0) for row in rows))
-    return Point(y.z, force + pull, work, tangent)
+    return SolverState(y.z, force + pull, work, tangent)
 
 
 equation_38 = diffrax.ODETerm(_field)
-"""Eq. (38) in one spell: x'' = side (cos(pi t) - gamma) + membrane(w, w'), for `Point` and `Spell`."""
+"""Eq. (38) in one spell: x'' = side (cos(pi t) - gamma) + membrane(w, w'), for `SolverState` and `FieldArguments`."""
 
 
-def _field_39(t: Any, y: Point, args: tuple[MembranePair, Int[Array, ""]]) -> Point:
+def _field_39(t: Any, y: SolverState, args: tuple[MembranePair, Int[Array, ""]]) -> SolverState:
     pair, mode = args
     side = jnp.sign(mode).astype(y.x.dtype)
     pull = jnp.where(mode == 0, 0.0, y.x - 0.5 * side + pair.c_star * y.z)
-    return Point(y.z, pair.A_star * jnp.cos(pair.omega_star * t) - pair.g_star - pull)
+    return SolverState(y.z, pair.A_star * jnp.cos(pair.omega_star * t) - pair.g_star - pull)
 
 
 equation_39 = diffrax.ODETerm(_field_39)
-"""Eq. (39), lengths in units of s and times in units of 1/omega0: for `Point` (x, x') and (`MembranePair`, mode)."""
+"""Eq. (39), lengths in units of s, times in units of 1/omega0: for `SolverState` (x, x') and (`MembranePair`, mode)."""
 
 
-class Motion(eqx.Module):
+class OdeCarry(eqx.Module):
     """The carry of a lane: where the ball is, the step it will try, and what its contact has seen so far."""
 
-    y: Point
+    y: SolverState
     t: Scalar
     n: Int[Array, ""]
     mode: Int[Array, ""]
@@ -97,7 +97,7 @@ class Motion(eqx.Module):
     steps: Int[Array, ""]
 
 
-class Ode(Method[Motion]):
+class Ode(Method[OdeCarry]):
     """An adaptive Runge-Kutta method of diffrax with located events.
 
     Attributes:
@@ -121,11 +121,11 @@ class Ode(Method[Motion]):
         """Say how far apart two motions from one point may end: steps of other lengths, each as wrong as is allowed."""
         return self.rtol
 
-    def taken(self, m: Motion) -> Int[Array, ""]:
+    def taken(self, m: OdeCarry) -> Int[Array, ""]:
         """Count the steps so far, those that were refused among them."""
         return m.steps
 
-    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
+    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> OdeCarry:
         """Make the carry of a start."""
         zero, whole = jnp.zeros_like(state.u), jnp.zeros_like(state.n)
         side = state.mode.astype(zero.dtype)
@@ -136,8 +136,8 @@ class Ode(Method[Motion]):
         else:
             first = inside = zero + self.dt
         no = jnp.zeros_like(held)
-        return Motion(
-            y=Point(
+        return OdeCarry(
+            y=SolverState(
                 x,
                 jnp.where(held, side * state.v, state.v),
                 zero if deep else None,
@@ -163,11 +163,11 @@ class Ode(Method[Motion]):
         )
 
     def step(
-        self, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
-    ) -> tuple[Motion, ImpactOutcome, Flag]:
+        self, pair: ImpactPair, wall: Wall, m: OdeCarry, *, recorded: bool = False
+    ) -> tuple[OdeCarry, ImpactOutcome, Flag]:
         """Try one step of the solver; one that vanishes beside the time, or is not finite, makes an impact of NaN."""
         half, held = 0.5 * pair.d, m.mode != 0
-        trial = _try(self, _solver(self, recorded), m, Spell(pair.gamma, m.mode, wall), recorded)
+        trial = _try(self, _solver(self, recorded), m, FieldArguments(pair.gamma, m.mode, wall), recorded)
         landing = _land(m, half, trial)
         sight = _look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
         landing, sight = share((landing, sight))
@@ -190,7 +190,7 @@ class Ode(Method[Motion]):
             y = eqx.tree_at(lambda y: y.tangent, y, fresh)
         h, full, other = decided(_lengths(self, m, trial, sight, seen, moved, shut))
         depth = jnp.where(landing.crest, jnp.maximum(m.depth, y.x), m.depth)
-        new = Motion(
+        new = OdeCarry(
             y=jax.tree.map(lambda new, old: jnp.where(moved, new, old), y, m.y),
             t=t,
             n=n,
@@ -212,7 +212,7 @@ class Ode(Method[Motion]):
         )
         return new, outcome, (landing.exits & m.entered) | lost
 
-    def ball(self, pair: ImpactPair, m: Motion) -> State:
+    def ball(self, pair: ImpactPair, m: OdeCarry) -> State:
         """Say where the ball of a carry is."""
         side = m.mode.astype(m.y.x.dtype)
         held = m.mode != 0
@@ -229,7 +229,7 @@ def _solver(engine: Ode, recorded: bool) -> Solver:
     return solver(scan_kind=kind)
 
 
-def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: Point, y1: Point, error: Point):
+def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: SolverState, y1: SolverState, error: SolverState):
     """Say whether a step is accepted, and how long the next is; the error of position and velocity alone decides."""
     if engine.dt is not None:
         return jnp.ones_like(t0, bool), jnp.full_like(t0, engine.dt)
@@ -249,14 +249,14 @@ class _Trial(eqx.Module):
 
     h: Scalar
     t: Scalar
-    y: Point
-    f: Point
+    y: SolverState
+    f: SolverState
     passes: Flag
     h_next: Scalar
     dense: Dense
 
 
-def _try(engine: Ode, solver: Solver, m: Motion, spell: Spell, recorded: bool) -> _Trial:
+def _try(engine: Ode, solver: Solver, m: OdeCarry, spell: FieldArguments, recorded: bool) -> _Trial:
     """Try one step of the solver, at most to the end of the period if it is recorded."""
     h = jnp.minimum(lax.stop_gradient(m.h), _LONGEST)
     t = m.t + h
@@ -325,7 +325,7 @@ class _Landing(eqx.Module):
     speed: Scalar  # towards the wall at an onset, away from it at an exit
 
 
-def _land(m: Motion, half: Scalar, trial: _Trial) -> _Landing:
+def _land(m: OdeCarry, half: Scalar, trial: _Trial) -> _Landing:
     """Close the gap that the repeated step leaves, to second order: aim (x + z s + push s^2/2) = wall.
 
     The root is -2 gap/(speed + sqrt(speed^2 - 2 push gap)), and the speed there is that square root. A ball that turns
@@ -352,7 +352,7 @@ def _ratio(change: Scalar, speed: Scalar) -> Scalar:
     return jnp.where(moving, change / jnp.where(moving, speed, 1.0), 0.0)
 
 
-def _meet(m: Motion, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, landing: _Landing) -> Point:
+def _meet(m: OdeCarry, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, landing: _Landing) -> SolverState:
     """Find the state at the event that a step has met (at its end, if none), in coordinates of the spell after it."""
     onset, exits, crest, delay, speed = landing.onset, landing.exits, landing.crest, landing.delay, landing.speed
     y = jax.tree.map(lambda value, slope: value + delay * slope, trial.y, trial.f)
@@ -366,10 +366,10 @@ def _meet(m: Motion, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, land
         jump = jnp.where(onset, _ratio(wall(zero, speed), speed), 0.0)
         jump = jnp.where(exits, _ratio(wall(zero, -speed), speed), jump)
         tangent = (a, b, c + jump * a, d + jump * b)
-    return Point(x, z, None if y.work is None else jnp.where(onset, 0.0, y.work), tangent)
+    return SolverState(x, z, None if y.work is None else jnp.where(onset, 0.0, y.work), tangent)
 
 
-def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, moved: Flag, shut: Flag):
+def _lengths(engine: Ode, m: OdeCarry, trial: _Trial, sight: _Sight, seen: Flag, moved: Flag, shut: Flag):
     """Say how long the next step is, the one to go on with after a cut one, and the one after the next change of mode.
 
     A change of mode changes the scale of time: each mode goes on with the length that it had.
@@ -382,7 +382,7 @@ def _lengths(engine: Ode, m: Motion, trial: _Trial, sight: _Sight, seen: Flag, m
 
 
 def _outcome(
-    m: Motion, half: Scalar, side: Scalar, y: Point, t: Scalar, n: Int[Array, ""], speed: Scalar
+    m: OdeCarry, half: Scalar, side: Scalar, y: SolverState, t: Scalar, n: Int[Array, ""], speed: Scalar
 ) -> ImpactOutcome:
     """Record the impact that ends at (t, n) with the ball leaving at a speed."""
     zero, v_out = jnp.zeros_like(half), -side * speed

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool
 
 from vijax.engine.impact import Lane
 from vijax.engine.polynomial import long_decay, phase
-from vijax.engine.quick_course import Course, Motion, at_reference, in_reach, motion
+from vijax.engine.quick_course import ContactCourse, ContactState, at_reference, in_reach, motion
 from vijax.engine.quick_flight import Flight
 from vijax.engine.quick_wall import DEEP_REACH, DOUBT, LONG_REACH, SoftWall
 from vijax.engine.roots import converged_step, householder, single
@@ -22,10 +22,10 @@ from vijax.runtime.xla import share, shared
 _EXIT_ROUNDS, _CREST_ROUNDS = 2, 2
 
 
-def _course(entry: "_Entry", cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> Course:
+def _course(entry: "_Entry", cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> ContactCourse:
     """Rotate the contact to a reference time of given cos and sin of pi s; `free` is its free part there."""
     steady_cos, steady_sin, force_cos, force_sin = entry.parts
-    return Course(
+    return ContactCourse(
         steady_cos * cosine + steady_sin * sine,
         steady_sin * cosine - steady_cos * sine,
         force_cos * cosine - force_sin * sine,
@@ -63,7 +63,7 @@ class _Entry(eqx.Module):
     pressure: Lane | None  # Gravity presses the ball into the wall by this much; None on level ground.
     rest: Lane | None  # The membrane's steady response to that pressure.
 
-    def penetration(self, at: Motion) -> Lane:
+    def penetration(self, at: ContactState) -> Lane:
         """All of w."""
         return at.w if self.rest is None else at.w + self.rest
 
@@ -158,11 +158,11 @@ def _lasts(wall: SoftWall, entry: _Entry, when: Lane) -> Bool[Array, "lane"]:
 
 
 @shared
-def _long_course(wall: SoftWall, entry: _Entry, when: Lane, cosine: Lane, sine: Lane) -> Course:
+def _long_course(wall: SoftWall, entry: _Entry, when: Lane, cosine: Lane, sine: Lane) -> ContactCourse:
     """Rotate the contact to where its steady response ends, with cos and sin of omega1 s there."""
     ebb = present(wall.ebb)
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
-    return Course(
+    return ContactCourse(
         -present(entry.rest), ebb.rate * (-1 / PI), ebb.force_cos, ebb.force_sin, *free, long_decay(wall.zeta * when)
     )
 
@@ -230,7 +230,9 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
 
 
 @shared
-def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: Course) -> tuple[Lane, Bool[Array, "lane"]]:
+def _rough_exit(
+    wall: SoftWall, entry: _Entry, guess: _Guess, course: ContactCourse
+) -> tuple[Lane, Bool[Array, "lane"]]:
     """Find the exit from the course's reference in single precision, and whether the polynomials held on the way."""
     free = at_reference(wall, course)
     near = guess.hop - 0.5 * wall.span
@@ -244,14 +246,14 @@ def _rough_exit(wall: SoftWall, entry: _Entry, guess: _Guess, course: Course) ->
 
 
 @shared
-def _crest_course(wall: SoftWall, entry: _Entry) -> Course:
+def _crest_course(wall: SoftWall, entry: _Entry) -> ContactCourse:
     """Rotate the contact to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
     cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
     return _course(entry, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
 
 
-def _snap(wall: SoftWall, at: Motion) -> Lane:
+def _snap(wall: SoftWall, at: ContactState) -> Lane:
     """Compute the fourth derivative of w."""
     return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
 

@@ -11,7 +11,7 @@ from vijax.model.flow import PI
 from vijax.runtime.xla import once
 
 
-class Motion(eqx.Module):
+class ContactState(eqx.Module):
     """Penetration w and its derivatives at one time of the contact, with the parts they were made of.
 
     What gravity adds to w, its steady response, is not in `w` (see `_Entry.penetration`): it changes no derivative,
@@ -29,7 +29,7 @@ class Motion(eqx.Module):
     decay: Lane
 
 
-class Course(eqx.Module):
+class ContactCourse(eqx.Module):
     """A contact as seen from one reference time: steady part, forcing and free part rotated to it."""
 
     steady_cos: Lane
@@ -42,7 +42,7 @@ class Course(eqx.Module):
 
 
 @once
-def motion(wall: SoftWall, course: Course, s: Lane) -> Motion:
+def motion(wall: SoftWall, course: ContactCourse, s: Lane) -> ContactState:
     """Compute the contact at time s from the course's reference."""
     sine, cosine = sine_cosine(wall.omega1 * s)
     drive_sine, drive_cosine = sine_cosine(PI * s)
@@ -58,13 +58,13 @@ def motion(wall: SoftWall, course: Course, s: Lane) -> Motion:
     return _derivatives(wall, w, rate, force, drive, sine, cosine, decay)
 
 
-def _derivatives(wall: SoftWall, w, rate, force, drive, sine, cosine, decay) -> Motion:
+def _derivatives(wall: SoftWall, w, rate, force, drive, sine, cosine, decay) -> ContactState:
     push = force - 2 * wall.zeta * rate - wall.kappa * wall.kappa * w
     jerk = drive - 2 * wall.zeta * push - wall.kappa * wall.kappa * rate
-    return Motion(w, rate, force, push, jerk, drive, sine, cosine, decay)
+    return ContactState(w, rate, force, push, jerk, drive, sine, cosine, decay)
 
 
-def at_reference(wall: SoftWall, course: Course) -> Motion:
+def at_reference(wall: SoftWall, course: ContactCourse) -> ContactState:
     """Give the contact at the course's reference: no sine and no exponential is needed there."""
     one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
     w = course.steady_cos + course.decay * course.free_cos

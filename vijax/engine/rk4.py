@@ -31,7 +31,7 @@ from vijax.runtime.xla import share
 _ON_GRID = 1e-6  # a start that is so small a part of a step before a sample counts as at it
 
 
-class Motion(eqx.Module):
+class Rk4Carry(eqx.Module):
     """The carry of a lane: the last sample, and what its contact and the way since the last exit have seen."""
 
     u: Scalar
@@ -51,7 +51,7 @@ class Motion(eqx.Module):
     tangent: tuple[Scalar, ...] | None  # row by row
 
 
-class Rk4(Method[Motion]):
+class Rk4(Method[Rk4Carry]):
     """The paper's method: classical Runge-Kutta steps of constant length, no event located.
 
     Attributes:
@@ -69,7 +69,7 @@ class Rk4(Method[Motion]):
         """Say how many steps a recorded run takes."""
         return int(self.steps) * (periods + HELD)
 
-    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Motion:
+    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> Rk4Carry:
         """Make the carry of a start; its phase is sample 0 if it lies on none of the grid of steps.
 
         Depth and work cost nothing here. Tangent maps are those of the numerical scheme, which has no saltation.
@@ -77,7 +77,7 @@ class Rk4(Method[Motion]):
         zero = jnp.zeros_like(state.u)
         h = 2 / self.steps
         k = jnp.floor(state.t / h + _ON_GRID)
-        return Motion(
+        return Rk4Carry(
             u=state.u,
             v=state.v,
             k=k,
@@ -96,8 +96,8 @@ class Rk4(Method[Motion]):
         )
 
     def step(
-        self, pair: ImpactPair, wall: Wall, m: Motion, *, recorded: bool = False
-    ) -> tuple[Motion, ImpactOutcome, Bool[Array, ""]]:
+        self, pair: ImpactPair, wall: Wall, m: Rk4Carry, *, recorded: bool = False
+    ) -> tuple[Rk4Carry, ImpactOutcome, Bool[Array, ""]]:
         """Take one step, and see what its sample shows; one at phase 0 and derivatives in reverse cost nothing."""
         h = 2 / self.steps
         new = _moved(self.steps, pair, wall, m)
@@ -127,12 +127,12 @@ class Rk4(Method[Motion]):
         )
         return new, outcome, leaves & m.entered
 
-    def ball(self, pair: ImpactPair, m: Motion) -> State:
+    def ball(self, pair: ImpactPair, m: Rk4Carry) -> State:
         """Say where the last sample is."""
         return State(m.u, m.v, m.offset + m.k * (2 / self.steps), m.n, m.mode)
 
 
-def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Motion) -> Motion:
+def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Rk4Carry) -> Rk4Carry:
     """Compute the next sample and the tangent map up to it; what the contact has seen is still that of the last one."""
     h = 2 / steps
     move = partial(_runge_kutta, pair, wall, m.offset + m.k * h, h)
@@ -172,7 +172,7 @@ def _power(pair: ImpactPair, wall: Wall, u: Scalar, v: Scalar) -> Scalar:
     return jnp.where(depth >= 0, -wall(depth, along) * along, 0.0)
 
 
-def _outcome(m: Motion, side: Int[Array, ""], t: Scalar) -> ImpactOutcome:
+def _outcome(m: Rk4Carry, side: Int[Array, ""], t: Scalar) -> ImpactOutcome:
     """Record the impact on a wall that ends with this sample, the first one outside, at a time t."""
     impact = Impact(
         n=m.onset_n,

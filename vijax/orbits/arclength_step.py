@@ -73,7 +73,7 @@ def unpack(arc: Arc, y):
     return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (arc.high - arc.low)
 
 
-def _equations(arc: Arc, y) -> shooting.Linear:
+def _equations(arc: Arc, y) -> shooting.LinearisedEquations:
     """Compute the gap and its derivatives in knots and parameter."""
     knots, x = unpack(arc, y)
     pair, moved = jax.jvp(arc.at, (x,), (arc.high - arc.low,))
@@ -126,7 +126,7 @@ def _tests(arc: Arc, y, tangent) -> Tests:
     )
 
 
-class Place(NamedTuple):
+class BranchPlace(NamedTuple):
     """Points of branches, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
 
     And how Newton came there: the size of its last correction, and how many it took.
@@ -143,12 +143,12 @@ class Place(NamedTuple):
 def _compiled(arcs: Arc, y, tangent, length):
     def one(arc, y, tangent, length):
         at = _correct(arc, y + length * tangent, tangent)
-        return Place(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.corrections)
+        return BranchPlace(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.corrections)
 
     return jax.vmap(one)(arcs, y, tangent, length)
 
 
-def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> Place:
+def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
     """Go on from points of branches by an arclength each: the compiled program behind every step and every search."""
     parts = []
     for tile in tiles.tiles(y.shape[0], _BATCHES):

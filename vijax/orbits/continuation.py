@@ -11,7 +11,7 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import periodic
-from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, Place, Tests, advance
+from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point, events, happenings, kind_of, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
@@ -127,14 +127,14 @@ def set_out(
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 
-def heading(place: Place, sign: float) -> Place:
+def heading(place: BranchPlace, sign: float) -> BranchPlace:
     """Turn the place the other way where the sign is negative; the fold's test function turns with it."""
     tests = place.tests.copy()
     tests[:, FOLD] *= sign
     return place._replace(tangent=sign * place.tangent, tests=tests)
 
 
-def follow_arcs(arcs: Arc, first: Place, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
+def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
     """Follow one way from every start: all lanes together until none goes on; a step that does not do is halved."""
     lanes, bend = first.y.shape[0], 1 - settings.min_cosine
     passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]

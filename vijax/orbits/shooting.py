@@ -47,14 +47,14 @@ class Sequence(eqx.Module):
         return self.side != 0
 
 
-class Linear(NamedTuple):
+class LinearisedEquations(NamedTuple):
     """The equations at a guess: what is missing, and how it changes with every knot (and a parameter, last)."""
 
     gap: Float[Array, "3*impact"]
     slope: Float[Array, "3*impact unknown"]
 
 
-class _Contact(NamedTuple):
+class _ContactEnd(NamedTuple):
     """The end of a contact: penetration there over the contact's length, and w'; each in onset, speed and length."""
 
     place: Float[Array, ""]
@@ -63,7 +63,7 @@ class _Contact(NamedTuple):
     rate_slope: Float[Array, "3"]
 
 
-def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
+def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _ContactEnd:
     """Compute a contact and its derivatives: all follow from the free response and the forcing at both ends.
 
     An onset moved at the same length moves the whole motion, less the free motion of what the state at the onset gains.
@@ -72,7 +72,7 @@ def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
     t, speed, stay, _, _ = knot
     zero, one = jnp.zeros_like(t), jnp.ones_like(t)
     if pair.rigid:
-        return _Contact(stay, -pair.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -pair.r, zero]))
+        return _ContactEnd(stay, -pair.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -pair.r, zero]))
     wall, force = flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t)
     w, rate = flow.oscillate(wall, force, zero, speed, stay)
     h, slope = flow.free_response(wall, stay)
@@ -80,7 +80,7 @@ def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _Contact:
     push = force.at(stay) - wall.mu * rate - square * w
     onset = rate - slope * speed - h * begin
     rate_onset = push + square * h * speed - slope * (begin - wall.mu * speed)
-    return _Contact(
+    return _ContactEnd(
         w / stay,
         rate,
         jnp.stack([onset, h, rate - w / stay]) / stay,
@@ -140,7 +140,9 @@ def gap(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "3*i
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
 
-def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactPair | None = None) -> Linear:
+def linearise(
+    pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactPair | None = None
+) -> LinearisedEquations:
     """Compute the equations and their derivatives in the knots, block by block: each involves two neighbours only.
 
     Args:
@@ -167,7 +169,7 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactP
     if moved is not None:
         change = jnp.where(real[:, None], change, 0.0)
         slope = jnp.concatenate([slope, change.reshape(-1, 1)], axis=1)
-    return Linear(missing, slope)
+    return LinearisedEquations(missing, slope)
 
 
 class Departure(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 
 from vijax.model.device import Harvester, one_device
 from vijax.orbits import orbit_properties, shooting, symmetry
-from vijax.orbits.arclength_step import Place, Tests
+from vijax.orbits.arclength_step import BranchPlace, Tests
 from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, heading, set_out
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
@@ -63,7 +63,7 @@ def switch(
     slope = np.asarray(_linearised(pair, sequence, knots).slope)
     away = np.append(np.linalg.svd(slope)[2][-1], 0.0)[None]
     # Test functions that vanish here would be met again at once.
-    first = Place(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
+    first = BranchPlace(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
     return [follow_arcs(arcs, heading(first, sign), along, points, settings)[0] for sign in (1.0, -1.0)]
 
 

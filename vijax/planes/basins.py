@@ -18,7 +18,7 @@ from vijax.model.records import Status
 from vijax.model.units import Given
 from vijax.planes import sweep
 from vijax.planes.axes import Parameters, cells, check_axis
-from vijax.planes.dataset import DEFAULT, Plan
+from vijax.planes.dataset import DEFAULT, SweepPlan
 from vijax.planes.sweep_settings import SPEED, START_POINTS, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -106,7 +106,7 @@ def plan_basins(
     settings: SweepSettings = DEFAULT,
     *,
     merge_mirrors: bool = False,
-) -> Plan:
+) -> SweepPlan:
     """Check what `basins` is asked for and lay out its cells; runs nothing.
 
     Args:
@@ -171,7 +171,7 @@ def plan_fractions(
     speed: float = SPEED,
     seed: int | None = None,
     merge_mirrors: bool = False,
-) -> Plan:
+) -> SweepPlan:
     """Check what `basin_fractions` is asked for and lay out its cells; runs nothing.
 
     Args:
@@ -192,7 +192,7 @@ def plan_fractions(
     return started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
 
 
-def _plan(axes: Mapping[str, Any], device: Harvester | None, settings: SweepSettings, merge_mirrors: bool) -> Plan:
+def _plan(axes: Mapping[str, Any], device: Harvester | None, settings: SweepSettings, merge_mirrors: bool) -> SweepPlan:
     checks.flag("merge_mirrors", merge_mirrors)
     settings.only("basins", "periods", "wall")
     planned = sweep.plan(axes, _OUTPUTS, device, settings)
@@ -217,13 +217,13 @@ def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
     return xr.Variable("start", first), xr.Variable("start", second)
 
 
-def check_starts(planned: Plan, starts: int) -> None:
+def check_starts(planned: SweepPlan, starts: int) -> None:
     """Raise ValueError unless a plan's cells fit in memory with so many starts each."""
     names = ["starts", *(dim for dim, size in planned.cells.sizes.items() if size > 1)]
     checks.fits(names, starts * planned.size, f"{planned.count:,} cells of {starts:,} starts")
 
 
-def started(planned: Plan, u0: "xr.Variable", v0: "xr.Variable") -> Plan:
+def started(planned: SweepPlan, u0: "xr.Variable", v0: "xr.Variable") -> SweepPlan:
     """Give the cells of a plan one more dimension, `start`, on which their starts depend."""
     of = planned.cells
     laid = replace(

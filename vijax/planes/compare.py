@@ -18,7 +18,7 @@ from vijax.model.quantities import synonyms
 from vijax.model.records import Status
 from vijax.planes import sweep
 from vijax.planes.axes import Axes
-from vijax.planes.dataset import DEFAULT, Plan
+from vijax.planes.dataset import DEFAULT, SweepPlan
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -53,8 +53,8 @@ class Model(enum.IntEnum):
 class Comparison:
     """A comparison that has passed the door: both sweeps, and the tolerance if one was given."""
 
-    soft: Plan
-    rigid: Plan
+    soft: SweepPlan
+    rigid: SweepPlan
     tolerance: float | None
 
     @property

@@ -33,7 +33,7 @@ DEFAULT = SweepSettings()
 
 
 @dataclass(frozen=True)
-class Plan:
+class SweepPlan:
     """A sweep that has passed the door.
 
     Attributes:
@@ -70,19 +70,19 @@ class Plan:
         """Name the fields of `Summary` that the outputs are made of."""
         return frozenset(need for name in self.outputs for need in OUTPUTS[name].needs)
 
-    def cut(self, block: Mapping[str, slice]) -> "Plan":
+    def cut(self, block: Mapping[str, slice]) -> "SweepPlan":
         """Plan a block of the cells alone."""
         return replace(self, cells=self.cells.cut(block))
 
 
-def label(planned: Plan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
+def label(planned: SweepPlan, fields_found: dict[str, np.ndarray]) -> "xr.Dataset":
     """Make the map of the fields of `Summary`, each [cells] or [cells, variants] in the flat order of the plan."""
     import xarray as xr  # here, as importing vijax must not load it
 
     return xr.Dataset(variables(planned, fields_found), coords=coordinates(planned.cells), attrs=provenance(planned))
 
 
-def variables(planned: Plan, fields_found: dict[str, np.ndarray]) -> "dict[str, xr.Variable]":
+def variables(planned: SweepPlan, fields_found: dict[str, np.ndarray]) -> "dict[str, xr.Variable]":
     """Make the variables of `label`, without what is the same for every tile of a plane."""
     import xarray as xr
 
@@ -95,7 +95,7 @@ def variables(planned: Plan, fields_found: dict[str, np.ndarray]) -> "dict[str, 
     return named | {"status": flagged(named["status"])}
 
 
-def specimen(planned: Plan) -> "xr.Dataset":
+def specimen(planned: SweepPlan) -> "xr.Dataset":
     """Make the map of the first cell alone, its numbers void: what kind of variables there will be."""
     first = planned.cut({dim: slice(1) for dim in planned.cells.dynamic})
     variants = math.prod(planned.cells.sizes[dim] for dim in planned.cells.variant)
@@ -132,7 +132,7 @@ def warn_if_held(dataset: "xr.Dataset") -> None:
         warnings.warn(f"gravity holds the ball: gamma = {span}, permanent contact everywhere; {advice}", stacklevel=2)
 
 
-def _variable(name: str, found: Found, planned: Plan) -> "xr.Variable":
+def _variable(name: str, found: Found, planned: SweepPlan) -> "xr.Variable":
     output = OUTPUTS[name]
     values = output.formula(found, planned.cells, planned.device) if output.formula else found[output.needs[0]]
     values = values.transpose(*(dim for dim in planned.cells.sizes if dim in values.dims))
@@ -151,7 +151,7 @@ def coordinates(of: Cells) -> "dict[str, xr.Variable]":
     return found
 
 
-def provenance(planned: Plan, **further: Any) -> dict[str, Any]:
+def provenance(planned: SweepPlan, **further: Any) -> dict[str, Any]:
     """Tell how a map was made: versions, commit, machine, `further` facts, and all that was asked."""
     return {
         "title": "Energy harvested by a vibro-impact pair",
@@ -176,7 +176,7 @@ def made_by() -> dict[str, str]:
     }
 
 
-def asked(planned: Plan) -> dict[str, Any]:
+def asked(planned: SweepPlan) -> dict[str, Any]:
     """Tell what a map holds besides its coordinates: settings, outputs, constants, tolerances."""
     # The constants that axes stand for are coordinates.
     constants = [name for name in CONSTANTS if name not in AXES]

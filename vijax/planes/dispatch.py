@@ -15,7 +15,7 @@ import numpy as np
 
 from vijax.batch import simulate
 from vijax.model.pair import ImpactPair
-from vijax.planes.dataset import Plan
+from vijax.planes.dataset import SweepPlan
 from vijax.planes.tiled_store import LARGEST_TILE, SMALLEST_TILE
 from vijax.runtime import context
 from vijax.runtime.tiles import padded, places
@@ -34,7 +34,7 @@ Fields = dict[str, np.ndarray]
 class Call(NamedTuple):
     """Cells of a plan by flat index, how many rows their call has, and which tile it is."""
 
-    planned: Plan
+    planned: SweepPlan
     cells: np.ndarray
     rows: int
     number: int
@@ -50,7 +50,7 @@ def rows_each(cells: int) -> int:
     return min(rows_for(math.ceil(cells / len(places()))), LARGEST_TILE)
 
 
-def compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
+def compute(planned: SweepPlan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
     """Compute cells, given by flat indices, into fields over all cells; yield how many are done."""
     of, done = planned.cells, 0
     gamma = of.flat(of.quantities["gamma"], wanted)
@@ -62,7 +62,7 @@ def compute(planned: Plan, wanted: np.ndarray, found: Fields, rows: int | None =
             yield done
 
 
-def _each(planned: Plan, group: np.ndarray, rows: int) -> Iterator[tuple[np.ndarray, Fields]]:
+def _each(planned: SweepPlan, group: np.ndarray, rows: int) -> Iterator[tuple[np.ndarray, Fields]]:
     """Yield flat indices and fields of every call over a group of cells, as the calls are done."""
     if not group.size:
         return

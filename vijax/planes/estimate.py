@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from vijax.planes.dataset import Plan
+from vijax.planes.dataset import SweepPlan
 from vijax.runtime import cache_folder, checks
 from vijax.runtime.context import door
 from vijax.runtime.files import write_json
@@ -54,7 +54,7 @@ class Estimate(NamedTuple):
 
 
 @door
-def of(*plans: Plan) -> Estimate:
+def of(*plans: SweepPlan) -> Estimate:
     """Estimate what runs of such plans take together."""
     kept = _paces()
     return Estimate(
@@ -83,7 +83,7 @@ class Watch:
             self._seen.append((done, time.perf_counter()))
         self._tell(done, total)
 
-    def keep(self, planned: Plan) -> None:
+    def keep(self, planned: SweepPlan) -> None:
         """Keep the pace, if it is one, beside compiled programs."""
         if len(self._seen) < 3:
             return
@@ -97,22 +97,22 @@ class Watch:
                 write_json(_paces() | {_kind(planned): pace}, file)
 
 
-def _periods(planned: Plan) -> int:
+def _periods(planned: SweepPlan) -> int:
     return planned.settings.periods + planned.settings.transient
 
 
-def _level(planned: Plan) -> str:
+def _level(planned: SweepPlan) -> str:
     return "inclined" if planned.cells.quantities["gamma"].values.any() else "level"
 
 
-def _kind(planned: Plan) -> str:
+def _kind(planned: SweepPlan) -> str:
     """Name the kind of a run: those of one kind keep one pace."""
     settings = planned.settings
     devices = f"{len(places())} {places()[0].device_kind}"
     return f"{settings.method} {settings.until} {settings.dtype} {_level(planned)} {devices}"
 
 
-def _slow(planned: Plan) -> float:
+def _slow(planned: SweepPlan) -> float:
     method = planned.settings.method
     return _SLOW[f"exact {_level(planned)}" if method == "exact" else method]
 

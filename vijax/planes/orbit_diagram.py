@@ -25,7 +25,7 @@ from vijax.model.records import State, Status
 from vijax.model.units import Given
 from vijax.planes import estimate
 from vijax.planes.axes import Axes, cells, check_axis
-from vijax.planes.dataset import Plan, coordinates, flagged, provenance, warn_if_held
+from vijax.planes.dataset import SweepPlan, coordinates, flagged, provenance, warn_if_held
 from vijax.planes.outputs import OUTPUTS
 from vijax.planes.sweep_settings import DiagramSettings
 from vijax.runtime import checks, context
@@ -127,7 +127,7 @@ class Diagram:
         settings: Those of the plan, with the directions and how much is kept.
     """
 
-    planned: Plan
+    planned: SweepPlan
     along: str
     settings: DiagramSettings
 
@@ -193,7 +193,7 @@ def plan(
     # A start that a rigid gap does not hold is put back into it: to this door all walls are soft.
     laid_out = cells({**given, along: points}, device, "soft")
     outputs = (*_POINTS, *_IMPACTS, *_STROBES)
-    diagram = Diagram(Plan(laid_out, settings, None, outputs, device), along, settings)
+    diagram = Diagram(SweepPlan(laid_out, settings, None, outputs, device), along, settings)
     names = ["recorded_periods", "values", *(name for name in diagram.dims if name in given)]
     checks.fits(names, diagram.size, f"the impacts of {diagram.count:,} points")
     return diagram
@@ -315,7 +315,7 @@ def _simulate(
     return points | {name: values.reshape(shape + values.shape[1:]) for name, values in fields.items()}
 
 
-def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: int, recorded_periods: int) -> Any:
+def _follow(planned: SweepPlan, table: dict[str, np.ndarray], lanes: int, periods: int, recorded_periods: int) -> Any:
     """Summarise every point, [chain, point], the chains taken so many points further by every call."""
     chains, points = table["d"].shape
     growth = {name: np.ones_like(table[name]) for name in ("metres", "speed")}
@@ -350,7 +350,7 @@ def _follow(planned: Plan, table: dict[str, np.ndarray], lanes: int, periods: in
     return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
 
 
-def _fly(planned: Plan, table: dict[str, np.ndarray], summary: Any, recorded_periods: int) -> Record:
+def _fly(planned: SweepPlan, table: dict[str, np.ndarray], summary: Any, recorded_periods: int) -> Record:
     """Fly the kept periods of every point again, from where they begin."""
     soft = planned.settings.wall == "soft"
     d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])

@@ -11,7 +11,7 @@ import numpy as np
 
 from vijax.model.records import Status
 from vijax.planes import inventory
-from vijax.planes.dataset import Plan, asked, coordinates, provenance, specimen
+from vijax.planes.dataset import SweepPlan, asked, coordinates, provenance, specimen
 from vijax.planes.store import compressors, seal, view
 from vijax.planes.store import write as write_store
 from vijax.runtime.files import replacing
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _SHOWN = 3  # Settings that differ which an error names; of others it says how many.
 
 
-def write(planned: Plan, tile: Mapping[str, int], birth: str, path: Path) -> None:
+def write(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path) -> None:
     """Write the store of a plan, every variable void.
 
     Args:
@@ -61,7 +61,7 @@ def void(name: str, dtype: np.dtype) -> Any:
 # --- damage ----------------------------------------------------------------------------------------------------------
 
 
-def mend(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
+def mend(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
     """Write again what is damaged: metadata by their copies, coordinates by the plan if it has the same as was there.
 
     Args:
@@ -92,7 +92,7 @@ def mend(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Ca
             _put(name, reason, (fresh / name).read_bytes(), path, say)
 
 
-def _mend_list(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
+def _mend_list(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
     """Write the list of a store again that has lost it, and what metadata of arrays differ from those of the store."""
     reason = inventory.fault(path / inventory.LIST, None)
     if reason == "is missing" and not inventory.had_list(path):
@@ -110,7 +110,7 @@ def _mend_list(planned: Plan, tile: Mapping[str, int], birth: str, path: Path, s
 
 
 @contextmanager
-def _fresh(planned: Plan, tile: Mapping[str, int], birth: str) -> Iterator[Path]:
+def _fresh(planned: SweepPlan, tile: Mapping[str, int], birth: str) -> Iterator[Path]:
     """Make the store of a plan as it would be made now, for a while."""
     with tempfile.TemporaryDirectory() as folder:
         write(planned, tile, birth, Path(folder, "fresh"))
@@ -129,7 +129,7 @@ def _put(name: str, reason: str, content: bytes, path: Path, say: Callable[[str]
 # --- which plane -----------------------------------------------------------------------------------------------------
 
 
-def check_same(planned: Plan, path: Path) -> None:
+def check_same(planned: SweepPlan, path: Path) -> None:
     """Raise FileExistsError unless a store holds the plane of a plan, or part of it."""
     with view(path) as store:
         found = list(_differences(planned, store))
@@ -141,7 +141,7 @@ def check_same(planned: Plan, path: Path) -> None:
         )
 
 
-def _differences(planned: Plan, store: "xr.Dataset") -> Iterator[str]:
+def _differences(planned: SweepPlan, store: "xr.Dataset") -> Iterator[str]:
     """Find what was asked otherwise than the store has it, a phrase each."""
     for name, value in json.loads(json.dumps(asked(planned))).items():
         if store.attrs.get(name, "left out") != value:

@@ -20,7 +20,7 @@ from vijax.model.membrane import HuntCrossley, Law
 from vijax.planes import cluster, dispatch, estimate, tiled_store
 from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, Cells, cells
-from vijax.planes.dataset import DEFAULT, Plan, label, variables, warn_if_held
+from vijax.planes.dataset import DEFAULT, SweepPlan, label, variables, warn_if_held
 from vijax.planes.dispatch import Call, Fields
 from vijax.planes.outputs import ON_REQUEST, OUTPUTS
 from vijax.planes.store import check_store, load, save, view
@@ -151,7 +151,7 @@ def plan(
     device: Harvester | None = None,
     settings: SweepSettings = DEFAULT,
     refine: int | None = None,
-) -> Plan:
+) -> SweepPlan:
     """Check what a sweep is asked for and lay out its cells; runs nothing.
 
     Args:
@@ -170,7 +170,7 @@ def plan(
     given = {name: values for name, values in axes.items() if values is not None}
     lossy = method is None or not isinstance(method.law, HuntCrossley)
     laid_out = cells(given, device, settings.wall, restitution=lossy)
-    return Plan(
+    return SweepPlan(
         cells=laid_out,
         settings=settings,
         method=method,
@@ -197,7 +197,7 @@ def _levels(refine: Any, of: Cells, until: str) -> int:
 
 @door
 def run(
-    planned: Plan,
+    planned: SweepPlan,
     progress: Callable[[int, int], None] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -222,7 +222,7 @@ def run(
 
 
 def _run(
-    planned: Plan,
+    planned: SweepPlan,
     tell: Callable[[int, int], None],
     out: Path | None,
     overwrite: bool,
@@ -241,7 +241,7 @@ def _run(
     return view(out)
 
 
-def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
+def check(planned: SweepPlan, out: str | Path, overwrite: bool = False) -> None:
     """Raise unless the map of a plan can be written there, or goes on there; makes nothing.
 
     Raises:
@@ -255,14 +255,14 @@ def check(planned: Plan, out: str | Path, overwrite: bool = False) -> None:
         tiled_store.check(planned, checks.path("out", out), overwrite)
 
 
-def check_room(planned: Plan) -> None:
+def check_room(planned: SweepPlan) -> None:
     """Raise ValueError unless the map of a plan fits in memory, where it is not written tile by tile."""
     names = [name for name, size in planned.cells.sizes.items() if size > 1]
     hint = "" if planned.refine else "; give out, a store that is written tile by tile"
     checks.fits(names, planned.size, f"{planned.count:,} cells", hint)
 
 
-def check_workers(planned: Plan, workers: cluster.Workers, out: str | Path | None) -> None:
+def check_workers(planned: SweepPlan, workers: cluster.Workers, out: str | Path | None) -> None:
     """Raise unless such workers can run the plan; starts none.
 
     Raises:
@@ -277,7 +277,7 @@ def check_workers(planned: Plan, workers: cluster.Workers, out: str | Path | Non
     cluster.check(workers)
 
 
-def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
+def _in_memory(planned: SweepPlan, tell: Callable[[int, int], None]) -> Fields:
     count = planned.count
     tell(0, count)
     found: Fields = {}
@@ -286,7 +286,7 @@ def _in_memory(planned: Plan, tell: Callable[[int, int], None]) -> Fields:
     return found
 
 
-def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
+def _refined(planned: SweepPlan, tell: Callable[[int, int], None]) -> "xr.Dataset":
     """Make the map of a plan of which a part is computed, in rounds, and the rest filled."""
     of = planned.cells
     varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
@@ -316,7 +316,7 @@ def _refined(planned: Plan, tell: Callable[[int, int], None]) -> "xr.Dataset":
     return dataset
 
 
-def _compile_ahead(planned: Plan) -> None:
+def _compile_ahead(planned: SweepPlan) -> None:
     """Begin to compile what the tiles of a new store need: XLA needs no Python, and importing zarr a core."""
     most = math.prod(tiled_store.blocks(planned.cells).values())
     whole = Call(planned, np.arange(min(most, planned.count)), dispatch.rows_for(most), 0)
@@ -342,8 +342,8 @@ def _fill(plane: tiled_store.Study, tell: Callable[[int, int], None], workers: c
 
 
 def _made(
-    tiles: Iterable[tiled_store.Tile], rows: int, workers: cluster.Workers | None
-) -> Generator[tiled_store.Tile, None, None]:
+    tiles: Iterable[tiled_store.StudyTile], rows: int, workers: cluster.Workers | None
+) -> Generator[tiled_store.StudyTile, None, None]:
     """Yield tiles as they are done, by whomever."""
     if workers is None:
         yield from _here(tiles, rows)
@@ -351,9 +351,9 @@ def _made(
         yield from cluster.done(partial(_make, rows), tiles, workers)
 
 
-def _here(tiles: Iterable[tiled_store.Tile], rows: int) -> Iterator[tiled_store.Tile]:
+def _here(tiles: Iterable[tiled_store.StudyTile], rows: int) -> Iterator[tiled_store.StudyTile]:
     """Yield tiles, simulated and written by this process, as they are done."""
-    running: dict[int, tiled_store.Tile] = {}
+    running: dict[int, tiled_store.StudyTile] = {}
 
     def one_each() -> Iterator[Call]:
         for tile in tiles:
@@ -367,7 +367,7 @@ def _here(tiles: Iterable[tiled_store.Tile], rows: int) -> Iterator[tiled_store.
 
 
 @door
-def _make(rows: int, tile: tiled_store.Tile) -> None:
+def _make(rows: int, tile: tiled_store.StudyTile) -> None:
     """Simulate and write a tile, in a worker, on its first device."""
     call, place = _whole(tile, rows), places()[0]
     dispatch.prepare(call, place)
@@ -375,6 +375,6 @@ def _make(rows: int, tile: tiled_store.Tile) -> None:
     tiled_store.write(tile, variables(tile.planned, found), seconds)
 
 
-def _whole(tile: tiled_store.Tile, rows: int) -> Call:
+def _whole(tile: tiled_store.StudyTile, rows: int) -> Call:
     """Make the call for all cells of a tile of a study."""
     return Call(tile.planned, np.arange(tile.planned.count), rows, tile.number)

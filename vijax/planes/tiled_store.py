@@ -21,7 +21,7 @@ import numpy as np
 
 from vijax.planes import inventory, store_metadata
 from vijax.planes.axes import Cells
-from vijax.planes.dataset import Plan, made_by
+from vijax.planes.dataset import SweepPlan, made_by
 from vijax.planes.store import check_place, check_store, encoded, view
 from vijax.runtime.files import beside, replacing, replacing_folder, write_json
 from vijax.runtime.tiles import places
@@ -56,7 +56,7 @@ class Study:
     """
 
     path: Path
-    planned: Plan
+    planned: SweepPlan
     dims: dict[str, tuple[str, ...]]
     extents: dict[str, int]
     birth: str
@@ -94,12 +94,12 @@ class Study:
         """Count the cells of a tile."""
         return math.prod(part.stop - part.start for part in self.block(tile).values())
 
-    def tile(self, number: int) -> "Tile":
+    def tile(self, number: int) -> "StudyTile":
         """Cut out a tile alone."""
         block, path = self.block(number), self.path.absolute()
         chunk = {**self.planned.cells.sizes, **self.extents}
         shapes = {name: tuple(chunk[dim] for dim in along) for name, along in self.dims.items()}
-        return Tile(number, path, self.birth, self.planned.cut(block), self.dims, shapes, self.place(number))
+        return StudyTile(number, path, self.birth, self.planned.cut(block), self.dims, shapes, self.place(number))
 
     def record(self, tile: int) -> Path:
         """Name the file where it is written that a tile is done."""
@@ -107,7 +107,7 @@ class Study:
 
 
 @dataclass(frozen=True)
-class Tile:
+class StudyTile:
     """One tile, as light as its cells: all that who runs and writes it must know, on whatever machine.
 
     Attributes:
@@ -123,7 +123,7 @@ class Tile:
     number: int
     path: Path
     birth: str
-    planned: Plan
+    planned: SweepPlan
     dims: dict[str, tuple[str, ...]]
     shapes: dict[str, tuple[int, ...]]
     place: dict[str, int]
@@ -150,7 +150,7 @@ def blocks(of: Cells) -> dict[str, int]:
 # --- who may write ---------------------------------------------------------------------------------------------------
 
 
-def check(planned: Plan, path: str | Path, overwrite: bool = False) -> None:
+def check(planned: SweepPlan, path: str | Path, overwrite: bool = False) -> None:
     """Raise unless the plane can be written there, or goes on there; makes nothing, and mends what is damaged.
 
     Raises:
@@ -173,7 +173,7 @@ def _target(path: str | Path, overwrite: bool) -> Path:
 
 
 @contextmanager
-def opened(planned: Plan, path: str | Path, overwrite: bool = False) -> Iterator[Study]:
+def opened(planned: SweepPlan, path: str | Path, overwrite: bool = False) -> Iterator[Study]:
     """Open the study of a plane, made or found, which no one else may write meanwhile.
 
     Raises:
@@ -190,7 +190,7 @@ def opened(planned: Plan, path: str | Path, overwrite: bool = False) -> Iterator
         yield _found(planned, target)
 
 
-def _make(planned: Plan, target: Path) -> None:
+def _make(planned: SweepPlan, target: Path) -> None:
     """Make a store without any tile, unless another run was faster."""
     part = beside(target, "part")
     try:
@@ -203,7 +203,7 @@ def _make(planned: Plan, target: Path) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _write_blank(planned: Plan, path: Path) -> None:
+def _write_blank(planned: SweepPlan, path: Path) -> None:
     birth = uuid.uuid4().hex
     store_metadata.write(planned, blocks(planned.cells), birth, path)
     _lock(path).parent.mkdir()
@@ -227,7 +227,7 @@ def _most(of: Cells) -> int:
     return min(share, LARGEST_TILE, max(room, 1))
 
 
-def _found(planned: Plan, path: Path) -> Study:
+def _found(planned: SweepPlan, path: Path) -> Study:
     """Describe the study that a store is, its tiles as long as they were when it was made."""
     with view(path) as store:
         dims = {name: tuple(map(str, store[name].dims)) for name in planned.outputs}
@@ -267,7 +267,7 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
         yield
 
 
-def _check_same(planned: Plan, path: Path) -> None:
+def _check_same(planned: SweepPlan, path: Path) -> None:
     """Raise unless a store holds this plane; what is damaged of it, but for its tiles, is mended."""
     store_metadata.mend(planned, blocks(planned.cells), _birth(path), path, _LOG.warning)
     store_metadata.check_same(planned, path)
@@ -314,7 +314,7 @@ def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, 
         yield name, path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in along))
 
 
-def write(tile: Tile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
+def write(tile: StudyTile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
     """Write the variables of a tile, then its record.
 
     Args:
@@ -352,7 +352,7 @@ def _filled(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray
     return chunk
 
 
-def _check_born(tile: Tile) -> None:
+def _check_born(tile: StudyTile) -> None:
     """Raise if another store has taken the place of the tile's.
 
     The lock is the driver's, and a worker may outlive it: it then writes what the next driver has run again, the same

@@ -37,7 +37,7 @@ _PACKAGE = Path(__file__).parents[1]
 _DIGEST = hashlib.sha256
 
 
-class Program:
+class TracedProgram:
     """A function of pytrees of arrays to one array, compiled for every shape of its arguments, as `jax.jit` does.
 
     Where JAX keeps compiled programs (`jax_compilation_cache_dir`), its traced form is kept, too.
