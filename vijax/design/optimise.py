@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -189,29 +189,45 @@ def optimise_all(
     box = check(devices, tune, bounds, objective, scatter)
     if (asked := expected(len(devices), far)).long:
         _LOG.warning("a long run begins: %s", asked)
-    alone = motion == "periodic" or objective in OVER_TOLERANCES
     task = Task(devices, tune, box, objective, scatter if objective == "expected" else (), reliability, settings)
-    cloud = nodes(scatter, samples)
-    if objective == "expected":
-        met, looked = every_start(devices, tune, box, far)
-        optima: list[list[Optimum]] = [[] for _ in devices]
-        climbed = [0] * len(devices)
-    else:
-        begun, met, looked = find(devices, tune, box, objective, far, orbits_alone=alone)
-        climbed = np.bincount(begun.owner, minlength=len(devices)).tolist()
-        optima = _on_orbits(task, begun, cloud, max_evaluations)
-    beyond = [None] * len(devices) if alone else _beyond(task, met, optima)
+    alone = motion == "periodic" or objective in OVER_TOLERANCES
     return [
         Design(
-            optima=tuple(one for one in (beyond[owner], *optima[owner]) if one is not None),
+            optima=found.optima,
             tune=tune,
-            bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, box[owner])).T.tolist()), strict=True)),
+            bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, limits)).T.tolist()), strict=True)),
             objective=objective,
             tolerances=scatter,
-            looked=looked[owner],
-            ascents=climbed[owner],
+            looked=found.looked,
+            ascents=found.ascents,
         )
-        for owner in range(len(devices))
+        for found, limits in zip(_sought(task, far, nodes(scatter, samples), max_evaluations, alone), box, strict=True)
+    ]
+
+
+class _Found(NamedTuple):
+    """What was found for one device; see `Design`."""
+
+    optima: tuple[Optimum | AperiodicOptimum, ...]
+    looked: Looked
+    ascents: int
+
+
+def _sought(task: Task, far: Effort, cloud: Nodes, max_evaluations: int, orbits_alone: bool) -> list[_Found]:
+    """Survey, climb from what was met and look for better motions that are no orbits, unless orbits alone count."""
+    count = len(task.devices)
+    if task.expected:
+        met, looked = every_start(task.devices, task.tune, task.box, far)
+        orbits: list[list[Optimum]] = [[] for _ in task.devices]
+        ascents = [0] * count
+    else:
+        begun, met, looked = find(task.devices, task.tune, task.box, task.objective, far, orbits_alone=orbits_alone)
+        ascents = np.bincount(begun.owner, minlength=count).tolist()
+        orbits = _on_orbits(task, begun, cloud, max_evaluations)
+    beyond = [None] * count if orbits_alone else _beyond(task, met, orbits)
+    return [
+        _Found(tuple(own) if other is None else (other, *own), *seen)
+        for other, own, seen in zip(beyond, orbits, zip(looked, ascents, strict=True), strict=True)
     ]
 
 

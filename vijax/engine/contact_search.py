@@ -1,6 +1,8 @@
 """The careful search of a contact: when a forced oscillator first returns to zero, where it turns before."""
 
 import math
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,6 +19,20 @@ from vijax.runtime.xla import once, share
 
 _ARRIVED = 2.0**-30  # relative step of the approach after which Newton's last one is exact
 PATIENCE = 20_000  # stages (about free half cycles) of one contact; only r = 1 comes near
+
+
+class _Oscillator(NamedTuple):
+    """The oscillator whose zeros are sought: membrane, forcing, steady response, and the state at time 0."""
+
+    m: Membrane
+    force: Force
+    steady: Force
+    w0: Scalar
+    z0: Scalar
+
+    def at(self, s: Scalar) -> tuple[Scalar, Scalar]:
+        """Compute w and w' at time s."""
+        return flow.oscillate(self.m, self.force, self.w0, self.z0, s)
 
 
 class _Search(eqx.Module):
@@ -56,6 +72,38 @@ def _envelope_end(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -
     return jnp.where(jnp.isfinite(bound) & spell.positive, spell.end, s)
 
 
+def _advance(oscillator: _Oscillator, limit: Scalar | float, search: _Search) -> _Search:
+    """Take the search of `first_return` a stage further: past a stretch free of zeros, or into a bracket of one."""
+    s, spell = search.s, search.spell
+    free = s + _free_end(oscillator.m, search.w, search.z)
+    envelope = _envelope_end(oscillator.m, oscillator.steady, search.w, search.z, s)
+    stretch = jnp.minimum(free, spell.end)
+    leap = envelope > stretch
+    ahead = jnp.minimum(jnp.where(leap, envelope, stretch), limit)
+    ahead, free, leap = share((ahead, free, leap))
+    never = ~jnp.isfinite(ahead)
+    w, z = oscillator.at(jnp.where(never, s, ahead))
+    falling = ~spell.positive & ~leap
+    # A free half cycle under negative forcing ends below zero, whatever rounding says.
+    bracketed = falling & ((w <= 0) | ((free <= spell.end) & (ahead < limit)))
+    # The stages approach a root under positive forcing quadratically, from below.
+    arrived = ~falling & ((w <= 0) | (ahead - s <= _ARRIVED * ahead)) & (ahead < limit)
+    last = jnp.where((w > 0) & (z < 0), -w / jnp.where(z < 0, z, -1.0), 0.0)
+    ahead = jnp.where(arrived, ahead + jnp.minimum(last, ahead - s), ahead)
+    never = never | (~bracketed & ~arrived & (ahead >= limit))
+    bracketed, arrived, never, ahead = share((bracketed, arrived, never, ahead))
+    return _Search(
+        s=jnp.where(bracketed, s, jnp.where(never, jnp.inf, ahead)),
+        w=jnp.where(bracketed, search.w, w),
+        z=jnp.where(bracketed, search.z, z),
+        high=jnp.where(bracketed, ahead, search.high),
+        spell=share(spell_after(oscillator.force, ahead)),
+        running=~(bracketed | arrived | never),
+        bracketed=bracketed,
+        stage=search.stage + 1,
+    )
+
+
 @once
 def first_return(
     m: Membrane,
@@ -75,47 +123,15 @@ def first_return(
     certainly one by then. So stage by stage either a stretch is certified free of zeros or a bracket holds exactly
     one. Where the oscillation has decayed, the steady response carries many free half cycles at once.
     """
-    steady = flow.steady_response(m, force)
-
-    def advance(search: _Search) -> _Search:
-        s, spell = search.s, search.spell
-        free = s + _free_end(m, search.w, search.z)
-        envelope = _envelope_end(m, steady, search.w, search.z, s)
-        stretch = jnp.minimum(free, spell.end)
-        leap = envelope > stretch
-        ahead = jnp.minimum(jnp.where(leap, envelope, stretch), limit)
-        ahead, free, leap = share((ahead, free, leap))
-        never = ~jnp.isfinite(ahead)
-        w, z = flow.oscillate(m, force, w0, z0, jnp.where(never, s, ahead))
-        falling = ~spell.positive & ~leap
-        # A free half cycle under negative forcing ends below zero, whatever rounding says.
-        bracketed = falling & ((w <= 0) | ((free <= spell.end) & (ahead < limit)))
-        # The stages approach a root under positive forcing quadratically, from below.
-        arrived = ~falling & ((w <= 0) | (ahead - s <= _ARRIVED * ahead)) & (ahead < limit)
-        last = jnp.where((w > 0) & (z < 0), -w / jnp.where(z < 0, z, -1.0), 0.0)
-        ahead = jnp.where(arrived, ahead + jnp.minimum(last, ahead - s), ahead)
-        never = never | (~bracketed & ~arrived & (ahead >= limit))
-        bracketed, arrived, never, ahead = share((bracketed, arrived, never, ahead))
-        return _Search(
-            s=jnp.where(bracketed, s, jnp.where(never, jnp.inf, ahead)),
-            w=jnp.where(bracketed, search.w, w),
-            z=jnp.where(bracketed, search.z, z),
-            high=jnp.where(bracketed, ahead, search.high),
-            spell=share(spell_after(force, ahead)),
-            running=~(bracketed | arrived | never),
-            bracketed=bracketed,
-            stage=search.stage + 1,
-        )
-
+    oscillator = _Oscillator(m, force, flow.steady_response(m, force), w0, z0)
     zero, no = jnp.zeros_like(w0), jnp.zeros_like(wanted)
     start = _Search(zero, w0, z0, zero, spell_after(force, zero), wanted, no, jnp.int32(0))
-    found = lax.while_loop(lambda search: search.running & (search.stage < patience), advance, start)
+    goes_on = lambda search: search.running & (search.stage < patience)  # noqa: E731
+    found = lax.while_loop(goes_on, partial(_advance, oscillator, limit), start)
     # From rest on the wall against a negative push the contact is a parabola of length 2 z0/|push|.
     push = jnp.minimum(force.at(zero) - m.mu * z0, -jnp.finfo(w0.dtype).tiny)
     guess = jnp.where(found.s == 0, -2 * z0 / push, zero)
-    exact = bracketed_root(
-        lambda s: flow.oscillate(m, force, w0, z0, s), found.s, found.high, guess, wanted & found.bracketed
-    )
+    exact = bracketed_root(oscillator.at, found.s, found.high, guess, wanted & found.bracketed)
     return jnp.where(found.running, jnp.nan, jnp.where(found.bracketed, exact, found.s))
 
 
@@ -177,6 +193,7 @@ def turning_points(
         length: When the contact is to end, at the first return of w to zero or not; looked for unless given.
     """
     steady = flow.steady_response(m, force)
+    contact = _Oscillator(m, force, steady, w0, z0)
     eps = jnp.finfo(w0.dtype).eps
     slope = force.slope()
     zero, no = jnp.zeros_like(w0), jnp.zeros_like(wanted)
@@ -184,7 +201,7 @@ def turning_points(
 
     def visit(v: _Visit) -> _Visit:
         first, s, seen = v.number == 0, v.s, v.seen
-        w, z = flow.oscillate(m, force, w0, z0, s)
+        w, z = contact.at(s)
         settled = _amplitude(m, steady, w, z, s) <= eps * (jnp.abs(steady.c) + jnp.abs(steady.q) + jnp.abs(w))
         seeking = v.going & (first | ~settled)
         rate = force.later(s).at(zero) - m.mu * z - m.kappa * m.kappa * w
@@ -211,20 +228,26 @@ def turning_points(
     sign = jnp.where(rising, 1.0, -1.0).astype(w0.dtype)
     start = _Visit(jnp.int32(length is not None), zero, sign, wanted, no, blank)
     end = lax.while_loop(lambda v: v.going & (v.number <= patience), visit, start)
-    seen = end.seen
-    # The steady response is highest at this phase and lowest half a period later: each once, the first still ahead.
-    known = -jnp.arctan2(steady.q, steady.c) / PI
+    seen = _settled_turns(contact, end)
+    return eqx.tree_at(lambda t: t.lost, seen, end.going | seen.lost)
+
+
+def _settled_turns(contact: _Oscillator, end: _Visit) -> Turns:
+    """Add the turning points of the steady response to those seen, where nothing else is left of the oscillation.
+
+    It is highest at a phase and lowest half a period later: each once, the first still ahead.
+    """
+    known = -jnp.arctan2(contact.steady.q, contact.steady.c) / PI
 
     def look(low: Array, seen: Turns) -> Turns:
         when = known + low.astype(known.dtype)
         ahead = when + 2 * jnp.ceil(0.5 * (end.s - when))
         there = end.settled & (ahead > 0) & (ahead < seen.exit)
-        w, _ = flow.oscillate(m, force, w0, z0, jnp.where(there, ahead, 0.0))
+        w, _ = contact.at(jnp.where(there, ahead, 0.0))
         return _compared(seen, ahead, w, there, there & (low == 1))
 
     # A loop, so that a program holds the membrane's flow once for both.
-    seen = lax.fori_loop(0, 2, look, seen)
-    return eqx.tree_at(lambda t: t.lost, seen, end.going | seen.lost)
+    return lax.fori_loop(0, 2, look, end.seen)
 
 
 def _compared(seen: Turns, s: Scalar, w: Scalar, turns: Flag, rises: Flag) -> Turns:

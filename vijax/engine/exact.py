@@ -106,6 +106,23 @@ def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, hel
     return jnp.where(stuck, 0.0, out), stuck, jnp.where(stuck, release, 0.0)
 
 
+def _onset(pair: ImpactPair, state: State, horizon: Scalar, wanted: Flag) -> tuple[Scalar, Scalar, Scalar, Flag]:
+    """Find how long the ball flies to the next wall, the wall's side, the velocity there, and whether one is reached.
+
+    A ball in contact is at its wall already, after a flight of length 0.
+    """
+    room = (0.5 * pair.d + state.u, 0.5 * pair.d - state.u)
+    force = flow.flight_force(pair.gamma, state.t)
+    sought = lax.stop_gradient((force, room, state.v, horizon))
+    flight, side = next_wall(*sought, wanted)
+    reached = wanted & (side != 0)
+    side = jnp.where(state.mode != 0, state.mode.astype(flight.dtype), jnp.where(reached, side, 1.0))
+    args = (force, side, jnp.where(side > 0, room[1], room[0]), state.v)
+    flight = jnp.where(reached, implicit_root(_crossing, jnp.where(reached, flight, 1.0), args), 0.0)
+    _, v_in = flow.flight(force, state.v, flight)
+    return flight, side, v_in, reached
+
+
 def step(
     pair: ImpactPair,
     state: State,
@@ -128,16 +145,8 @@ def step(
     Differentiable in pair and state, forward and reverse, to any order: event times by the implicit function.
     """
     held = state.mode != 0
-    room = (0.5 * pair.d + state.u, 0.5 * pair.d - state.u)
     wanted = ~held & (horizon > 0)
-    force = flow.flight_force(pair.gamma, state.t)
-    sought = lax.stop_gradient((force, room, state.v, horizon))
-    flight, side = next_wall(*sought, wanted)
-    reached = wanted & (side != 0)
-    side = jnp.where(held, state.mode.astype(flight.dtype), jnp.where(reached, side, 1.0))
-    args = (force, side, jnp.where(side > 0, room[1], room[0]), state.v)
-    flight = jnp.where(reached, implicit_root(_crossing, jnp.where(reached, flight, 1.0), args), 0.0)
-    _, v_in = flow.flight(force, state.v, flight)
+    flight, side, v_in, reached = _onset(pair, state, horizon, wanted)
     t, periods = flow.wrap_phase(state.t + flight)
     meets = reached | held
     if pair.rigid:
@@ -146,14 +155,11 @@ def step(
         work = energy.membrane_work_rigid(v_in, pair.r)
     else:
         w0 = jnp.where(held, side * state.u - 0.5 * pair.d, 0.0)
-        stay, out, depth = _soft_contact(
-            pair, flow.membrane(pair, rolled=rolled), side, t, w0, side * v_in, meets, deep, patience
-        )
+        wall = flow.membrane(pair, rolled=rolled)
+        stay, out, depth = _soft_contact(pair, wall, side, t, w0, side * v_in, meets, deep, patience)
         stuck = jnp.zeros_like(held)
-        ends = jnp.isfinite(stay)
-        work = energy.membrane_work(
-            pair.kappa, pair.mu, pair.gamma, side, t, jnp.where(ends, stay, 1.0), v_in, -side * out
-        )
+        ended = jnp.where(jnp.isfinite(stay), stay, 1.0)
+        work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, side, t, ended, v_in, -side * out)
     permanent = meets & jnp.isinf(stay)
     ends = meets & ~permanent
     n = state.n + periods.astype(state.n.dtype)

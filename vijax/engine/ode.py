@@ -2,10 +2,8 @@
 
 One `step` of a lane is one attempt of a solver step, accepted, rejected or cut short, so that no lane waits for
 another's solve. A cell's motion is a chain of smooth spells: flight in the displacement u, contact in the penetration
-w = side u - d/2; `mode` says which, and no sign of a rounded number is asked. The wall is met where the dense output of
-a step first crosses it; the step is then repeated up to there, and what is missing is closed by the Taylor polynomial
-of the repeated step, so that the state has the order of the solver and not that of the dense output. This is the only
-file that imports diffrax.
+w = side u - d/2; `mode` says which, and no sign of a rounded number is asked. What a step meets, where and in what
+state, `ode_events` says. This is the only file that imports diffrax.
 """
 
 from typing import Any
@@ -17,8 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from vijax.engine.dense_output import Dense, SolverState, dense_output, root
+from vijax.engine.dense_output import SolverState, dense_output
 from vijax.engine.method import ImpactOutcome, Method, decided
+from vijax.engine.ode_events import LONGEST, OdeCarry, Sight, Trial, land, look, meet
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair, Real
@@ -27,13 +26,9 @@ from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 
 Solver = Any  # a Runge-Kutta solver of diffrax
-_LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
-_CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step
-_ATTEMPTS = 6  # repeats after which a crossing is taken as it is: rounding holds it from closing
 # The first step, in half periods of the forcing; in a contact at most 0.1/kappa. The method chooses all others: a
 # longer one is refused where it is too long, a shorter one costs a few steps.
 _FIRST_STEP = 1e-3
-_CREST = 2.0  # an aim that is no wall: the deepest point of a contact
 _VANISHING = 4  # roundings: a shorter step does not advance time
 
 
@@ -72,29 +67,6 @@ def _field_39(t: Any, y: SolverState, args: tuple[MembranePair, Int[Array, ""]])
 
 equation_39 = diffrax.ODETerm(_field_39)
 """Eq. (39), lengths in units of s, times in units of 1/omega0: for `SolverState` (x, x') and (`MembranePair`, mode)."""
-
-
-class OdeCarry(eqx.Module):
-    """The carry of a lane: where the ball is, the step it will try, and what its contact has seen so far."""
-
-    y: SolverState
-    t: Scalar
-    n: Int[Array, ""]
-    mode: Int[Array, ""]
-    h: Scalar
-    full: Scalar  # step to go on with after one that was cut short
-    other: Scalar  # step to go on with after the next change of mode
-    cut: Flag  # this step was cut short, to end at an event or before a second turning
-    aim: Scalar  # the event it was cut for: a wall in the direction -1 or +1, or a crest; 0 for none
-    attempts: Int[Array, ""]
-    onset_t: Scalar
-    onset_n: Int[Array, ""]
-    entered: Flag  # the contact had an onset
-    v_in: Scalar
-    depth: Scalar
-    left_t: Scalar  # when the ball left a wall last
-    left_n: Int[Array, ""]
-    steps: Int[Array, ""]
 
 
 class Ode(Method[OdeCarry]):
@@ -168,14 +140,14 @@ class Ode(Method[OdeCarry]):
         """Try one step of the solver; one that vanishes beside the time, or is not finite, makes an impact of NaN."""
         half, held = 0.5 * pair.d, m.mode != 0
         trial = _try(self, _solver(self, recorded), m, FieldArguments(pair.gamma, m.mode, wall), recorded)
-        landing = _land(m, half, trial)
-        sight = _look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
+        landing = land(m, half, trial)
+        sight = look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
         landing, sight = share((landing, sight))
         shut = landing.onset | landing.exits
         seen = trial.passes & sight.seen & ~shut & ~landing.crest
         seen, moved = decided((seen, trial.passes & ~seen))
         side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
-        y = _meet(m, half, side, wall, trial, landing)
+        y = meet(m, half, side, wall, trial, landing)
         t = trial.t + landing.delay
         over = decided(t >= 2)
         t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
@@ -244,21 +216,9 @@ def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: SolverState, y
     return keep, jnp.where(jnp.isfinite(h), h, 0.2 * (t1 - t0))
 
 
-class _Trial(eqx.Module):
-    """A step that was tried: where it leads, whether its error lets it pass, and the length to try next."""
-
-    h: Scalar
-    t: Scalar
-    y: SolverState
-    f: SolverState
-    passes: Flag
-    h_next: Scalar
-    dense: Dense
-
-
-def _try(engine: Ode, solver: Solver, m: OdeCarry, spell: FieldArguments, recorded: bool) -> _Trial:
+def _try(engine: Ode, solver: Solver, m: OdeCarry, spell: FieldArguments, recorded: bool) -> Trial:
     """Try one step of the solver, at most to the end of the period if it is recorded."""
-    h = jnp.minimum(lax.stop_gradient(m.h), _LONGEST)
+    h = jnp.minimum(lax.stop_gradient(m.h), LONGEST)
     t = m.t + h
     if recorded:
         room = lax.stop_gradient(2 - m.t)
@@ -272,110 +232,16 @@ def _try(engine: Ode, solver: Solver, m: OdeCarry, spell: FieldArguments, record
     y, error, f0, f = share((y, error, f0, f))
     passes, h_next = _control(engine, solver.error_order(equation_38), m.t, t, m.y, y, error)
     dense = share(dense_output(h, *lax.stop_gradient((m.y, f0, y, f))))
-    return _Trial(h, t, y, f, passes, h_next, dense)
+    return Trial(h, t, y, f, passes, h_next, dense)
 
 
-class _Sight(eqx.Module):
-    """What the dense output of a step shows: whether to try it shorter, how much, and the event it should end at."""
-
-    seen: Flag
-    theta: Scalar
-    aim: Scalar
-
-
-def _look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) -> _Sight:
-    """Find the first wall crossing of a step, the crest of a contact before it, or a second turning of the velocity.
-
-    A velocity that changes sign between the ends turns once; the position is monotone up to there and from there on,
-    so each crossing is bracketed, and of two the earlier is found. Where the acceleration changes sign (at most once,
-    as a step is at most _LONGEST) the velocity is extreme: if it has changed sign there and back, the step is cut at
-    that place, and the next look sees one turning at a time (`untwisted`: it was cut so).
-    """
-    one, zero = jnp.ones_like(half), jnp.zeros_like(half)
-    z0, z1, bend0, bend1 = dense.c1, dense.rate(one), dense.c2, dense.bend(one)
-    heading = jnp.where(z0 == 0, jnp.sign(z1), jnp.sign(z0))
-    turns = heading * z1 < 0
-    turning = root(lambda s: (-heading * dense.rate(s), -heading * dense.bend(s)), zero, one)
-    rising = jnp.sign(bend1)
-    extreme = root(lambda s: (rising * dense.bend(s), rising * dense.jerk(s)), zero, one)
-    twice = (bend0 * bend1 < 0) & ~turns & ~untwisted & (heading * dense.rate(extreme) < 0)
-    # What may be met: either wall in flight, and in contact the membrane's rest from above.
-    wall = jnp.where(held, 0.0, half)
-    middle = jnp.where(turns, turning, one)
-    first = (~held | (heading < 0)) & (heading * dense.place(middle) > wall)
-    second = turns & ~first & (~held | (heading > 0)) & (-heading * dense.place(one) > wall)
-    aim = jnp.where(first, heading, -heading)
-    low, high = jnp.where(first, 0.0, middle), jnp.where(first, middle, 1.0)
-    crossing = root(lambda s: (aim * dense.place(s) - wall, aim * dense.rate(s)), low, high)
-    crest = turns & held & (heading > 0) if deep else jnp.zeros_like(turns)
-    return _Sight(
-        twice | crest | first | second,
-        jnp.where(twice, extreme, jnp.where(crest, turning, crossing)),
-        jnp.where(twice, 0.0, jnp.where(crest, _CREST, aim)),
-    )
-
-
-class _Landing(eqx.Module):
-    """Whether a step that was cut for an event has met it, how much later in time it is, and the speed there."""
-
-    onset: Flag
-    exits: Flag
-    crest: Flag
-    delay: Scalar
-    speed: Scalar  # towards the wall at an onset, away from it at an exit
-
-
-def _land(m: OdeCarry, half: Scalar, trial: _Trial) -> _Landing:
-    """Close the gap that the repeated step leaves, to second order: aim (x + z s + push s^2/2) = wall.
-
-    The root is -2 gap/(speed + sqrt(speed^2 - 2 push gap)), and the speed there is that square root. A ball that turns
-    just before the wall has none, and has not met it. Derivatives are those of the true event: the lengths of steps are
-    constants to them.
-    """
-    held, aim = m.mode != 0, lax.stop_gradient(m.aim)
-    x, z, push = trial.y.x, trial.y.z, trial.f.z
-    gap, speed, drive = aim * x - jnp.where(held, 0.0, half), aim * z, aim * push
-    square = speed * speed - 2 * drive * gap
-    root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-    both = speed + root
-    real = ((square >= 0) | (gap > 0)) & ((root > 0) | (drive > 0))
-    tops = (aim == _CREST) & (push < 0)
-    delay = jnp.where(tops, -z / jnp.where(tops, push, -1.0), -2 * gap / jnp.where(both > 0, both, jnp.inf))
-    near = trial.passes & ((jnp.abs(delay) <= _CLOSED * trial.h) | (m.attempts >= _ATTEMPTS))
-    met, crest = decided((near & real & (jnp.abs(aim) == 1), near & tops))
-    return _Landing(met & ~held, met & held, crest, jnp.where(met | crest, delay, 0.0), root)
-
-
-def _ratio(change: Scalar, speed: Scalar) -> Scalar:
-    """Jump of the acceleration over the speed of crossing: the one entry of a soft saltation matrix."""
-    moving = speed != 0
-    return jnp.where(moving, change / jnp.where(moving, speed, 1.0), 0.0)
-
-
-def _meet(m: OdeCarry, half: Scalar, side: Scalar, wall: Wall, trial: _Trial, landing: _Landing) -> SolverState:
-    """Find the state at the event that a step has met (at its end, if none), in coordinates of the spell after it."""
-    onset, exits, crest, delay, speed = landing.onset, landing.exits, landing.crest, landing.delay, landing.speed
-    y = jax.tree.map(lambda value, slope: value + delay * slope, trial.y, trial.f)
-    top = y.x + 0.5 * delay * delay * trial.f.z
-    x = jnp.where(onset, 0.0, jnp.where(exits, side * half, jnp.where(crest, top, y.x)))
-    z = jnp.where(onset, speed, jnp.where(exits, -side * speed, jnp.where(crest, 0.0, y.z)))
-    tangent = None
-    if y.tangent is not None:
-        a, b, c, d = y.tangent
-        zero = jnp.zeros_like(speed)
-        jump = jnp.where(onset, _ratio(wall(zero, speed), speed), 0.0)
-        jump = jnp.where(exits, _ratio(wall(zero, -speed), speed), jump)
-        tangent = (a, b, c + jump * a, d + jump * b)
-    return SolverState(x, z, None if y.work is None else jnp.where(onset, 0.0, y.work), tangent)
-
-
-def _lengths(engine: Ode, m: OdeCarry, trial: _Trial, sight: _Sight, seen: Flag, moved: Flag, shut: Flag):
+def _lengths(engine: Ode, m: OdeCarry, trial: Trial, sight: Sight, seen: Flag, moved: Flag, shut: Flag):
     """Say how long the next step is, the one to go on with after a cut one, and the one after the next change of mode.
 
     A change of mode changes the scale of time: each mode goes on with the length that it had.
     """
     ahead = trial.h_next if engine.dt is not None else jnp.maximum(trial.h_next, m.h)  # m.h: was capped
-    ahead = jnp.minimum(jnp.where(m.cut, m.full, ahead), _LONGEST)
+    ahead = jnp.minimum(jnp.where(m.cut, m.full, ahead), LONGEST)
     after = jnp.where(shut, m.other, jnp.where(moved, ahead, trial.h_next))
     h = jnp.where(seen, sight.theta * trial.h, after)
     return lax.stop_gradient((h, jnp.where(seen, ahead, m.full), jnp.where(shut, m.full, m.other)))

@@ -11,7 +11,7 @@ from vijax.engine.ground import Ground
 from vijax.engine.impact import Lane
 from vijax.engine.quick_inclined_flight import Incline, incline
 from vijax.model import energy
-from vijax.model.flow import PI, membrane
+from vijax.model.flow import PI, Membrane, membrane
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import AnyArray
 
@@ -72,14 +72,7 @@ Wall = RigidWall | SoftWall
 
 
 def prepare(pair: ImpactPair, *, ground: Ground = Ground.LEVEL) -> Wall:
-    """Compute the constants of the quick step for every cell.
-
-    The size certificates, for a forcing of at most 1, or with gravity 1 + |gamma| and that many times the speed: while
-    v h'(s) > h(s), up to half the free time of greatest depth s_a, w' stays positive (Duhamel with h' > 0), and once
-    kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From there -w' starts with slope V = -w'' and is driven by at
-    most max f': it stays positive while V h > max f' H, H the integral of h ("lift"); h/H falls with time since h is
-    log-concave.
-    """
+    """Compute the constants of the quick step for every cell."""
     level = ground is Ground.LEVEL
     slope = None if level else incline(pair.gamma)
     if pair.rigid:
@@ -92,16 +85,7 @@ def prepare(pair: ImpactPair, *, ground: Ground = Ground.LEVEL) -> Wall:
     span, theta = PI / omega1, jnp.arctan2(omega1, zeta)
     crest = theta / omega1
     bend = zeta * zeta - (2 / 3) * (4 * zeta * zeta - square)
-
-    def response(x):  # h, h' and H at omega1 s = x
-        decay = jnp.exp(-zeta / omega1 * x)
-        h, slope = decay * jnp.sin(x) / omega1, decay * (jnp.cos(x) - zeta / omega1 * jnp.sin(x))
-        return h, slope, (1 - slope - 2 * zeta * h) / square
-
-    h_a, slope_a, static_a = response(0.5 * theta)
-    h_d, _, static_d = response(jnp.full_like(theta, DEEP_REACH))
-    h_e, _, static_e = response(jnp.full_like(theta, LONG_REACH))
-    steep = (1 + DOUBT) * jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a)
+    steep, lift, long_lift = _certificates(wall, theta)
     return SoftWall(
         half=0.5 * pair.d,
         r=pair.r,
@@ -122,13 +106,38 @@ def prepare(pair: ImpactPair, *, ground: Ground = Ground.LEVEL) -> Wall:
         sin_crest=jnp.sin(PI * crest),
         crest_decay=jnp.exp(-zeta * crest),
         steep=steep if level else steep * (1 + jnp.abs(pair.gamma)),
-        lift=(1 + DOUBT) * static_d / h_d,
-        long_lift=None if level else (1 + DOUBT) * static_e / h_e,
+        lift=lift,
+        long_lift=None if level else long_lift,
         # Near the resonance the steady response is large and cancels.
         usable=(size > 1.0) & (pair.r > 1e-2),
         incline=slope,
         ebb=None if ground is not Ground.STEEP else _ebb(stiffness, loss, jnp.abs(pair.gamma) / square),
     )
+
+
+def _certificates(wall: Membrane, theta: Lane) -> tuple[Lane, Lane, Lane]:
+    """Compute the size certificates of a contact: the constants `steep`, `lift` and `long_lift` of `SoftWall`.
+
+    They are for a forcing of at most 1, or with gravity 1 + |gamma| and that many times the speed.
+
+    While v h'(s) > h(s), up to s_a = theta/(2 omega1), half the free time of greatest depth, w' stays positive (Duhamel
+    with h' > 0), and once kappa^2 w(s_a) >= 1 it falls until its zero ("steep"). From there -w' starts with slope
+    V = -w'' and is driven by at most max f': it stays positive while V h > max f' H, H the integral of h ("lift"); h/H
+    falls with time since h is log-concave.
+    """
+    zeta, omega1 = wall.zeta, wall.omega1
+    square = wall.kappa * wall.kappa
+
+    def response(x):  # h, h' and H at omega1 s = x
+        decay = jnp.exp(-zeta / omega1 * x)
+        h, slope = decay * jnp.sin(x) / omega1, decay * (jnp.cos(x) - zeta / omega1 * jnp.sin(x))
+        return h, slope, (1 - slope - 2 * zeta * h) / square
+
+    h_a, slope_a, static_a = response(0.5 * theta)
+    h_d, _, static_d = response(jnp.full_like(theta, DEEP_REACH))
+    h_e, _, static_e = response(jnp.full_like(theta, LONG_REACH))
+    steep = (1 + DOUBT) * jnp.maximum(h_a / slope_a, (1 / square + static_a) / h_a)
+    return steep, (1 + DOUBT) * static_d / h_d, (1 + DOUBT) * static_e / h_e
 
 
 def _ebb(stiffness: Lane, loss: Lane, rest: Lane) -> Ebb:
