@@ -4,10 +4,8 @@ python scripts/branch.py
 python scripts/branch.py --help  # options, and more lines to begin with
 """
 
-import sys
-
 from vijax.cli.branch import branch
-from vijax.cli.process import run
+from vijax.cli.process import leave, run
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -16,4 +14,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -1,8 +1,6 @@
 """`python -m vijax` is the command `vijax`."""
 
-import sys
-
-from vijax.cli.main import main
+from vijax.cli.main import command
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command()

@@ -7,7 +7,6 @@
 A figure N becomes figure_N.png in the folder; the claims are printed and become claims.md there.
 """
 
-import sys
 import time
 from pathlib import Path
 
@@ -85,4 +84,4 @@ def _check(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(process.run(paper))
+    process.leave(process.run(paper))

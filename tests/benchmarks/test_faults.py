@@ -21,7 +21,7 @@ from scripts import grid as script
 from tests.helpers import stand_in
 from vijax import plots
 from vijax.batch import simulate
-from vijax.cli import process
+from vijax.cli.process import leave
 from vijax.planes import dispatch, tiled_store
 from vijax.planes import sweep as sweeps
 from vijax.planes.sweep import load, sweep
@@ -67,7 +67,7 @@ def child(arguments):
     """The script with the stand-in, in a process that may be killed."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's children ignore it
     prepare()
-    sys.exit(script.main(arguments))
+    leave(script.main(arguments))
 
 
 def started(folder):
@@ -128,16 +128,8 @@ def test_a_second_process_is_refused_in_one_line(folder, capsys):
     is_undisturbed("map.zarr")
 
 
-@pytest.fixture
-def leaves(monkeypatch):
-    """Exit codes that the script would have ended the process with."""
-    codes = []
-    monkeypatch.setattr(process.os, "_exit", codes.append)
-    return codes
-
-
 @pytest.mark.parametrize("at", ["chunk", "record"])
-def test_a_full_disk_is_one_line_and_what_is_done_stays(folder, capsys, monkeypatch, leaves, at):
+def test_a_full_disk_is_one_line_and_what_is_done_stays(folder, capsys, monkeypatch, at):
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "somewhere")
 
     def write_json(report, path):
@@ -153,8 +145,7 @@ def test_a_full_disk_is_one_line_and_what_is_done_stays(folder, capsys, monkeypa
     chunks = tiled_store._files
     with monkeypatch.context() as disk:
         disk.setattr(*((tiled_store, "write_json", write_json) if at == "record" else (tiled_store, "_files", _files)))
-        script.main(ARGUMENTS)
-    assert leaves == [1]
+        assert script.main(ARGUMENTS) == 1
     assert capsys.readouterr().err.splitlines()[-1] == (
         "error: No space left on device (somewhere); "
         "18 of 48 cells are in map.zarr; the same command goes on from there"

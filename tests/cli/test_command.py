@@ -296,11 +296,19 @@ def test_fish_takes_names_apart_by_commas_for_one(monkeypatch, capsys):
     assert 'string split --max 1 "," $completion' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("code", [1, 130, 143])
+def test_a_run_that_came_to_no_end_is_left_at_once(code):
+    """No thread is waited for, as a compiled call on one cannot be stopped."""
+    busy = "import threading, time; threading.Thread(target=time.sleep, args=(60,)).start(); "
+    line = f"{busy}from vijax.cli.process import leave; leave({code})"
+    assert subprocess.run([sys.executable, "-c", line], timeout=30).returncode == code
+
+
 def test_bash_completes_after_the_line_of_the_readme(tmp_path):
     """By a command of the name that a wheel installs."""
     (line,) = set(re.findall(r'`(eval "[^`]*")`', (ROOT / "README.md").read_text(encoding="utf-8")))
     stub = tmp_path / "vijax"
-    stub.write_text(f"#!{sys.executable}\nimport sys\nfrom vijax.cli.main import main\nsys.exit(main())\n")
+    stub.write_text(f"#!{sys.executable}\nfrom vijax.cli.main import command\ncommand()\n")
     stub.chmod(0o755)
     environment = os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
     asked = 'COMP_WORDS=(vijax sweep --wall r) COMP_CWORD=3; _vijax_completion vijax; echo "${COMPREPLY[@]}"'

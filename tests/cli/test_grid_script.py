@@ -152,10 +152,9 @@ def planned(monkeypatch, folder):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sweep, "run", run)
-    monkeypatch.setattr(os, "_exit", lambda code: None)
 
     def plan(*arguments):
-        script.main(list(arguments))
+        assert script.main(list(arguments)) == 130
         return plans.pop()
 
     return plan

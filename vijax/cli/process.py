@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -44,10 +44,10 @@ def import_beside(module: str) -> None:
 
 
 def run(command: click.Command, arguments: list[str] | None = None) -> int:
-    """Run a command and return its exit code.
+    """Run a command and return its exit code, with which `leave` ends the process.
 
-    It is 0; 1 if what is to be written could not be; 2 after bad input, when nothing was run. After Ctrl-C the process
-    ends with 130, after SIGTERM with 143.
+    It is 0; 1 if what is to be written could not be; 2 after bad input, when nothing was run; 130 after Ctrl-C and 143
+    after SIGTERM.
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
@@ -63,13 +63,22 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
     except (click.Abort, KeyboardInterrupt) as error:
         cause = error.__cause__ or error
         click.echo(f"stopped; {_kept(cause)}", err=True)
-        # A compiled call cannot be stopped: leave without waiting for it.
-        os._exit(143 if isinstance(cause, _Terminated) else 130)
+        return 143 if isinstance(cause, _Terminated) else 130
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
-        os._exit(1)
+        return 1
     return 0
+
+
+def leave(code: int) -> NoReturn:
+    """End the process with the exit code of `run`, at once where the run came to no end.
+
+    A compiled call that is under way then cannot be stopped, and leaving as Python does would wait for it.
+    """
+    if code in (0, 2):
+        sys.exit(code)
+    os._exit(code)
 
 
 @contextmanager
