@@ -39,15 +39,15 @@ def slow_engine(*args, **settings):
 
 
 def prepare():
-    """The stand-in and small tiles, in this process."""
-    simulate.summarise, tiled_store.LARGEST_TILE, dispatch.places = slow_engine, MOST, lambda: jax.devices()[:1]
+    """The stand-in, in this process."""
+    simulate.summarise, dispatch.places = slow_engine, lambda: jax.devices()[:1]
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(simulate, "summarise", stand_in)
-    monkeypatch.setattr(tiled_store, "LARGEST_TILE", MOST)
+    monkeypatch.setenv("VIJAX_TILE", str(MOST))
     monkeypatch.setattr(dispatch, "places", lambda: jax.devices()[:1])
     return tmp_path
 

@@ -32,7 +32,7 @@ MOST = 6  # cells of a tile, here
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(simulate, "summarise", stand_in)
-    monkeypatch.setattr(tiled_store, "LARGEST_TILE", MOST)
+    monkeypatch.setenv("VIJAX_TILE", str(MOST))
     return tmp_path
 
 
@@ -119,7 +119,7 @@ def test_a_scheduler_that_is_lost_is_one_line(capfd, seconds):
 
 
 def test_a_tile_is_as_light_as_its_cells(folder, monkeypatch):
-    monkeypatch.setattr(tiled_store, "LARGEST_TILE", 1024)
+    monkeypatch.setenv("VIJAX_TILE", "1024")
     side = 10_000
     planned = sweeps.plan({"d": np.linspace(0.1, 0.3, side), "kappa": np.geomspace(3, 400, side)})
     with tiled_store.opened(planned, "map.zarr") as plane:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import threading
 import time
 from pathlib import Path
@@ -16,7 +17,7 @@ from vijax.batch import simulate
 from vijax.model.device import Harvester
 from vijax.model.membrane import HuntCrossley
 from vijax.model.records import Status
-from vijax.planes import dataset, dispatch
+from vijax.planes import dataset
 from vijax.planes import sweep as sweeps
 from vijax.planes.axes import cells, parse_axis
 from vijax.planes.sweep import load, save, sweep
@@ -216,9 +217,15 @@ def test_an_unknown_axis_is_named(no_engine):
 # --- cells to map and back -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("said", ["0", "some", "32769", ""])
+def test_what_is_no_number_of_cells_of_a_tile_is_met_before_anything_runs(no_engine, monkeypatch, said):
+    monkeypatch.setenv("VIJAX_TILE", said)
+    with pytest.raises(ValueError, match=re.escape(f"VIJAX_TILE must be a whole number from 1 to 32768; got {said!r}")):
+        sweep(d=0.2, kappa=3.0)
+
+
 def test_every_cell_lands_in_its_place(engine, monkeypatch):
-    monkeypatch.setattr(dispatch, "SMALLEST_TILE", 4)
-    monkeypatch.setattr(dispatch, "LARGEST_TILE", 8)
+    monkeypatch.setenv("VIJAX_TILE", "8")
     axes = {"A": [1.0, 2.0, 5.0], "kappa": [3.0, 30.0, 300.0], "gamma": [0.1, 0.0], "d": np.linspace(0.1, 0.3, 11)}
     steps = []
     here = threading.current_thread()
@@ -231,6 +238,7 @@ def test_every_cell_lands_in_its_place(engine, monkeypatch):
     np.testing.assert_allclose(found["P"], energy, rtol=1e-14)
     np.testing.assert_allclose(found["power"], energy * 6 / math.pi, rtol=1e-14)
     assert sum(count for count, *_ in engine) == 66
+    assert max(count for count, *_ in engine) <= 8
     # Level cells and the others never share a tile: each kind has its own program.
     assert all(len(set((np.asarray(pair.gamma) == 0).tolist())) == 1 for _, _, pair, _ in engine)
     assert [step[1] for step in steps] == sorted(step[1] for step in steps)
@@ -293,8 +301,7 @@ def test_admissible_asks_for_energy_and_depth(monkeypatch):
 
 
 def test_ctrl_c_drops_the_waiting_tiles(engine, monkeypatch):
-    monkeypatch.setattr(dispatch, "SMALLEST_TILE", 2)
-    monkeypatch.setattr(dispatch, "LARGEST_TILE", 2)
+    monkeypatch.setenv("VIJAX_TILE", "2")
     slow = simulate.summarise
 
     def summarise(*args, **settings):

@@ -40,7 +40,7 @@ def calls(monkeypatch):
         return stand_in(*args, count=count, **settings)
 
     monkeypatch.setattr(simulate, "summarise", summarise)
-    monkeypatch.setattr(tiled_store, "LARGEST_TILE", MOST)
+    monkeypatch.setenv("VIJAX_TILE", str(MOST))
     monkeypatch.setattr("vijax.planes.dispatch.places", lambda: jax.devices()[:1])
     return made
 
@@ -301,13 +301,11 @@ def test_tiles_are_blocks_of_at_most_so_many_cells(sizes, most, expected):
     assert tiled_store.extents(sizes, most) == expected
 
 
-def test_a_small_plane_has_tiles_for_everyone(calls, out, monkeypatch):
-    monkeypatch.setattr(tiled_store, "LARGEST_TILE", 1000)
-    monkeypatch.setattr(tiled_store, "SMALLEST_TILE", 3)
+def test_a_small_plane_has_tiles_for_everyone(monkeypatch):
     monkeypatch.setattr(tiled_store, "places", lambda: jax.devices()[:1] * 2)
-    sweep(**AXES, out=out)
-    assert len(calls) >= 4
-    assert max(calls) <= 5
+    plane = {"d": np.linspace(0.1, 0.3, 128), "kappa": np.geomspace(3, 400, 64)}
+    cells = sweeps.plan(plane).cells
+    assert math.prod(tiled_store.blocks(cells).values()) * 4 == cells.count
 
 
 def test_a_tile_of_many_variants_has_fewer_cells():
@@ -321,7 +319,7 @@ def test_a_tile_of_many_variants_has_fewer_cells():
 
 def test_tiles_stay_as_they_were_made(calls, out, monkeypatch):
     stopped_after(8, out, **AXES)
-    monkeypatch.setattr(tiled_store, "LARGEST_TILE", 20)
+    monkeypatch.setenv("VIJAX_TILE", "20")
     calls.clear()
     xr.testing.assert_identical(sweep(**AXES, out=out).load(), sweep(**AXES))
     assert max(calls[:-1]) <= MOST  # the last call is that of the sweep in memory
@@ -605,11 +603,8 @@ import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
 import vijax
-from vijax.planes import dispatch
 from vijax.runtime import tiles
 assert set(tiles.places()) == set(jax.devices())
-dispatch.SMALLEST_TILE = 128
-vijax.planes.tiled_store.LARGEST_TILE = 128
 axes = dict(d=np.linspace(0.2, 0.3, 17), r=np.linspace(0.3, 0.7, 21), wall="rigid", periods=12, until="window")
 vijax.sweep(**axes, outputs=["impacts_per_period", "restitution"], out=sys.argv[2])
 """
@@ -619,7 +614,9 @@ def test_results_do_not_depend_on_the_number_of_devices(tmp_path):
     stores = []
     for number in (1, 2):
         path = tmp_path / f"{number}.zarr"
-        subprocess.run([sys.executable, "-c", ON_DEVICES, str(number), str(path)], check=True)
+        command, environment = [sys.executable, "-c", ON_DEVICES, str(number), str(path)], {"VIJAX_TILE": "128"}
+        subprocess.run(command, env=os.environ | environment, check=True)
+        assert len(list((path / "status" / "tiles").glob("*.json"))) == 4
         stores.append(load(path))
     one, two = stores
     assert one.attrs["device"] != two.attrs["device"]

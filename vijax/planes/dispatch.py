@@ -15,8 +15,8 @@ import numpy as np
 
 from vijax.batch import simulate
 from vijax.model.pair import ImpactPair
+from vijax.planes import tile_size
 from vijax.planes.dataset import SweepPlan
-from vijax.planes.tiled_store import LARGEST_TILE, SMALLEST_TILE
 from vijax.runtime import context
 from vijax.runtime.tiles import padded, places
 
@@ -42,12 +42,12 @@ class Call(NamedTuple):
 
 def rows_for(cells: int) -> int:
     """Find how many rows the call for so many cells has: a power of two, so that few programs are compiled."""
-    return max(padded(cells), SMALLEST_TILE)
+    return max(padded(cells), tile_size.smallest())
 
 
 def rows_each(cells: int) -> int:
     """Find how many rows a call has where there are so many cells for all devices together."""
-    return min(rows_for(math.ceil(cells / len(places()))), LARGEST_TILE)
+    return min(rows_for(math.ceil(cells / len(places()))), tile_size.largest())
 
 
 def compute(planned: SweepPlan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
@@ -67,7 +67,7 @@ def _each(planned: SweepPlan, group: np.ndarray, rows: int) -> Iterator[tuple[np
     if not group.size:
         return
     # Strided tiles are samples of the whole plane: they cost the same, and nobody is left with the slow corner.
-    number = max(math.ceil(group.size / rows), min(len(places()), math.ceil(group.size / SMALLEST_TILE)))
+    number = max(math.ceil(group.size / rows), min(len(places()), math.ceil(group.size / tile_size.smallest())))
     for call, found, _ in in_turn(Call(planned, group[first::number], rows, first) for first in range(number)):
         yield call.cells, found
 

@@ -17,7 +17,7 @@ import numpy as np
 from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
 from vijax.model.device import Harvester, one_device
 from vijax.model.membrane import HuntCrossley, Law
-from vijax.planes import cluster, dispatch, estimate, tiled_store
+from vijax.planes import cluster, dispatch, estimate, tile_size, tiled_store
 from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, Cells, cells
 from vijax.planes.dataset import DEFAULT, SweepPlan, label, variables, warn_if_held
@@ -162,6 +162,7 @@ def plan(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
     """
+    tile_size.largest()  # what is wrong with the environment is said before anything runs
     method = settings.integrator()
     if outputs is None:
         outputs = (name for name in OUTPUTS if name not in ON_REQUEST)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vijax.planes import inventory, store_metadata
+from vijax.planes import inventory, store_metadata, tile_size
 from vijax.planes.axes import Cells
 from vijax.planes.dataset import SweepPlan, made_by
 from vijax.planes.store import check_place, check_store, encoded, view
@@ -29,9 +29,6 @@ from vijax.runtime.tiles import places
 if TYPE_CHECKING:
     import xarray as xr
 
-# Cells of a tile: the largest take a core a second or two, large enough to keep lanes full and files few, small enough
-# to lose.
-SMALLEST_TILE, LARGEST_TILE = 1024, 32768
 # Tiles of a small plane for everyone who takes some. With one each, all wait for whoever has the dearest block.
 _SHARES = 2
 # Factor by which a share may be larger, as halves of odd lengths are rounded up: without, it would be halved once more.
@@ -222,9 +219,9 @@ def _birth(path: Path) -> str:
 
 def _most(of: Cells) -> int:
     """Find how many cells a tile has, at most."""
-    share = max(int(_ROUNDING * of.count / (_SHARES * len(places()))), SMALLEST_TILE)
+    share = max(int(_ROUNDING * of.count / (_SHARES * len(places()))), tile_size.smallest())
     room = _LARGEST_CHUNK // math.prod(of.sizes[dim] for dim in of.variant)
-    return min(share, LARGEST_TILE, max(room, 1))
+    return min(share, tile_size.largest(), max(room, 1))
 
 
 def _found(planned: SweepPlan, path: Path) -> Study:
