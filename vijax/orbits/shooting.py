@@ -212,6 +212,8 @@ class _Descent(eqx.Module):
     iteration: Int[Array, ""]
 
 
+# optimistix in its place (`python benchmarks/newton.py`): Newton without damping takes 1.1 to 1.2 times as long near
+# orbits and finds a third fewer from random guesses; the dogleg finds about as many, in 1.3 to 3.4 times the time.
 def newton(
     pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"], max_iterations: int = _MOST_ITERATIONS
 ) -> tuple[Float[Array, "orbit impact 3"], Float[Array, "orbit"]]:
