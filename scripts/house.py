@@ -1,9 +1,10 @@
-"""Print how vijax is laid out: what stands at its top, and how rooms and folders import each other.
+"""Print how vijax is laid out: what stands at its top, how rooms and folders import each other, and what is longest.
 
     python scripts/house.py
 
 A room is a module, a folder is what stands at the top of the package. An arrow is drawn from whoever imports to what is
-imported, however often and at whatever depth, once. Floors are counted along the longest way down the arrows.
+imported, however often and at whatever depth, once. Floors are counted along the longest way down the arrows. Lines of
+a function are those of its signature and body, without its docstring.
 """
 
 import ast
@@ -69,6 +70,30 @@ def count(arrows: Arrows) -> int:
     return sum(len(below) for below in arrows.values())
 
 
+def named_alike(package: Path = PACKAGE) -> dict[str, list[str]]:
+    """Find the names that several classes of a package have, and the rooms that these stand in."""
+    found: dict[str, list[str]] = {}
+    for path in sorted(package.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, []).append(_dotted(path, package))
+    return {name: rooms for name, rooms in found.items() if len(rooms) > 1}
+
+
+def lengths(package: Path = PACKAGE) -> tuple[dict[str, int], dict[str, int]]:
+    """Count the lines of every room, and of every function."""
+    of_rooms, of_functions = {}, {}
+    for path in sorted(package.rglob("*.py")):
+        text, name = path.read_text(encoding="utf-8"), _dotted(path, package)
+        of_rooms[name] = len(text.splitlines())
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                said = node.body[0] if ast.get_docstring(node) else None
+                silent = 0 if said is None else _lines(said)
+                of_functions[f"{name}.{node.name}:{node.lineno}"] = _lines(node) - silent
+    return of_rooms, of_functions
+
+
 def at_the_top(package: Path = PACKAGE) -> list[str]:
     """List the folders and files at the top of a package."""
     return sorted(path.name for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists())
@@ -83,10 +108,17 @@ def lines(package: Path = PACKAGE) -> Iterable[str]:
         yield f"{what}: {len(arrows)}, on {floors(arrows)} floors, {count(arrows)} arrows between them"
     across = sum(_top(name) != _top(other) for name, below in between_rooms.items() for other in below)
     yield f"arrows from a room of one folder to a room of another: {across}"
+    for what, lines_of in zip(("room", "function"), lengths(), strict=True):
+        longest = max(lines_of, key=lambda name: lines_of[name])
+        yield f"longest {what}: {longest}, {lines_of[longest]} lines"
 
 
 def _dotted(path: Path, package: Path) -> str:
     return ".".join([package.name, *path.relative_to(package).with_suffix("").parts])
+
+
+def _lines(node: ast.stmt) -> int:
+    return (node.end_lineno or node.lineno) - node.lineno + 1
 
 
 def _top(name: str) -> str:

@@ -69,6 +69,28 @@ def test_the_house_is_small_enough_to_know():
     assert len(rooms) == len([path for path in PACKAGE if path.name != "__init__.py"])
 
 
+def test_rooms_and_functions_are_short_enough_to_read():
+    rooms, functions = house.lengths()
+    assert {name: lines for name, lines in rooms.items() if lines > 400} == {}
+    assert {name: lines for name, lines in functions.items() if lines > 50} == {}
+    assert len(functions) > 1000
+
+
+def test_one_noun_is_one_record():
+    """A name that two rooms give to two things says neither."""
+    assert house.named_alike() == {}
+
+
+def test_lengths_and_namesakes_are_counted(tmp_path):
+    (tmp_path / "one.py").write_text(
+        'class Tile:\n    def lay(self):\n        """Lay it.\n\n        Flat.\n        """\n        return 1\n'
+    )
+    (tmp_path / "two.py").write_text("class Tile:\n    pass\n")
+    package = tmp_path.name
+    assert house.lengths(tmp_path) == ({f"{package}.one": 7, f"{package}.two": 2}, {f"{package}.one.lay:2": 2})
+    assert house.named_alike(tmp_path) == {"Tile": [f"{package}.one", f"{package}.two"]}
+
+
 def test_rooms_arrows_and_floors_are_read_as_python_does(tmp_path):
     package = tmp_path / "hut"
     for file, text in {

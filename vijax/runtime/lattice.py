@@ -9,7 +9,8 @@ def lattice(count: int, size: int) -> np.ndarray:
     """Spread points evenly over a unit cube, [size, point].
 
     Multiples, modulo 1, of the powers of 1/x for the root of x^(size + 1) = x + 1: along a line the golden ratio, and
-    as even in more dimensions as that is on a line. Unlike a grid there may be any number of them.
+    as even in more dimensions as that is on a line. Unlike a grid there may be any number of them. On a plane they are
+    as even as Halton's points of `scipy.stats.qmc`, which takes 0.7 s to import.
 
     Args:
         count: How many.
