@@ -17,7 +17,7 @@ import xarray as xr
 import vijax
 from vijax.batch import simulate
 from vijax.design import optimise, optimum, report
-from vijax.design.report import lines, table
+from vijax.design.report_lines import lines, table
 from vijax.design.robustness import surroundings, weighted
 from vijax.design.tolerance import Tolerance, nodes
 from vijax.model import device
@@ -464,8 +464,8 @@ CALLS: Table = {
         {"design": a_design()},
         {"design": (3, None, "best"), "surroundings": (3, "all"), "diagram": (3, a_map()), "tolerances": (3, [3])},
     ),
-    "report.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design(), {})}),
-    "report.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
+    "report_lines.lines": (lambda report: next(lines(report)), {}, {"report": (3, None, "best", a_design(), {})}),
+    "report_lines.table": (lambda report: next(table(report)), {}, {"report": (3, None, "best")}),
     "designs.design": (
         designs.design,
         {"diagram": a_map(), "report": {"best": None}},

@@ -15,9 +15,9 @@ import pytest
 import vijax
 from scripts import design as script
 from vijax.design import objective, off_design, optimise
-from vijax.design import report as reports
 from vijax.design import robustness as around
 from vijax.design.objective import Batch, Scene
+from vijax.design.report_lines import table
 from vijax.design.tolerance import Tolerance, nodes
 from vijax.model.device import Harvester
 from vijax.model.records import Status
@@ -395,6 +395,6 @@ def test_what_a_survey_met_says_what_to_do():
         ({}, "nothing that settles"),
     ):
         one = {"best": None, "survey": nothing | met}
-        (line,) = reports.table({"over": {"name": "d", "values": [0.1]}, "designs": [one]})
+        (line,) = table({"over": {"name": "d", "values": [0.1]}, "designs": [one]})
         assert line.startswith("d 0.1: no admissible motion; ")
         assert says in line

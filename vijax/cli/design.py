@@ -155,9 +155,9 @@ def _write(whole: dict[str, Any], diagram: "xr.Dataset | None", written: Path | 
 
 
 def _lines(whole: dict[str, Any]) -> Iterable[str]:
-    from vijax.design import report
+    from vijax.design.report_lines import lines, table
 
-    return report.table(whole) if "over" in whole else report.lines(whole)
+    return table(whole) if "over" in whole else lines(whole)
 
 
 def _devices(

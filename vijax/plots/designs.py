@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vijax.design.report import amount, factors
+from vijax.design.report import factors
+from vijax.design.report_lines import amount
 from vijax.design.variables import LINEAR, constant
 from vijax.model.units import UNITS
 from vijax.plots.figure import styled
