@@ -237,10 +237,15 @@ def ode(quick: bool) -> Iterator[Row]:
         print(f"{what:6} {typical(rows, what).cell_period:7.1f} us per cell-period")
     ratio = typical(rows, "chain").cell_period / typical(rows, "ode").cell_period
     print(f"ode is {ratio:.1f} times faster")
-    exact = vijax.trajectory(pair, U0, V0, chained, max_impacts=64).states
-    near = vijax.trajectory(pair, U0, V0 * (1 + 1e-9), chained, max_impacts=64).states
     stepped = vijax.trajectory(pair, U0, V0, chained, max_impacts=64, method="ode", rtol=rtol).states
     found["ode"] = tuple(np.asarray(x)[:, -1] for x in (stepped.u, stepped.v))
+    tell_errors(found, pair, chained, rtol)
+
+
+def tell_errors(found: dict[str, Any], pair: Any, chained: int, rtol: float) -> None:
+    """Print how far off final displacements and velocities are, and whether a cell's sensitivity explains it."""
+    exact = vijax.trajectory(pair, U0, V0, chained, max_impacts=64).states
+    near = vijax.trajectory(pair, U0, V0 * (1 + 1e-9), chained, max_impacts=64).states
     true = [np.asarray(x)[:, -1] for x in (exact.u, exact.v)]
     # How far a change of 1e-9 at the start goes tells what a cell's sensitivity explains.
     growth = np.hypot(*(np.asarray(x)[:, -1] - y for x, y in zip((near.u, near.v), true, strict=True))) / (1e-9 * V0)

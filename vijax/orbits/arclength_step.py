@@ -150,8 +150,4 @@ def _compiled(arcs: Arc, y, tangent, length):
 
 def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
     """Go on from points of branches by an arclength each: the compiled program behind every step and every search."""
-    parts = []
-    for tile in tiles.tiles(y.shape[0], _BATCHES):
-        rows = jax.tree.map(lambda leaf, rows=tile.rows: np.asarray(leaf)[rows], (arcs, y, tangent, length))
-        parts.append(jax.tree.map(lambda leaf, real=tile.real: np.asarray(leaf)[:real], _compiled(*rows)))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return tiles.map_tiles(lambda rows: _compiled(*rows), (arcs, y, tangent, length), _BATCHES)
