@@ -149,6 +149,8 @@ def verified(
     sequence = starts.some(np.array(good)).flown.sequence(width)
     found = periodic.solve(jax.vmap(lambda d: d.pair())(many), sequence, jnp.array(wide))
     seen = states(own, found)
+    # The ascent followed equations of an orbit. That the ball flies it, nothing in between met, and is drawn to it, is
+    # asked only now, of the few ends that are left.
     attracts = np.array([found.status[row] == Status.OK == seen[row].status for row in range(len(own))])
     names = orbit_properties.labels(found)
     optima: list[list[Optimum]] = [[] for _ in devices]

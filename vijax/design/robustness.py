@@ -86,6 +86,7 @@ def surroundings(
     if not isinstance(optimum, Optimum):
         share = sum(one.share for one in attractors if one.label == optimum.label)
         return Surroundings(share, attractors, None, None)
+    # Several attractors may have the design's label; by its P its own is known among them.
     own = float(orbit_properties.power(optimum.orbit, optimum.device)[0])
     share = sum(one.share for one in attractors if math.isclose(one.P, own, rel_tol=_SAME))
     return Surroundings(share, attractors, _edge(optimum, "down", reach), _edge(optimum, "up", reach))
@@ -108,6 +109,7 @@ def _attractors(device: Harvester, starts: int, seed: int | None) -> tuple[Neigh
 
 def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
     device = optimum.device
+    # Of all that the motion depends on, omega0 changes kappa alone.
     kappa = float(device.omega0) * math.pi / float(device.omega)
     within = ((1 - reach) * kappa, (1 + reach) * kappa)
     (followed,) = continuation.follow(optimum.orbit, "kappa", within, direction=way)
@@ -163,6 +165,7 @@ def _searched(design: Design, optimum: Optimum, starts: int, reach: float, point
 
     height = score(z)
     for index in range(len(names)):
+        # First the whole reach, then what lies between the neighbours of the best point there.
         for span in (reach, 2 * reach / (points - 1)):
             line = np.tile(z, (points, 1))
             line[:, index] += span * np.linspace(-1, 1, points)

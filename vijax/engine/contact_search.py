@@ -206,6 +206,8 @@ def turning_points(
         seeking = v.going & (first | ~settled)
         rate = force.later(s).at(zero) - m.mu * z - m.kappa * m.kappa * w
         z = jnp.where(s == 0, z, 0.0)  # A turning point's own w' is zero, not its rounding error.
+        # The search wants a function that rises from zero: w' after a minimum, -w' after a maximum. As w' obeys w's own
+        # equation, forced by the derivative of the forcing, its state is w' and w'', which is `rate`.
         later = slope.later(s)
         sought = jax.tree.map(lambda x, slope: jnp.where(first, x, v.sign * slope), (force, w0, z0), (later, z, rate))
         limit = jnp.where(first, jnp.inf, seen.exit - s)

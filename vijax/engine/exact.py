@@ -60,7 +60,7 @@ def _soft_contact(
     """Find duration (inf: for ever), outward speed -w' at the exit, and largest penetration of a contact."""
     force = flow.contact_force(pair.gamma, side, t)
     args = (wall, force, w0, z0)
-    frozen = lax.stop_gradient(args)
+    frozen = lax.stop_gradient(args)  # as in `_onset`
     if deep:
         duration, when = exit_and_crest(*frozen, wanted, patience)
     else:
@@ -97,6 +97,7 @@ def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, hel
     force = flow.contact_force(pair.gamma, side, t)
     push = force.at(jnp.zeros_like(t))
     spell = spell_after(lax.stop_gradient(force), jnp.zeros_like(t))
+    # Each bounce that is left is r times as fast as the last one, under a push that hardly changes meanwhile.
     out = pair.r * speed
     chatter = 2 * out / jnp.where(push > 0, push, 1.0) / jnp.maximum(1 - pair.r, jnp.finfo(t.dtype).tiny)
     tired = (out < stick_speed(t.dtype)) & (push > 0) & (chatter < _STICK_SHARE * spell.end) & (pair.r < 1)
@@ -113,6 +114,8 @@ def _onset(pair: ImpactPair, state: State, horizon: Scalar, wanted: Flag) -> tup
     """
     room = (0.5 * pair.d + state.u, 0.5 * pair.d - state.u)
     force = flow.flight_force(pair.gamma, state.t)
+    # The search is not differentiated: `implicit_root` adds the derivatives of the time that it finds. Where it finds
+    # none, the harmless time 1 stands there meanwhile, as both sides of a `where` are differentiated.
     sought = lax.stop_gradient((force, room, state.v, horizon))
     flight, side = next_wall(*sought, wanted)
     reached = wanted & (side != 0)

@@ -142,21 +142,27 @@ class Ode(Method[OdeCarry]):
         trial = _try(self, _solver(self, recorded), m, FieldArguments(pair.gamma, m.mode, wall), recorded)
         landing = land(m, half, trial)
         sight = look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
+        # Nearly all that follows reads both: without `share` XLA would compute them again for each reader.
         landing, sight = share((landing, sight))
         shut = landing.onset | landing.exits
+        # A step on whose way something happens is not taken but tried again, up to there. One that was cut for an event
+        # and has met it is taken as it is: what its dense output shows there is that same event.
         seen = trial.passes & sight.seen & ~shut & ~landing.crest
         seen, moved = decided((seen, trial.passes & ~seen))
         side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
         y = meet(m, half, side, wall, trial, landing)
         t = trial.t + landing.delay
+        # The phase stays within one period: a time that only grew would lose digits as it does.
         over = decided(t >= 2)
         t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
         n = m.n + (moved & over).astype(m.n.dtype)
         outcome = _outcome(m, half, side, y, t, n, landing.speed)
+        # A step so short will never pass: this cell would hold its lane for ever. NaN compares false, and is lost too.
         lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
         outcome = eqx.tree_at(lambda p: p.impact.v_out, outcome, jnp.where(lost, jnp.nan, outcome.impact.v_out))
 
         if y.tangent is not None:
+            # The tangent map of an impact is from exit to exit, and whoever adds impacts up multiplies these.
             unit = (1.0, 0.0, 0.0, 1.0)
             fresh = tuple(jnp.where(landing.exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
             y = eqx.tree_at(lambda y: y.tangent, y, fresh)
@@ -205,6 +211,7 @@ def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: SolverState, y
     """Say whether a step is accepted, and how long the next is; the error of position and velocity alone decides."""
     if engine.dt is not None:
         return jnp.ones_like(t0, bool), jnp.full_like(t0, engine.dt)
+    # By its defaults an integral controller: it does not read the errors of earlier steps, for which ones stand below.
     controller = diffrax.PIDController(rtol=engine.rtol, atol=engine.atol)
     t0, t1, y0, y1, error = lax.stop_gradient((t0, t1, y0, y1, error))
     (x0, z0), (x1, z1), (e_x, e_z) = ((y.x, y.z) for y in (y0, y1, error))
@@ -212,6 +219,7 @@ def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: SolverState, y
     keep, begin, end, _, _, _ = controller.adapt_step_size(
         t0, t1, (x0, z0), (x1, z1), None, (e_x, e_z), order, (one, one, jnp.asarray(False))
     )
+    # An error that is not finite says nothing of how much shorter the step must be.
     h = end - begin
     return keep, jnp.where(jnp.isfinite(h), h, 0.2 * (t1 - t0))
 
@@ -221,10 +229,12 @@ def _try(engine: Ode, solver: Solver, m: OdeCarry, spell: FieldArguments, record
     h = jnp.minimum(lax.stop_gradient(m.h), LONGEST)
     t = m.t + h
     if recorded:
+        # The states at phase 0 are asked for: no step goes past one, and it ends there exactly, which a sum might miss.
         room = lax.stop_gradient(2 - m.t)
         ends = decided(h >= room)
         t, h = jnp.where(ends, 2.0, t), jnp.where(ends, room, h)
     no = jnp.zeros_like(m.cut)
+    # The dense output needs the slope at the start; solvers whose first stage it is are handed it.
     f0 = _field(m.t, m.y, spell)
     fsal = solver.tableau.fsal
     y, error, _, last, _ = solver.step(equation_38, m.t, t, m.y, spell, (no, f0) if fsal else None, no)

@@ -75,6 +75,7 @@ def look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) ->
     """
     one, zero = jnp.ones_like(half), jnp.zeros_like(half)
     z0, z1, bend0, bend1 = dense.c1, dense.rate(one), dense.c2, dense.bend(one)
+    # From rest the ball goes where its velocity at the end of the step points, for it turns at most once within one.
     heading = jnp.where(z0 == 0, jnp.sign(z1), jnp.sign(z0))
     turns = heading * z1 < 0
     turning = root(lambda s: (-heading * dense.rate(s), -heading * dense.bend(s)), zero, one)
@@ -86,6 +87,7 @@ def look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) ->
     middle = jnp.where(turns, turning, one)
     first = (~held | (heading < 0)) & (heading * dense.place(middle) > wall)
     second = turns & ~first & (~held | (heading > 0)) & (-heading * dense.place(one) > wall)
+    # Up to the turning the position is monotone, and so it is from there on: either part holds one crossing or none.
     aim = jnp.where(first, heading, -heading)
     low, high = jnp.where(first, 0.0, middle), jnp.where(first, middle, 1.0)
     crossing = root(lambda s: (aim * dense.place(s) - wall, aim * dense.rate(s)), low, high)
@@ -118,6 +120,7 @@ def land(m: OdeCarry, half: Scalar, trial: Trial) -> Landing:
     x, z, push = trial.y.x, trial.y.z, trial.f.z
     gap, speed, drive = aim * x - jnp.where(held, 0.0, half), aim * z, aim * push
     square = speed * speed - 2 * drive * gap
+    # Both sides of a `where` are differentiated: where there is no root that of 1 is taken, whose slope is finite.
     root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     both = speed + root
     real = ((square >= 0) | (gap > 0)) & ((root > 0) | (drive > 0))

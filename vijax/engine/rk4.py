@@ -108,6 +108,7 @@ class Rk4(Method[Rk4Carry]):
         work = jnp.where(onset, 0.0, m.work + 0.5 * h * power)
         t = m.offset + new.k * h
         outcome = _outcome(replace(new, mode=mode, work=work), m.mode, t)
+        # A ball that leaves begins a new tangent map: that of an impact is from exit to exit.
         tangent = new.tangent
         if tangent is not None:
             unit = (1.0, 0.0, 0.0, 1.0)
@@ -142,6 +143,7 @@ def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Rk4Carry) -> Rk4Carry:
         a, b, c, d = m.tangent
         (_, (p, q)), (_, (r, s)) = (jax.jvp(move, (m.u, m.v), column) for column in ((a, c), (b, d)))
         tangent = (p, r, q, s)
+    # Samples are counted, and a phase is their number times h: a sum of so many steps would drift off the grid.
     k = m.k + 1
     over = k >= steps
     k, n = jnp.where(over, 0.0, k), m.n + over.astype(m.n.dtype)

@@ -143,7 +143,9 @@ def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings
     while going.any():
         there = advance(arcs, y, tangent, length)
         straight = (there.tangent * tangent).sum(axis=1)
+        # Newton may end on another branch, or far along this one: neither its direction nor its distance fits then.
         near = np.linalg.norm(there.y - y, axis=1) < 2 * length
+        # Of two things within a step one may hide the other's change of sign, so that each gets a step of its own.
         single = (happenings(tests, there.tests) <= 1) | (length < settings.crowded_step)
         good = going & (there.size <= settings.newton_tolerance) & (straight > settings.min_cosine) & near & single
         for lane in np.flatnonzero(good):
@@ -153,6 +155,7 @@ def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings
         new = (there.y, there.tangent, there.tests)
         y, tangent, tests = (np.where(good[:, None], *pair) for pair in zip(new, (y, tangent, tests), strict=True))
         length = np.where(good, longer, 0.5 * length)
+        # Past a grazing or a bound there is no orbit. The first such point is kept: between it and the last is the end.
         real = (tests[:, FIRST_END:] > 0).all(axis=1) | ~good
         short = np.array([len(lane) < points for lane in passed])
         # A closed branch comes by its start again, in the same direction.

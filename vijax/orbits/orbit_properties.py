@@ -96,6 +96,7 @@ def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
     own = tiles.library((check_orbit(orbit), device))
     orbit, device = jax.tree.map(own.asarray, (orbit, device))
     energy = own.asarray(harvested_energy(device, orbit.depth * depth_unit(orbit, device)))
+    # The span of an orbit is in half forcing periods, for their length is the unit of time.
     return tiles.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
 
 

@@ -163,6 +163,7 @@ def linearise(
     # Entry (impact, equation, impact, knot).
     full = here[:, None, :, None] * blocks[:, :, None, :3]
     full = full.at[..., :2].add(there[:, None, :, None] * blocks[:, :, None, 3:5])
+    # Where there is no impact the identity keeps the matrix regular, and the step there zero.
     idle = here[:, None, :, None] * jnp.eye(3, dtype=knots.dtype)[None, :, None, :]
     full = jnp.where(real[:, None, None, None], full, idle)
     slope, missing = full.reshape(3 * width, 3 * width), jnp.where(real[:, None], pieces, 0.0).reshape(-1)

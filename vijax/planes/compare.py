@@ -202,6 +202,7 @@ def cheapest_model(found: "xr.Dataset", tolerance: float) -> "xr.DataArray":
     checks.variables("found", found, ("relative_difference", "relative_difference_stderr", "status_soft"), "compare")
     difference, doubt = found["relative_difference"], SURE * found["relative_difference_stderr"]
     ended = found["status_soft"].isin(_SETTLED) & found["status_rigid"].isin(_SETTLED)
+    # Where neither holds, noise could turn the verdict.
     enough, short = difference + doubt <= tolerance, difference - doubt > tolerance
     verdict = short.astype(np.int8).where(ended & (enough | short), Model.UNDECIDED)
     verdict = _flags(verdict, Model, f"cheapest model whose P is within {100 * tolerance:.6g} %", found)
@@ -223,6 +224,7 @@ def rigid_from(cheapest: "xr.DataArray") -> "xr.DataArray | None":
     axis = next((dim for dim in cheapest.dims if dim in synonyms("kappa")), None)
     if axis is None:
         return None
+    # From the stiffest cell down, a product is 1 as long as no cell has failed.
     enough = (cheapest == Model.RIGID).sortby(axis, ascending=False)
     onset = enough[axis].where(enough.astype(int).cumprod(axis) == 1).min(axis)
     onset.attrs = {
