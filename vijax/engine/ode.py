@@ -160,12 +160,7 @@ class Ode(Method[OdeCarry]):
         # A step so short will never pass: this cell would hold its lane for ever. NaN compares false, and is lost too.
         lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
         outcome = eqx.tree_at(lambda p: p.impact.v_out, outcome, jnp.where(lost, jnp.nan, outcome.impact.v_out))
-
-        if y.tangent is not None:
-            # The tangent map of an impact is from exit to exit, and whoever adds impacts up multiplies these.
-            unit = (1.0, 0.0, 0.0, 1.0)
-            fresh = tuple(jnp.where(landing.exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
-            y = eqx.tree_at(lambda y: y.tangent, y, fresh)
+        y = _renewed(y, landing.exits)
         h, full, other = decided(_lengths(self, m, trial, sight, seen, moved, shut))
         depth = jnp.where(landing.crest, jnp.maximum(m.depth, y.x), m.depth)
         new = OdeCarry(
@@ -243,6 +238,15 @@ def _try(engine: Ode, solver: Solver, m: OdeCarry, spell: FieldArguments, record
     passes, h_next = _control(engine, solver.error_order(equation_38), m.t, t, m.y, y, error)
     dense = share(dense_output(h, *lax.stop_gradient((m.y, f0, y, f))))
     return Trial(h, t, y, f, passes, h_next, dense)
+
+
+def _renewed(y: SolverState, exits: Flag) -> SolverState:
+    """Begin a tangent map at an exit: those of impacts are from exit to exit, and whoever adds them up multiplies."""
+    if y.tangent is None:
+        return y
+    unit = (1.0, 0.0, 0.0, 1.0)
+    fresh = tuple(jnp.where(exits, one, value) for one, value in zip(unit, y.tangent, strict=True))
+    return eqx.tree_at(lambda y: y.tangent, y, fresh)
 
 
 def _lengths(engine: Ode, m: OdeCarry, trial: Trial, sight: Sight, seen: Flag, moved: Flag, shut: Flag):
