@@ -159,3 +159,13 @@ def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     assert table["A"].attrs["units"] == "m s-2"
     last = with_constants(DEVICE, A=float(one.values[-1]))
     assert float(table["P"][0, -1]) == pytest.approx(float(orbit_properties.power(one.orbit[-1:], last)[0]), rel=1e-12)
+
+
+def test_a_family_ends_where_its_orbit_fades():
+    """The branch of the lower 1:1 orbit ends in impacts of speed zero, at a pitchfork that no ball flies."""
+    found = orbit_search.search(impact_pair(0.28, 120.0, 0.6), "RL")
+    branches = switching.family(found, "d", (0.2, 0.3))
+    pitchforks = points(branches, "pitchfork")
+    faded = [int(point.orbit.status[0]) == Status.VIRTUAL for point in pitchforks]
+    assert sorted(faded) == [False, True]
+    assert pitchforks[faded.index(True)].value == pytest.approx(2 / np.pi**2, rel=1e-12, abs=0)

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from vijax.model.device import Harvester, one_device
+from vijax.model.records import Status
 from vijax.orbits import orbit_properties, shooting, symmetry
 from vijax.orbits.arclength_step import BranchPlace, Tests
 from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, heading, set_out
@@ -72,6 +73,11 @@ def _begins(point: Point) -> bool:
     return point.kind == "flip" or (point.kind == "pitchfork" and bool(point.orbit.sequence.mirrored[0]))
 
 
+def _real(point: Point) -> bool:
+    """Say whether a ball flies the orbit of a point: at the very end of a branch, where impacts fade, none may."""
+    return bool(point.orbit.status[0] == Status.OK)
+
+
 @door
 def family(
     orbit: Orbit,
@@ -105,7 +111,7 @@ def family(
         grown += _new(follow(one, along, within, **told), grown, settings)
     youngest = grown
     for _ in range(max_switches):
-        where = [point for branch in youngest for point in branch.points if _begins(point)]
+        where = [point for branch in youngest for point in branch.points if _begins(point) and _real(point)]
         youngest = []
         for point in where:
             youngest += _new(switch(point, along, within, **told), grown + youngest, settings)
