@@ -241,17 +241,46 @@ def long_periods(count: int) -> None:
     say("labels of long periods that a flight does not keep", 1 - kept.mean(), 5e-3, f"{count:,} of {cells:,} cells")
 
 
-def _labelled(d: np.ndarray, kappa: np.ndarray, r: np.ndarray, **settings: Any) -> simulate.Summary:
-    """Summarise level cells at the default start, in a padded tile."""
+def slow_cells(count: int) -> None:
+    """Compare verdicts on cells that are slow to converge with those of searches for many more periods."""
+    draw, cells, undecided = np.random.default_rng(107), 0, 0
+    met: list[list[Any]] = []
+    while sum(d.size for d, *_ in met) < count:
+        d, r = draw.uniform(0.02, 0.6, 65536), draw.uniform(0.2, 0.9, 65536)
+        kappa = np.exp(draw.uniform(np.log(2), np.log(1000), d.size))
+        gamma = draw.uniform(-0.5, 0.5, d.size) * (draw.random(d.size) < 0.5)
+        found = _labelled(d, kappa, r, gamma, periods=400)
+        some = np.flatnonzero(found.status == vijax.Status.CONVERGING)
+        kinds = found.period, found.impacts_left, found.impacts_right, found.fastest
+        met.append([x[some] for x in (d, kappa, r, gamma, *kinds)])
+        cells, undecided = cells + d.size, undecided + (found.status == vijax.Status.SLOW).sum()
+    d, kappa, r, gamma, period, left, right, fastest = (np.concatenate(x)[:count] for x in zip(*met, strict=True))
+    parts = [slice(at, at + 8192) for at in range(0, count, 8192)]
+    later = jax.tree.map(
+        lambda *part: np.concatenate(part),
+        *(_labelled(d[at], kappa[at], r[at], gamma[at], periods=FLOWN) for at in parts),
+    )
+    same = (later.period == period) & (later.impacts_left == left) & (later.impacts_right == right)
+    known = later.status != vijax.Status.SLOW
+    wrong = known & ~(same & (np.abs(later.fastest / fastest - 1) < 1e-6))
+    say(f"slow cells with another motion by {FLOWN:,} periods", wrong.sum(), 0, f"{known.sum():,} of {cells:,} cells")
+    say("cells undecided after 400 periods", undecided / cells, 1e-3)
+
+
+def _labelled(
+    d: np.ndarray, kappa: np.ndarray, r: np.ndarray, gamma: np.ndarray | None = None, **settings: Any
+) -> simulate.Summary:
+    """Summarise cells, level ones unless gamma is given, at the default start, in a padded tile."""
     rows = np.resize(np.arange(d.size), max(1 << (d.size - 1).bit_length(), 512))
-    pair = ImpactPair(*(jnp.asarray(x[rows]) for x in (d, kappa, r, np.zeros_like(d))))
+    gamma = np.zeros_like(d) if gamma is None else gamma
+    pair = ImpactPair(*(jnp.asarray(x[rows]) for x in (d, kappa, r, gamma)))
     u0, v0, one = jnp.minimum(0.05853, 0.49 * pair.d), jnp.full(rows.size, -0.47898), jnp.ones(rows.size)
     scale = simulate.Scale(one, one, jnp.ones(1), jnp.ones(1))
     found = simulate.summarise(pair, u0, v0, scale, Harvester(), outputs=frozenset({"fastest"}), **settings)
     return jax.tree.map(lambda x: np.asarray(x)[: d.size], found)
 
 
-PARTS = "reference", "plane", "audit", "quick", "gradients", "steady", "labels"
+PARTS = "reference", "plane", "audit", "quick", "gradients", "steady", "labels", "slow"
 
 
 def _parts(quick: bool) -> tuple[Callable[[], None], ...]:
@@ -264,6 +293,7 @@ def _parts(quick: bool) -> tuple[Callable[[], None], ...]:
         gradients,
         lambda: steady_states(350 if quick else 7000),
         lambda: long_periods(500 if quick else 10_000),
+        lambda: slow_cells(500 if quick else 10_000),
     )
 
 

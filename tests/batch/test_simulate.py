@@ -76,32 +76,60 @@ def known(name):
 
 
 def test_periodic_cells_have_the_known_period_counts_and_power(plane):
-    slow = plane.status == Status.SLOW
-    assert not np.any(PERIODIC & (plane.period == 0)), "a periodic cell was called aperiodic"
-    assert np.sum(PERIODIC & slow) <= 1
-    sure = PERIODIC & ~slow
-    assert np.all(plane.status[sure] == Status.OK)
+    assert not np.any(PERIODIC & (plane.period <= 0)), "a periodic cell was called aperiodic, or is undecided"
+    sure = PERIODIC
+    assert np.sum(plane.status[sure] != Status.OK) <= 1, "one cell is slow to converge"
+    assert np.all(np.isin(plane.status[sure], (Status.OK, Status.CONVERGING)))
     counts = [(cell["p"], cell.get("left"), cell.get("right")) for cell in PLANE]
     assert [(i, *counts[i]) for i in np.flatnonzero(sure)] == [
         (i, plane.period[i], plane.impacts_left[i], plane.impacts_right[i]) for i in np.flatnonzero(sure)
     ]
-    np.testing.assert_allclose(plane.P[sure, 0], known("P_J")[sure], rtol=1e-9)
+    # The reference flew, and of the slow cell it had 7 digits.
+    error = np.abs(plane.P[:, 0] / known("P_J") - 1)
+    assert np.all(error[sure] < np.where(plane.status[sure] == Status.OK, 1e-9, 2e-7))
     assert np.all(plane.P_stderr[sure] == 0)
 
 
 def test_orbits_have_the_known_impact_speeds(plane):
-    sure = np.flatnonzero(PERIODIC & (plane.status == Status.OK))
+    sure = np.flatnonzero(PERIODIC)
     fastest = [np.max(np.abs(PLANE[i]["impact_velocities"])) for i in sure]
     number = [len(PLANE[i]["impact_velocities"]) / PLANE[i]["p"] for i in sure]
-    np.testing.assert_allclose(plane.fastest[sure], fastest, rtol=1e-9)
+    error = np.abs(plane.fastest[sure] / fastest - 1)
+    assert np.all(error < np.where(plane.status[sure] == Status.OK, 1e-9, 5e-6))
     np.testing.assert_allclose(plane.impacts_per_period[sure], number, rtol=1e-12)
 
 
-def test_a_slow_cell_has_averages_near_the_orbit_it_creeps_to(plane):
-    slow = PERIODIC & (plane.status == Status.SLOW)
-    assert np.all(plane.period[slow] == -1)
-    assert np.all(plane.impacts_left[slow] == -1)
-    np.testing.assert_allclose(plane.P[slow, 0], known("P_J")[slow], rtol=1e-3)
+# Near pitchforks, flips and folds of the default map, what motion has come to after 20,000 periods: d, kappa, label, P.
+CREEPING = [
+    (0.250587084148728, 114.10653837567223, (1, 1, 1), 2.4991626464094018e-05),
+    (0.2589041095890411, 288.8515052612388, (1, 1, 1), 2.9087026003962114e-06),
+    (0.10528375733855186, 17.977972596496514, (1, 2, 1), 0.0010050879020658489),
+    (0.05684931506849315, 41.752192215870146, (1, 2, 2), 6.981420865886072e-05),
+    (0.14246575342465753, 32.24056743462479, (2, 4, 2), 0.00034256965984922147),
+    (0.13463796477495107, 243.12161058938304, (8, 14, 8), 2.3007413405909074e-06),
+]
+
+
+def test_a_slow_cell_is_decided_by_the_orbit_that_it_creeps_to():
+    found = summarise([cell(d, kappa, u0=0.0, v0=0.4) for d, kappa, *_ in CREEPING], 400, variants=ALONE)
+    assert np.all(found.status == Status.CONVERGING)
+    labels = zip(found.period, found.impacts_left, found.impacts_right, strict=True)
+    assert list(labels) == [label for *_, label, _ in CREEPING]
+    np.testing.assert_allclose(found.P[:, 0], [P for *_, P in CREEPING], rtol=1e-9)
+    assert np.all(found.lyapunov < 0)
+
+
+def test_a_slow_motion_that_passes_by_an_orbit_does_not_get_its_label():
+    """Newton's method leads straight to an orbit of tiny impacts, to which the ball, ever slower, never comes."""
+    found = summarise([cell(0.20362035225048924, 3.0874251189801387, u0=0.0, v0=0.4)], 400, variants=ALONE)
+    assert found.period[0] <= 0
+
+
+def test_a_cell_at_its_bifurcation_stays_undecided():
+    """The 1:1 orbit's pitchfork, as its branch over d has it: the multiplier is 1 to the eighth digit."""
+    found = summarise([cell(0.24876858576293404, 100.0, v0=0.4)], 400, variants=ALONE)
+    assert (found.status[0], found.period[0]) == (Status.SLOW, -1)
+    assert found.periods_run[0] >= 400
 
 
 def test_aperiodic_cells_have_the_known_power_within_their_errors(plane):
@@ -300,9 +328,10 @@ def test_inclined_cells_know_the_50_digit_orbit_and_run_into_attractors():
 
 def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     """Its rounds failed again and again, each beginning its window anew: 7,678 periods for 400."""
-    found = sweep(d=0.05, kappa=65.9459038750667, gamma=0.1, outputs=["period", "periods_run", "status"])
-    assert int(found.status) == Status.SLOW
-    assert int(found.period) == -1
+    counts = ["period", "impacts_left", "impacts_right"]
+    found = sweep(d=0.05, kappa=65.9459038750667, gamma=0.1, outputs=[*counts, "periods_run", "status"])
+    assert int(found.status) == Status.CONVERGING
+    assert (int(found.period), int(found.impacts_left), int(found.impacts_right)) == (24, 90, 48)
     assert found.periods_run < 1000
 
 
@@ -321,8 +350,10 @@ def test_a_long_period_is_kept_by_a_flight_of_thousands():
         (0.42213485860502636, 2.8083176198774358, 0.3414784028305109),
         (0.13992353802728440, 118.61016650019532, 0.6504155346023393),
     ):
-        found = sweep(d=d, kappa=kappa, r=r, outputs=["period", "max_impact_speed"])
+        found = sweep(d=d, kappa=kappa, r=r, outputs=["period", "max_impact_speed", "status"])
         if (period := int(found.period)) > 8:
             axes = {"d": d, "kappa": kappa, "r": r, "outputs": ["max_impact_speed"]}
             later = sweep(**axes, until="window", transient=5000, periods=period)
-            assert float(later.max_impact_speed) == pytest.approx(float(found.max_impact_speed), rel=1e-6)
+            # The slow one's multiplier a period is exp(-8e-5): by then it has come to within 1.5e-6.
+            near = 1e-6 if int(found.status) == Status.OK else 3e-6
+            assert float(later.max_impact_speed) == pytest.approx(float(found.max_impact_speed), rel=near)

@@ -227,6 +227,6 @@ def test_the_neutral_family_is_one_entry():
 def test_what_looks_like_chaos_says_for_how_long():
     found = known().isel(d=1)
     assert found.label.values[0] == "aperiodic"
-    assert found.periods_run[0] == 200
+    assert found.periods_run[0] >= 200  # one of its starts went on, undecided by then
     assert found.lyapunov[0] > 0.3
     assert not found.periodic[0]

@@ -162,7 +162,7 @@ def test_verdict_stands_above_the_noise(difference, error, verdict):
 @pytest.mark.parametrize("status", Status)
 @pytest.mark.parametrize("wall", ["soft", "rigid"])
 def test_cells_that_did_not_end_have_no_verdict(wall, status):
-    ended = status in (Status.OK, Status.NO_IMPACT, Status.PERMANENT_CONTACT, Status.STICKING)
+    ended = status in (Status.OK, Status.CONVERGING, Status.NO_IMPACT, Status.PERMANENT_CONTACT, Status.STICKING)
     made = built(**{f"status_{wall}": status})
     assert words(cheapest_model(made, 0.05)) == ["rigid" if ended else "undecided"]
 

@@ -67,7 +67,7 @@ class Answer(eqx.Module):
 
 def request(plan: Plan, settings: Settings, cell: Cell) -> Request:
     """Say what serving each lane would need."""
-    return Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell.since), cell.arrival)
+    return Request(cell.pair, cell.ball, cell.held, last_period(plan, settings, cell), cell.arrival)
 
 
 def sampled_answer(plan: Plan, request: Request) -> Answer:

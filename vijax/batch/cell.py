@@ -137,6 +137,9 @@ class Candidate(eqx.Module):
     moved: Lane
     last: Lane
     rounds: Lane
+    late: Mask  # its periods are spent: the search goes on for a while, less sceptical of recurrences
+    laps: Lane  # rounds that are flown before the next judgement
+    followed: Mask  # the motion was seen to come nearer to the orbit that Newton's method found
 
 
 class Course(eqx.Module):

@@ -51,7 +51,7 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
     impact, after = outcome.impact, outcome.after
     waits = course.waits & cell.running
     # A round of a candidate orbit may begin close to the end and go on beyond it.
-    end = last_period(plan, settings, cell.since)
+    end = last_period(plan, settings, cell)
     late = carry.n.astype(cell.count.dtype) - jnp.maximum(end, cell.ball.n)
     idle = cell.running & ~course.waits
     out = idle & (carry.mode == 0) & (late >= (QUIET if cell.candidate is not None else 0))

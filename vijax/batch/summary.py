@@ -7,16 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from vijax.batch.cell import TANGENT_SCALE, Cell, Harvest, Lane, Mask, Plan, Settings, batch_length
-from vijax.batch.cell_end import failed, last_period
+from vijax.batch.cell import Cell, Harvest, Lane, Mask, Plan, Settings, batch_length
+from vijax.batch.cell_end import chaotic, failed, growth, last_period
 from vijax.batch.chain import Handover, hand_over
 from vijax.engine.impact import Ball
 from vijax.model.records import Status
 from vijax.runtime.arrays import AnyArray, Values, present
-
-# Growth of the tangent map over a cell's window, in powers of e, from which motion without an orbit is chaos. A smaller
-# one takes slow transients of periodic orbits for it, a larger one leaves weak chaos undecided in short windows.
-_CHAOS = 7.0
 
 
 class Summary(eqx.Module):
@@ -91,7 +87,7 @@ def _ended(plan: Plan, settings: Settings, cell: Cell) -> _End:
     lost = failed(cell.status)
     periodic = (jnp.zeros_like(cell.running) if c is None else c.tracing) & ~lost
     permanent = cell.status == Status.PERMANENT_CONTACT
-    end = last_period(plan, settings, cell.since)
+    end = last_period(plan, settings, cell)
     window = end - cell.since
     span = jnp.where(periodic, 1.0 if c is None else c.period, window)
     quiet = impacts == 0 if c is None else (impacts == 0) | (cell.status == Status.NO_IMPACT)
@@ -156,15 +152,13 @@ def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, "lane"], Lane | None
     period, lyapunov = jnp.where(e.periodic, e.prime, -1.0), None
     status = jnp.where(e.silent, Status.NO_IMPACT, jnp.where(e.permanent | e.failed, cell.status, Status.OK))
     if cell.tangent is not None:
-        a, b, c, d = cell.tangent
-        size = jnp.abs(a) + jnp.abs(b) + jnp.abs(c) + jnp.abs(d)
-        growth = jnp.log(size) + present(cell.exponent) * jnp.log(TANGENT_SCALE)
-        chaotic = growth > _CHAOS
-        lyapunov = jnp.where(e.periodic, jnp.log(present(cell.multiplier)) / e.span, growth / e.window)
+        lyapunov = jnp.where(e.periodic, jnp.log(present(cell.multiplier)) / e.span, growth(cell) / e.window)
         lyapunov = jnp.where(none, jnp.nan, lyapunov)
         if attractor:
-            period = jnp.where(e.periodic, e.prime, jnp.where(chaotic, 0.0, -1.0))
-            status = jnp.where(~e.periodic & ~chaotic & ~none, Status.SLOW, status)
+            chaos = chaotic(cell)
+            period = jnp.where(e.periodic, e.prime, jnp.where(chaos, 0.0, -1.0))
+            status = jnp.where(~e.periodic & ~chaos & ~none, Status.SLOW, status)
+            status = jnp.where(e.periodic & present(cell.candidate).late, Status.CONVERGING, status)
     if attractor:
         period = jnp.where(e.still, 1.0, jnp.where(e.failed, -1.0, period))
     if cell.tally.stuck is not None:

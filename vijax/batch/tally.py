@@ -29,7 +29,7 @@ from vijax.runtime.xla import share
 def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     """Add one event to a cell."""
     impact = event.impact
-    end = last_period(plan, settings, cell.since)
+    end = last_period(plan, settings, cell)
     over = event.real & (impact.onset_n >= end)
     tracing = jnp.zeros_like(over) if cell.candidate is None else cell.candidate.tracing
     over = over & ~tracing

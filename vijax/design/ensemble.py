@@ -21,7 +21,7 @@ from vijax.model.records import Status
 from vijax.planes.basins import SPEED, spread
 from vijax.runtime import tiles
 
-AVERAGED = Status.OK, Status.STICKING, Status.SLOW  # a ball that ended so has averages
+AVERAGED = Status.OK, Status.CONVERGING, Status.STICKING, Status.SLOW  # a ball that ended so has averages
 _TILES = (512, 4096, 32768)  # cells of one compiled call
 _FIRST = 10  # a first flight of so much fewer periods refutes most of what a long one would
 _MORE = 4  # so many times the balls of an ensemble prove a design whose balls start anywhere

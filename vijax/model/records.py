@@ -26,6 +26,7 @@ class Status(enum.IntEnum):
     VIRTUAL = 8  # the equations of an orbit hold, but the ball would meet a wall in between
     UNSTABLE = 9  # the orbit repels, or is at a bifurcation
     NOT_RUN = 10  # the store is not finished, and nothing is known of the cell yet
+    CONVERGING = 11  # as OK: its periods were spent before it arrived, and the orbit is the one that it approaches
 
     @property
     def advice(self) -> str:
@@ -47,6 +48,7 @@ _ADVICE = {
     Status.NO_ORBIT: "begin nearer to an orbit, by a search or in smaller steps: the equations have no solution there",
     Status.VIRTUAL: "search for orbits with other impacts: the ball would meet a wall in between",
     Status.UNSTABLE: "follow it as a branch, or look for what attracts by a sweep: no ball stays on this orbit",
+    Status.CONVERGING: "use it: the motion is slow to arrive, and Newton's method found the orbit that it approaches",
     Status.NOT_RUN: "give the same command again: it goes on with what is left",
 }
 

@@ -30,7 +30,7 @@ COMPARED = ("P", "P_stderr", "period", "impacts_left", "impacts_right", "status"
 # Standard errors at which a verdict has to hold still: of a plane of thousands of cells two would often fail by chance.
 SURE = 3.0
 # Ends of cells that have a P to judge by: otherwise there is none, or it still drifts.
-_SETTLED = (Status.OK, Status.NO_IMPACT, Status.PERMANENT_CONTACT, Status.STICKING)
+_SETTLED = (Status.OK, Status.CONVERGING, Status.NO_IMPACT, Status.PERMANENT_CONTACT, Status.STICKING)
 
 
 class Label(enum.IntEnum):

@@ -31,7 +31,8 @@ class SweepSettings:
 
     Attributes:
         periods: Forcing periods to run, 400: at most (until="attractor"), or after the transient (until="window").
-            With fewer more cells stay undecided, their status SLOW.
+            A cell without a verdict then goes on for up to nine times as many, less sceptical of what recurs, and if
+            that finds its orbit its status is CONVERGING; else SLOW.
         until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
             `transient` periods and measures over the next `periods`.
         transient: Forcing periods to drop before a window, 0. The search for an attractor begins at once and takes
