@@ -17,11 +17,11 @@ def ensemble(noise, balls=512, radius=0.02):
     return x, 1e-5 * np.exp(rise + noise * np.random.default_rng(3).standard_normal(balls))
 
 
-def test_pairs_are_opposite_and_even():
+def test_pairs_are_opposite_and_even_and_no_two_balls_are_in_one_place():
     some = pairs(64, 3)
     np.testing.assert_array_equal(some[:32], -some[32:])
     for column in some.T:
-        np.testing.assert_allclose(np.sort(column[:32]), (2 * np.arange(32) + 1) / 32 - 1)
+        np.testing.assert_allclose(np.sort(column), (2 * np.arange(64) + 1) / 64 - 1)
 
 
 def test_a_smooth_average_is_recovered_with_its_slopes():

@@ -23,6 +23,8 @@ from vijax.runtime import tiles
 
 AVERAGED = Status.OK, Status.CONVERGING, Status.STICKING, Status.SLOW  # a ball that ended so has averages
 _TILES = (512, 4096, 32768)  # cells of one compiled call
+# Balls that set out from one state differ by this part of their velocity: as copies they would tell nothing new.
+_ASIDE = 1e-4
 _FIRST = 10  # a first flight of so much fewer periods refutes most of what a long one would
 _MORE = 4  # so many times the balls of an ensemble prove a design whose balls start anywhere
 
@@ -116,7 +118,7 @@ def fly(
         off = {name: getattr(device, name) * np.tile(x, len(owner)) for name, x in zip(names, factors.T, strict=True)}
         # Tuned already: what is left to do is the nondimensional form of what is off.
         device, pair = _cells(_changed(device, off), np.zeros((each.size, 0)), ())
-    begun = _anywhere(pair.d, len(owner), balls) if task.expected else _on(starts, balls)
+    begun = _anywhere(pair.d, len(owner), balls) if task.expected else _joined([on_motion(x, balls) for x in starts])
     found = averages(device, survey(pair, device, begun, longest=1, periods=periods).ended)
     whole = Ensemble((z - centre[:, None]).reshape(-1, len(task.tune)), found, device)
     return [whole.some(np.arange(i * balls, (i + 1) * balls)) for i in range(len(owner))]
@@ -138,14 +140,16 @@ def pairs(balls: int, size: int) -> np.ndarray:
     half = (balls + 1) // 2
     # Not a lattice: of few balls it would leave the ends of each variable out, where a surface is fixed best.
     order = np.random.default_rng(size).permuted(np.tile(np.arange(half), (size, 1)), axis=1).T
-    some = (2 * order + 1) / half - 1
+    # Opposite ones lie between them: no two balls that set out alike are in one device, where they would stay alike.
+    some = (2 * order + 0.5) / half - 1
     return np.concatenate([some, -some])[:balls]
 
 
-def _on(starts: list[Starts], balls: int) -> Starts:
-    """Put so many balls on the motion of every centre, in turn where fewer are known."""
-    turn = [jax.tree.map(lambda x: np.resize(x, balls), one) for one in starts]
-    return jax.tree.map(lambda *x: np.concatenate(x), *turn)
+def on_motion(starts: Starts, balls: int) -> Starts:
+    """Put so many balls on a motion: where some are known to be, in turn, each time a little aside."""
+    u, v, t = (np.resize(x, balls) for x in jax.tree.leaves(starts))
+    many: Any = u, v * (1 + _ASIDE * (np.arange(balls) // len(starts.v))), t
+    return Starts(*many)
 
 
 def _anywhere(d: Any, centres: int, balls: int) -> Starts:
@@ -153,6 +157,10 @@ def _anywhere(d: Any, centres: int, balls: int) -> Starts:
     u, v = (np.tile(x.values, centres) for x in spread(balls, None))
     begun: Any = u * d, 2 * SPEED * v, np.zeros_like(d)
     return Starts(*begun)
+
+
+def _joined(some: list[Starts]) -> Starts:
+    return jax.tree.map(lambda *x: np.concatenate(x), *some)
 
 
 def alike(found: Averages) -> np.ndarray:
