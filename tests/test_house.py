@@ -16,7 +16,7 @@ import pytest
 from scripts import house
 
 ROOT = Path(__file__).parent.parent
-FOLDERS = ("vijax", "scripts", "benchmarks", "tests")
+FOLDERS = ("vijax", "scripts", "benchmarks", "docs", "tests")
 SOURCES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 PUBLIC = [path for path in SOURCES if ROOT / "tests" not in path.parents]
 PACKAGE = [path for path in SOURCES if ROOT / "vijax" in path.parents]

@@ -87,7 +87,7 @@ def trajectory(
         solver, rtol, atol, membrane, steps: As in `sweep`. With a `HuntCrossley` membrane the pair's r is None.
 
     Returns:
-        The `Trajectory`. Differentiable in pair and start, forward and reverse: a scan of bounded length. The exact
+        The `Trajectory`. Differentiable in pair and start, forward and reverse, by a scan of bounded length. The exact
         engine to any order; "ode" once, as the lengths of its steps are constants to a derivative; "rk4" not
         usefully, as its derivatives miss the jump at the wall.
 

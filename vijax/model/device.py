@@ -82,13 +82,13 @@ class Harvester(eqx.Module):
     @property
     @door
     def length_unit(self) -> Real:
-        """Compute metres per unit of u: A pi^2/omega^2."""
+        """Compute metres per unit of u, A pi^2/omega^2."""
         return self.A * (math.pi / self.omega) ** 2
 
     @property
     @door
     def speed_unit(self) -> Real:
-        """Compute metres per second per unit of u': A pi/omega."""
+        """Compute metres per second per unit of u', A pi/omega."""
         return self.A * (math.pi / self.omega)
 
     @property

@@ -41,7 +41,7 @@ class ImpactPair(eqx.Module):
 
     @property
     def rigid(self) -> bool:
-        """Say whether the walls are rigid: a static choice, which no compiled program asks twice."""
+        """Say whether the walls are rigid, which is a static choice that no compiled program asks twice."""
         return self.kappa is None
 
     @property

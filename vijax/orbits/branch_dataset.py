@@ -26,10 +26,10 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
         device: Gives A, omega (unless one is the parameter) and the electrical constants; Tables I and II by default.
 
     Returns:
-        Over (branch, point): the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the label's `period`,
-        `impacts_left`, `impacts_right`, `status`; over (branch, point, impact): `v_in`, `side`, `phase`, `duration`,
-        `depth` [m]; over (branch, event_number): `event`, its `event_value`, and
-        `event_point`, the point nearest to it; over branch: `end_first`, `end_last`.
+        Over (branch, point) the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the label's `period`,
+        `impacts_left`, `impacts_right`, `status`; over (branch, point, impact) `v_in`, `side`, `phase`, `duration`,
+        `depth` [m]; over (branch, event_number) `event`, its `event_value`, and
+        `event_point`, the point nearest to it; over branch `end_first`, `end_last`.
     """
     import xarray as xr  # here, as importing vijax must not load it
 

@@ -84,7 +84,7 @@ def basins(
         axes: Any other axes of `sweep`; every point of arrays among them has a table of its own.
 
     Returns:
-        `basin` over all axes: the place of the start's attractor in its parameter cell's table, whose variables have
+        `basin` over all axes, the place of the start's attractor in its parameter cell's table, whose variables have
         the dimension `attractor`: `label`, `period`, `impacts_left`, `impacts_right`, `P` [J per half period],
         `max_impact_speed` [m/s], `impacts_per_period`, `contact_fraction`, `lyapunov`, `admissible`, `periodic`,
         `starts` (how many end there), `fraction` (of all) and, for starts drawn at random, `fraction_stderr`,

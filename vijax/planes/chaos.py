@@ -129,7 +129,7 @@ def survival(
         wall, device, progress: As in `sweep`.
 
     Returns:
-        Over the axes: `survival` over `after` [forcing periods], the part of all starts that are still chaotic;
+        Over the axes, `survival` over `after` [forcing periods], the part of all starts that are still chaotic;
         `lifetime` [forcing periods] and `lifetime_stderr`, infinite where no chaos ended, NaN where there was none.
 
     Raises:

@@ -79,7 +79,7 @@ def orbit_diagram(
 
     What is carried from point to point is the physical displacement and velocity, and the phase: so u and v change
     with their units where omega or A do, and a wall may move over the ball, which then starts in contact; a rigid one
-    puts it back to |u| = 0.49 d. All other axes, and both directions, run side by side.
+    puts it back to `|u| = 0.49 d`. All other axes, and both directions, run side by side.
 
     A point whose attractor is certain ends there: its orbit, polished, is what it would have come to, and is taken to
     the end of its periods as it is. Elsewhere all periods are run. What is handed on is the ball at phase 0; where a

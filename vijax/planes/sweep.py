@@ -98,7 +98,7 @@ def sweep(
             (`vijax.planes.refine`). `computed` says which are which.
         progress: Called with (cells done, cells in all) from the calling thread, first before anything is run. While a
             plane is refined, all are those known to be needed, and grow.
-        out: Zarr store, named *.zarr, to write tile by tile, so that memory is set by a tile. It opens at any time,
+        out: Zarr store, named `*.zarr`, to write tile by tile, so that memory is set by a tile. It opens at any time,
             cells that were not run yet by their `status`; stopped in whatever way, the same call goes on with what is
             left of it, and mends what was damaged. A refined plane is written when it is whole. Without, everything is
             in memory.

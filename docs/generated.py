@@ -1,0 +1,82 @@
+"""Pages that the program writes of itself: options, outputs, status codes and quantities, from the tables it reads."""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import click
+
+from vijax.cli.main import vijax as command
+from vijax.cli.page import Page
+from vijax.model.quantities import AXES, QUANTITIES
+from vijax.model.records import Status
+from vijax.planes.outputs import ON_REQUEST, OUTPUTS
+
+INTO = Path(__file__).parent / "generated"
+
+
+def write() -> None:
+    """Write the pages into `generated`; a page that says the same as before is left, so that it is not built again."""
+    INTO.mkdir(exist_ok=True)
+    texts = {"command": _command(), "outputs": _outputs(), "status": _status(), "quantities": _quantities()}
+    for name, text in texts.items():
+        path = INTO / f"{name}.md"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines) + "\n"
+
+
+def _command() -> str:
+    context = click.Context(command, info_name="vijax")
+    return "\n".join(_page(name, context) for name in command.list_commands(context))
+
+
+def _page(name: str, above: click.Context) -> str:
+    page = command.get_command(above, name)
+    assert page is not None, name
+    context = click.Context(page, info_name=name, parent=above)
+    parts = [f"## vijax {name}\n", page.help or "", ""]
+    if isinstance(page, Page):
+        for title, options in page.sections.items():
+            records = [record for option in options if (record := option.get_help_record(context))]
+            parts += [f"**{title}**\n", _table(("option", "meaning"), [(f"`{a}`", _text(b)) for a, b in records])]
+        parts += [_text(page.epilog or ""), "", "Lines to begin with:\n", "```sh"]
+        parts += [f"vijax {name} {example}".rstrip() for example in page.examples] + ["```", ""]
+    return "\n".join(parts)
+
+
+def _text(said: str) -> str:
+    """Escape what Markdown would read as markup in a text of help."""
+    return re.sub(r"([*_<>$\[\]])", r"\\\1", said)
+
+
+def _outputs() -> str:
+    rows = [
+        (f"`{name}`", output.units, _text(output.description) + (" (on request)" if name in ON_REQUEST else ""))
+        for name, output in OUTPUTS.items()
+    ]
+    return _table(("variable", "unit", "what it is"), rows)
+
+
+def _status() -> str:
+    rows = [(str(int(one)), f"`{one.name.lower()}`", _text(one.advice)) for one in Status]
+    return _table(("value", "name", "what to do"), rows)
+
+
+def _quantities() -> str:
+    from vijax.model.device import Harvester
+
+    device = Harvester()
+    rows = []
+    for name, quantity in QUANTITIES.items():
+        default = quantity.default if name in AXES else _default(getattr(device, name))
+        rows.append((f"`{name}`", quantity.unit or "1", _text(quantity.long_name), default, quantity.rule.must))
+    return _table(("name", "unit", "what it is", "unless given", "values"), rows)
+
+
+def _default(value: float | None) -> str:
+    return "the radius R0" if value is None else f"{value:.6g}"

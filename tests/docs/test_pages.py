@@ -1,0 +1,114 @@
+"""The pages: they build without a warning, load nothing from elsewhere, and show what the program is now."""
+
+import re
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import vijax
+from docs import executed
+from docs.__main__ import main
+from vijax.cli.main import vijax as command
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """The built pages. Warnings are errors, links that lead nowhere within the pages among them."""
+    place = tmp_path_factory.mktemp("pages")
+    assert main(["--into", str(place)]) == 0
+    return place / "html"
+
+
+class Loads(HTMLParser):
+    """Collects the addresses that a browser loads with a page; a link that a reader may follow is none."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Take what a tag loads."""
+        wanted = ("src", "srcset", "data", "poster") + (("href",) if tag in ("link", "use", "image", "base") else ())
+        self.found += [value for name, value in attrs if name in wanted and value]
+
+
+def loaded(file: Path) -> Iterator[str]:
+    """The addresses that a page or a style sheet loads."""
+    text = file.read_text(encoding="utf-8")
+    if file.suffix == ".html":
+        page = Loads()
+        page.feed(text)
+        yield from page.found
+    yield from re.findall(r"url\(\s*['\"]?([^'\")]+)", text)
+    yield from re.findall(r"@import\s+['\"]([^'\"]+)", text)
+
+
+def test_nothing_is_loaded_from_elsewhere(built):
+    files = [*built.rglob("*.html"), *built.rglob("*.css")]
+    assert len(files) > 10
+    outside = {(file.name, one) for file in files for one in loaded(file) if re.match(r"(?:\w+:)?//", one)}
+    assert not outside
+    assert (built / "_static/tex-svg.js").stat().st_size > 1e6
+
+
+def test_what_would_be_loaded_from_elsewhere_is_seen(tmp_path):
+    page = tmp_path / "page.html"
+    page.write_text(
+        '<a href="https://a.b"><script src="//c.d/e.js"></script><style>@import "https://f.g"; p {url(//h.i)}'
+    )
+    assert set(loaded(page)) == {"//c.d/e.js", "https://f.g", "//h.i"}
+
+
+def test_everything_offered_is_on_the_page_of_functions(built):
+    text = (built / "reference/functions.html").read_text(encoding="utf-8")
+    shown = re.findall(r'<dt class="sig[^>]*id="vijax\.([\w.]+)"', text)
+    tops = [name for name in shown if name in set(vijax.__all__) - {"plots"} or name.startswith("plots.")]
+    offered = {name for name in vijax.__all__ if name != "plots"} | {f"plots.{name}" for name in vijax.plots.__all__}
+    assert set(tops) == offered
+    assert len(tops) == len(offered)
+
+
+def test_every_option_is_on_the_page_of_the_command(built):
+    text = (built / "reference/command.html").read_text(encoding="utf-8")
+    for name in command.list_commands(None):
+        section = text.partition(f'id="vijax-{name}"')[2].partition("<section")[0]
+        options = [one for option in command.get_command(None, name).params for one in option.opts if one[:2] == "--"]
+        assert not [one for one in options if not re.search(rf"{one}\b", section)], name
+
+
+def test_no_page_shows_outputs_of_other_code():
+    stale = [path.name for path in executed.pages() if executed.kept(executed.read_page(path)) is None]
+    assert not stale, f"{stale} have changed since they were executed: python docs --stale"
+    assert not executed.stray()
+
+
+def test_a_page_whose_code_has_changed_is_not_built():
+    text = (executed.HERE / "start.md").read_text(encoding="utf-8")
+    assert executed.read(text).cells
+    with pytest.raises(ValueError, match="changed since it was executed"):
+        executed.read(text.replace("kappa=", "r=0.5, kappa="))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "other"),
+    [
+        ("P = 1.66e-04 J", "P = 1.6601e-04 J", False),
+        ("P = 1.66e-04 J", "P = 1.67e-04 J", True),
+        ("9,312 cells in 11.56 s, 805 cells/s", "9,312 cells in 3.1 s, 2,904 cells/s", False),
+        ("9,312 cells in 11.56 s", "9,313 cells in 11.56 s, 805", True),
+        ("status ok", "status slow", True),
+        ("[4 1 1]", "[4 1]", True),
+    ],
+)
+def test_outputs_differ_by_a_word_or_a_number_and_not_by_the_hour(old, new, other):
+    assert executed.differ(old, new) == other
+
+
+def test_what_a_function_returns_is_not_read_as_a_type(built):
+    """Napoleon takes what stands before a colon in the first line for a type."""
+    text = (built / "reference/functions.html").read_text(encoding="utf-8")
+    assert not re.findall(r"Return type<|>Type<", text)
