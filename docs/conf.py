@@ -24,6 +24,7 @@ myst_heading_anchors = 3
 autodoc_typehints = "none"  # docstrings tell shapes, units and ranges; the annotations of arrays would drown them
 autodoc_member_order = "bysource"
 napoleon_custom_sections = [("Attributes", "params_style")]  # a record is made of its fields
+highlight_language = "none"  # of indented blocks, which are lines of a shell
 default_role = "code"  # what docstrings put into single backticks
 smartquotes = False  # an option begins with two hyphens
 

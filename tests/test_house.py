@@ -45,7 +45,7 @@ def name(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def test_the_readme_says_of_every_folder_what_it_says_itself():
+def test_the_page_on_developing_says_of_every_folder_what_it_says_itself():
     """That imports point downwards is held by import-linter, by the contract in pyproject.toml."""
     said = {}
     for path in sorted((ROOT / "vijax").glob("*/__init__.py")):
@@ -55,10 +55,10 @@ def test_the_readme_says_of_every_folder_what_it_says_itself():
             f"{name(path)} must hold a docstring and nothing else"
         )
         said[path.parent.name] = " ".join((ast.get_docstring(parsed) or "").split())
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert dict(re.findall(r"^\| `vijax/(\w+)/` \| (.*) \|$", readme, re.M)) == said
+    page = (ROOT / "docs/developing.md").read_text(encoding="utf-8")
+    assert dict(re.findall(r"^\| `vijax/(\w+)/` \| (.*) \|$", page, re.M)) == said
     layers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
-    assert f"`{' > '.join(layer for layer in layers if layer[0] != '(')}`" in readme
+    assert f"`{' > '.join(layer for layer in layers if layer[0] != '(')}`" in page
 
 
 def test_the_house_is_small_enough_to_know():

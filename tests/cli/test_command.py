@@ -304,9 +304,9 @@ def test_a_run_that_came_to_no_end_is_left_at_once(code):
     assert subprocess.run([sys.executable, "-c", line], timeout=30).returncode == code
 
 
-def test_bash_completes_after_the_line_of_the_readme(tmp_path):
+def test_bash_completes_after_the_line_of_the_pages(tmp_path):
     """By a command of the name that a wheel installs."""
-    (line,) = set(re.findall(r'`(eval "[^`]*")`', (ROOT / "README.md").read_text(encoding="utf-8")))
+    (line,) = set(re.findall(r'`(eval "[^`]*")`', (ROOT / "docs/maps.md").read_text(encoding="utf-8")))
     stub = tmp_path / "vijax"
     stub.write_text(f"#!{sys.executable}\nfrom vijax.cli.main import command\ncommand()\n")
     stub.chmod(0o755)

@@ -86,6 +86,29 @@ def test_no_page_shows_outputs_of_other_code():
     assert not executed.stray()
 
 
+def test_the_readme_prints_what_the_page_printed():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(readme.splitlines()) <= 120
+    (block,) = re.findall(r"```python\n(.*?)```", readme, re.S)
+    start = executed.read((executed.HERE / "start.md").read_text(encoding="utf-8"))
+    cells = [cell for cell in start.cells if cell.cell_type == "code"]
+    shown = [line for cell in cells for line in cell.source.splitlines()]
+    printed = [output.text.strip() for cell in cells for output in cell.outputs if "text" in output]
+    lines = [line for line in block.splitlines() if line]
+    said = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
+    assert said == printed[: len(said)]
+    code = [line for line in lines if not line.startswith("# ")]
+    places = [shown.index(line) for line in code]
+    assert len(code) == 9
+    assert places == sorted(places)
+
+
+def test_links_of_the_readme_lead_somewhere():
+    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert len(links) > 15
+    assert not [link for link in links if not (ROOT / link).exists()]
+
+
 def test_a_page_whose_code_has_changed_is_not_built():
     text = (executed.HERE / "start.md").read_text(encoding="utf-8")
     assert executed.read(text).cells
