@@ -28,8 +28,9 @@ def main(arguments: list[str] | None = None) -> int:
             found = executed.execute(page)
             differences += len(found)
             print(f"{page.name}: {time.perf_counter() - began:.0f} s", *found, sep="\n", flush=True)
-    for path in executed.stray():
-        path.unlink()
+    if asked.execute or asked.stale:
+        for path in executed.stray():  # of pages that are no more
+            path.unlink()
     options = ["-b", "html", "-W", "--keep-going", "-q", "-j", "auto", "-d", str(asked.into / "doctrees")]
     return build_main([*options, str(executed.HERE), str(asked.into / "html")]) or min(differences, 1)
 

@@ -109,7 +109,7 @@ def differ(old: str, new: str) -> bool:
 
 
 def _close(old: float, new: float) -> bool:
-    return math.isclose(old, new, rel_tol=RELATIVE, abs_tol=1e-12)
+    return math.isclose(old, new, rel_tol=RELATIVE)
 
 
 def _cells(notebook: NotebookNode) -> list[NotebookNode]:
