@@ -253,7 +253,7 @@ def slow_cells(count: int) -> None:
         some = np.flatnonzero(found.status == vijax.Status.CONVERGING)
         kinds = found.period, found.impacts_left, found.impacts_right, found.fastest
         met.append([x[some] for x in (d, kappa, r, gamma, *kinds)])
-        cells, undecided = cells + d.size, undecided + (found.status == vijax.Status.SLOW).sum()
+        cells, undecided = cells + d.size, undecided + int((found.status == vijax.Status.SLOW).sum())
     d, kappa, r, gamma, period, left, right, fastest = (np.concatenate(x)[:count] for x in zip(*met, strict=True))
     parts = [slice(at, at + 8192) for at in range(0, count, 8192)]
     later = jax.tree.map(

@@ -31,7 +31,8 @@ def main(arguments: list[str] | None = None) -> int:
     if asked.execute or asked.stale:
         for path in executed.stray():  # of pages that are no more
             path.unlink()
-    options = ["-b", "html", "-W", "--keep-going", "-q", "-j", "auto", "-d", str(asked.into / "doctrees")]
+    # In one process: a fork of one in which JAX runs threads may never end.
+    options = ["-b", "html", "-W", "--keep-going", "-q", "-d", str(asked.into / "doctrees")]
     return build_main([*options, str(executed.HERE), str(asked.into / "html")]) or min(differences, 1)
 
 
