@@ -14,9 +14,10 @@ from vijax.runtime.arrays import AnyArray, present
 _IMPACTS = 512
 # Steps likewise, where the method chooses them: with a tolerance that rounding does not let it meet, it would go on.
 _STEPS = 20_000
-# Times its periods for which a cell that is undecided when they are spent goes on. Of the default map that decides all
-# but one cell in six thousand, and costs a twentieth more; with 3 two in six thousand are left.
-_LATE_SHARE = 9.0
+# Times its periods for which a cell that is undecided when they are spent goes on. With 1 half again as many of them
+# stay undecided, with 9 a third fewer; but the last lanes of a tile run that long while the others stand idle, and a
+# plane of 128 x 128 cells then takes twice its time.
+_LATE_SHARE = 3.0
 # Growth of the tangent map over a cell's window, in powers of e, from which motion without an orbit is chaos. A smaller
 # one takes slow transients of periodic orbits for it, a larger one leaves weak chaos undecided in short windows.
 _CHAOS = 7.0

@@ -31,7 +31,7 @@ class SweepSettings:
 
     Attributes:
         periods: Forcing periods to run, 400: at most (until="attractor"), or after the transient (until="window").
-            A cell without a verdict then goes on for up to nine times as many, less sceptical of what recurs, and if
+            A cell without a verdict then goes on for up to three times as many, less sceptical of what recurs, and if
             that finds its orbit its status is CONVERGING; else SLOW.
         until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
             `transient` periods and measures over the next `periods`.
