@@ -114,8 +114,7 @@ def recur(settings: Settings, cell: Cell, impact: LaneImpact, kept: Mask, count:
     # On a round the anchor is the round's first impact.
     opening = kept & c.tracing & (c.left == c.length)
     again = kept & c.tracing & ~opening & (period >= 1) & (c.prime == c.period)
-    # Of a late cell, whose multiplier is near one, Newton's method knows the orbit to fewer digits.
-    same = jnp.where(c.late, 1.0, 1e-2) * recurrence(lag.dtype, 100 * grain(settings))
+    same = 1e-2 * recurrence(lag.dtype, 100 * grain(settings))
     again = again & (2 * jnp.abs(lag - period) + jnp.abs(impact.v_in - c.anchor_v) < same)
     fresh, again, found = share((fresh | opening, again, found))
     candidate = replace(
