@@ -29,9 +29,6 @@ Carry = Any
 # with more, lanes that wait stand idle. Of chains there are few lanes, and one that waits holds up its chain. No result
 # depends on them.
 STEPS, _CHAIN_STEPS = 8, 4
-# The same once no cell waits for a lane: a few slow cells are left at last, and a round costs all lanes. With 8 a
-# window of 128 x 128 cells takes a tenth longer.
-_LAST_STEPS = 64
 _SHARE, _FEWEST = 32, 16  # one lane in so many is served or refilled together: a larger batch keeps slow cells waiting
 
 
@@ -130,7 +127,7 @@ def _able(program: Program, at: _AtWork) -> Int[Array, ""]:
     return ((at.cell >= 0) & ~_declined(program, at) & ~program.stopped(at.carry)).sum()
 
 
-def _round(program: Program, width: int, steps: Int[Array, ""] | int, at: _AtWork) -> Carry:
+def _round(program: Program, width: int, steps: int, at: _AtWork) -> Carry:
     """Run one round of the lanes that have a cell: steps, service, review.
 
     Args:
@@ -139,7 +136,7 @@ def _round(program: Program, width: int, steps: Int[Array, ""] | int, at: _AtWor
         steps: Most steps of a round.
         at: The lanes.
     """
-    carry = program.kernel(partial(_steps, program))(jnp.asarray(steps, jnp.int32), *at)
+    carry = program.kernel(partial(_steps, program, steps))(*at)
     if service := program.service:
         due = program.kernel(partial(_service_due, program, service, width))
         serve = partial(_serve, program, service, width)
@@ -147,7 +144,7 @@ def _round(program: Program, width: int, steps: Int[Array, ""] | int, at: _AtWor
     return program.kernel(program.review)(carry)
 
 
-def _steps(program: Program, most: Int[Array, ""], cell: Int[Array, "lane"], carry: Carry) -> Carry:
+def _steps(program: Program, most: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Take up to so many steps; fewer once half the lanes that set out wait for something else."""
 
     def some_steps(at: _AtWork) -> _AtWork:
@@ -161,7 +158,7 @@ def _steps(program: Program, most: Int[Array, ""], cell: Int[Array, "lane"], car
             step, at = state
             return step + 1, at._replace(carry=program.step(at.carry))
 
-        return lax.while_loop(goes_on, one, (jnp.int32(0), at))[1]
+        return lax.while_loop(goes_on, one, (0, at))[1]
 
     return in_blocks(some_steps, _AtWork(cell, carry)).carry
 
@@ -236,8 +233,7 @@ def run(
 
     def refill_and_round(queue: _Queue) -> _Queue:
         queue = _refill(program, table, width, queue)
-        steps = jnp.where(queue.waiting < count, STEPS, _LAST_STEPS)
-        return queue._replace(at=queue.at._replace(carry=_round(program, width, steps, queue.at)))
+        return queue._replace(at=queue.at._replace(carry=_round(program, width, STEPS, queue.at)))
 
     def goes_on(queue: _Queue) -> Bool[Array, ""]:
         return (queue.at.cell >= 0).any() | (queue.waiting < count)
