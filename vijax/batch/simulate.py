@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vijax.batch import advance, chain, lanes, rows, solver_steps
-from vijax.batch.attractor_search import MAX_PERIOD, blank_candidate, recurrence, review, settled
+from vijax.batch.attractor_search import blank_candidate, review
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
+from vijax.batch.recurrence import MAX_PERIOD, recurrence, settled
 from vijax.batch.summary import Summary, shapes, unload
 from vijax.engine import exact, quick_wall
 from vijax.engine.ground import ground_of

@@ -17,11 +17,11 @@ from vijax.design.tolerance import Tolerance, drawn
 from vijax.design.variables import LINEAR, cells
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.model.records import Status
+from vijax.model.records import SETTLED, Status
 from vijax.planes.basins import SPEED, spread
 from vijax.runtime import tiles
 
-AVERAGED = Status.OK, Status.CONVERGING, Status.STICKING, Status.SLOW  # a ball that ended so has averages
+AVERAGED = *SETTLED, Status.SLOW  # a ball that ended so has averages
 _TILES = (512, 4096, 32768)  # cells of one compiled call
 # Balls that set out from one state differ by this part of their velocity: as copies they would tell nothing new.
 _ASIDE = 1e-4

@@ -12,13 +12,12 @@ from vijax.batch.impact_log import record
 from vijax.batch.simulate import Starts
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.model.records import State, Status
+from vijax.model.records import SETTLED, State, Status
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import context
 from vijax.runtime.tiles import padded, workers
 
 _SMALLEST_TILE, _LARGEST_TILE = 512, 8192  # cells of a call
-_SETTLED = Status.OK, Status.STICKING
 _SAME = 1e-6  # relative difference within which attractors of one pair are the same; see `basins`
 
 
@@ -75,7 +74,7 @@ class Survey(NamedTuple):
 
     def restless(self, impacts: int) -> np.ndarray:
         """Find cells whose motion is no such orbit: chaos, not settled, or of too many periods or impacts."""
-        going = np.isin(self.ended.status, (*_SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
+        going = np.isin(self.ended.status, (*SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
         return np.flatnonzero(going & ~self._closing(impacts))
 
     def onward(self, cells: np.ndarray, device: Harvester, periods: int) -> "Survey":
@@ -95,7 +94,7 @@ class Survey(NamedTuple):
         """Say which cells ended on an orbit that is wanted."""
         ended, count = self.ended, self.ended.impacts_left + self.ended.impacts_right
         some = (ended.period > 0) & (ended.period <= self.longest) & (count > 0) & (count <= impacts)
-        return np.isin(ended.status, _SETTLED) & some
+        return np.isin(ended.status, SETTLED) & some
 
 
 def survey(pair: ImpactPair, device: Harvester, starts: Starts, *, longest: int, periods: int) -> Survey:

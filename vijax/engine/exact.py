@@ -60,7 +60,8 @@ def _soft_contact(
     """Find duration (inf: for ever), outward speed -w' at the exit, and largest penetration of a contact."""
     force = flow.contact_force(pair.gamma, side, t)
     args = (wall, force, w0, z0)
-    frozen = lax.stop_gradient(args)  # as in `_onset`
+    # Derivatives come from the root that is found, not from the search for it.
+    frozen = lax.stop_gradient(args)
     if deep:
         duration, when = exit_and_crest(*frozen, wanted, patience)
     else:

@@ -53,6 +53,10 @@ _ADVICE = {
 }
 
 
+SETTLED = Status.OK, Status.CONVERGING, Status.STICKING
+"""Ends of a motion that is known: an orbit, or averages with a standard error."""
+
+
 class WithStatus(eqx.Module):
     """A record that prints its `status` by name."""
 

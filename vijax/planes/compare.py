@@ -15,7 +15,7 @@ from vijax.model.choices import Precision, Until, Walls
 from vijax.model.device import Harvester
 from vijax.model.label import ordered
 from vijax.model.quantities import synonyms
-from vijax.model.records import Status
+from vijax.model.records import SETTLED, Status
 from vijax.planes import sweep
 from vijax.planes.axes import Axes
 from vijax.planes.dataset import DEFAULT, SweepPlan
@@ -30,7 +30,7 @@ COMPARED = ("P", "P_stderr", "period", "impacts_left", "impacts_right", "status"
 # Standard errors at which a verdict has to hold still: of a plane of thousands of cells two would often fail by chance.
 SURE = 3.0
 # Ends of cells that have a P to judge by: otherwise there is none, or it still drifts.
-_SETTLED = (Status.OK, Status.CONVERGING, Status.NO_IMPACT, Status.PERMANENT_CONTACT, Status.STICKING)
+_ENDED = (*SETTLED, Status.NO_IMPACT, Status.PERMANENT_CONTACT)
 
 
 class Label(enum.IntEnum):
@@ -201,7 +201,7 @@ def cheapest_model(found: "xr.Dataset", tolerance: float) -> "xr.DataArray":
     tolerance = _checked(tolerance)
     checks.variables("found", found, ("relative_difference", "relative_difference_stderr", "status_soft"), "compare")
     difference, doubt = found["relative_difference"], SURE * found["relative_difference_stderr"]
-    ended = found["status_soft"].isin(_SETTLED) & found["status_rigid"].isin(_SETTLED)
+    ended = found["status_soft"].isin(_ENDED) & found["status_rigid"].isin(_ENDED)
     # Where neither holds, noise could turn the verdict.
     enough, short = difference + doubt <= tolerance, difference - doubt > tolerance
     verdict = short.astype(np.int8).where(ended & (enough | short), Model.UNDECIDED)
