@@ -4,7 +4,6 @@ The orbit follows its parameters by the implicit function theorem on the shootin
 with every impact's own unknowns kept. Where that derivative means nothing, values and derivatives are NaN.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -25,7 +24,7 @@ from vijax.orbits.shooting import Knots, Sequence
 from vijax.orbits.validity import validity
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.derivatives import differentiable, shared_slopes
 
 
 class Steady(WithStatus):
@@ -107,16 +106,17 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
     wall = "rigid" if orbit.pair.rigid else "soft"
     # Numbers of one kind, however they are given: each kind would be a program of its own.
     device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
-    return _near(device, pair, orbit.sequence, orbit.knots, wall)
+    return _near((device, pair), (orbit.sequence, orbit.knots), wall)
 
 
-@partial(jitted, static_argnames="wall")
-def _near(device: Harvester, pair: ImpactPair | None, sequence: Sequence, guess: Knots, wall: str) -> Steady:
+@differentiable
+def _near(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], wall: str) -> Steady:
     """Find the steady state near a guess.
 
     Compiled once, and so are its derivatives and batches: as one call they are known by its identity, while loops run
     one by one would be compiled for every call, as each makes their bodies anew.
     """
+    (device, pair), (sequence, guess) = moved, about
     pair = device.pair(wall) if pair is None else pair
     guess = jnp.where(sequence.real[:, None], guess, 0.0)
     return response(device, pair, sequence, *find(pair, sequence, guess))
@@ -151,7 +151,7 @@ def response(
     # Harmless numbers where there is no orbit: what is computed from them is thrown away.
     absent = (status == Status.NO_ORBIT) | ~sequence.real
     knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)
-    knots = _follows(pair, sequence, knots)
+    knots = shared_slopes(_follows(pair, sequence, knots))
     valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
     depth, harvested, work = (valid * x for x in _impacts(device, pair, sequence, knots, deepest))
     P = jnp.where(sequence.real, harvested, 0.0).sum() / sequence.span
@@ -181,7 +181,10 @@ _HARMLESS = (0.0, 1.0, 0.5)  # a knot
 
 
 def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):
-    """Compute depth [m], harvested energy [J] and energy given to the membrane [J] of every impact."""
+    """Compute depth [m], harvested energy [J] and energy given to the membrane [J] of every impact.
+
+    Where several results need a derivative XLA would compute it for each of them: sharing them halves what it compiles.
+    """
     real = sequence.real
     t, speed, stay = knots.T
     if pair.rigid:
@@ -190,9 +193,9 @@ def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Kno
         work = energy.membrane_work_rigid(speed, pair.r)
     else:
         departure = shooting.departures(pair, sequence, knots)
-        depth = _depths(pair, departure.side, knots, deepest)
-        signed = departure.side * speed, -departure.side * departure.speed
-        work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, departure.side, t, stay, *signed)
+        depth = shared_slopes(_depths(pair, departure.side, knots, deepest))
+        signed = departure.side * speed, -departure.side * shared_slopes(departure.speed)
+        work = shared_slopes(energy.membrane_work(pair.kappa, pair.mu, pair.gamma, departure.side, t, stay, *signed))
     depth = jnp.where(real, depth, 0.0) * device.length_unit
     work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
     return depth, energy.harvested_energy(device, depth), work

@@ -1,0 +1,94 @@
+"""Derivatives of a compiled function at numbers: one program, with our options of the compiler, of all slopes at once.
+
+What JAX differentiates it compiles anew, with its own options, as a part of whatever `jax.grad` makes of the program
+around it: of a steady state that takes three times as long as the program here, and happens for every kind of
+derivative that is asked for. Where the arguments are traced themselves, under `jit`, `vmap` or a second derivative, the
+function is differentiated as JAX does.
+"""
+
+from collections.abc import Callable, Hashable
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+
+from vijax.runtime import context
+from vijax.runtime.xla import jitted, share
+
+T = TypeVar("T")
+
+
+def differentiable(work: Callable[..., T]) -> Callable[..., T]:
+    """Compile a function, and its derivatives where its arguments are numbers.
+
+    Args:
+        work: Function of variables, of what is not varied (two pytrees of arrays) and of a kind that can be hashed, to
+            a pytree of arrays. Its derivative in what is not varied must be zero: it is not asked for.
+    """
+    program = jitted(work, static_argnums=2)
+
+    @partial(jitted, static_argnums=2)
+    def slopes(variables: Any, fixed: Any, kind: Hashable) -> tuple[list[jax.Array], T]:
+        def numbers(variables):
+            result = work(variables, fixed, kind)
+            return [leaf for leaf in jax.tree.leaves(result) if _varies(leaf)], result
+
+        return jax.jacfwd(numbers, has_aux=True)(variables)
+
+    @partial(jax.custom_jvp, nondiff_argnums=(2,))
+    def call(variables: Any, fixed: Any, kind: Hashable) -> T:
+        return program(variables, fixed, kind)
+
+    @partial(call.defjvp, symbolic_zeros=True)
+    def derivative(kind: Hashable, primals: Any, tangents: Any) -> tuple[T, T]:
+        variables, fixed = primals
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(primals)):
+            moved = jax.tree.map(_dense, tangents[0], is_leaf=_is_zero)
+            return jax.jvp(lambda variables: program(variables, fixed, kind), (variables,), (moved,))
+        # Within a derivative JAX takes a program apart before it compiles it, and what is to be shared is shared no
+        # longer: twice the operations. No other thread is within one.
+        with context.pool(1) as elsewhere:
+            columns, result = elsewhere.submit(slopes, variables, fixed, kind).result()
+        moved = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
+        rows = iter(columns)
+        return result, jax.tree.map(lambda leaf: _along(leaf, rows, moved), result)
+
+    return call
+
+
+@jax.custom_jvp
+def shared_slopes(value: Any) -> Any:
+    """Keep a value that several results need, as `xla.share` does, and its derivative, which that would not."""
+    return share(value)
+
+
+@shared_slopes.defjvp
+def _shared_slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    return shared_slopes(primals[0]), share(tangents[0])
+
+
+def _varies(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jnp.inexact)
+
+
+def _is_zero(leaf: Any) -> bool:
+    return isinstance(leaf, SymbolicZero)
+
+
+def _dense(moved: Any) -> Any:
+    return jnp.zeros(moved.shape, moved.dtype) if _is_zero(moved) else moved
+
+
+def _along(leaf: jax.Array, rows: Any, moved: list[Any]) -> Any:
+    """Compute the tangent of a result; of what holds no real numbers, JAX's word for none."""
+    if not _varies(leaf):
+        return np.zeros(leaf.shape, jax.dtypes.float0)
+    # What stands still is left out: a slope that is not finite, of what nobody varies, must not spoil the others.
+    parts = zip(jax.tree.leaves(next(rows)), moved, strict=True)
+    return sum(
+        (jnp.tensordot(row, step, jnp.ndim(step)) for row, step in parts if not _is_zero(step)),
+        start=jnp.zeros_like(leaf),
+    )
