@@ -157,22 +157,3 @@ def test_a_misspelt_switch_is_named():
     done = without_kernels("import vijax.public", switch="off")
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == "ValueError: VIJAX_KERNELS must be 0 (no kernels) or 1; got 'off'"
-
-
-@pytest.mark.parametrize(("rows", "often", "brief"), [(64, False, True), (65, False, False), (64, True, False)])
-def test_a_program_of_few_rows_is_compiled_briefly(monkeypatch, rows, often, brief):
-    asked = []
-    monkeypatch.setattr(xla, "compiler_options", lambda *, brief: asked.append(brief) or {})
-    double = xla.jitted(lambda x, *, factor: x * factor, often=often, static_argnames="factor")
-    for factor in (2, 2, 3):
-        np.testing.assert_array_equal(double(np.ones(rows), factor=factor), np.full(rows, 1.0 * factor))
-    assert asked == [brief]
-
-
-def test_within_another_program_it_is_a_part_of_that():
-    square = xla.jitted(lambda x: x * x)
-    np.testing.assert_array_equal(jax.jit(square)(np.arange(3.0)), [0, 1, 4])
-    # Of constants, too: within a program JAX traces everything.
-    np.testing.assert_array_equal(jax.jit(lambda x: x + square(np.arange(3.0)))(1.0), [1, 2, 5])
-    assert jax.grad(square)(3.0) == 6
-    np.testing.assert_array_equal(jax.vmap(jax.grad(square))(np.arange(3.0)), [0, 2, 4])

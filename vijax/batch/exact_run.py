@@ -16,7 +16,7 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
 from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 # The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
 # call, and few enough that the host waits for no long one after every ball has arrived.
@@ -97,7 +97,9 @@ def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArr
     return reached, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), flown)
 
 
-_stretch = jitted(partial(_onward, count=_STRETCH))
+@jitted
+def _stretch(asked: Asked, pair: ImpactPair, reached: _Reached, first: Any):
+    return _onward(asked, pair, reached, first, _STRETCH)
 
 
 def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Reached, _Flown]:

@@ -12,7 +12,7 @@ from vijax.engine import exact
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
 from vijax.runtime import tiles
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 # No result depends on these: how many balls fly together, how many at phase 0 are found together, and after how many
 # impacts of each those that have arrived make room. Fewer are more calls, more are more rows that nobody needs.

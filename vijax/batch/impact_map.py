@@ -19,7 +19,7 @@ from vijax.engine.impact import Ball
 from vijax.model.pair import ImpactPair
 from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 # Forcing periods in which an impact must come; the map tells of none that comes later, and no orbit may have such a
 # flight.
@@ -66,7 +66,7 @@ def _compiled(answer: Callable, plan: Plan):
         seen = impact.side, impact.v_in, impact.v_out, impact.duration, impact.depth, impact.work
         return Next(onset, *seen, real), given.sure
 
-    return jitted(work)
+    return jitted(work, name=f"{work.__module__}.{work.__qualname__} {answer.__qualname__} {plan}")
 
 
 def _answered(work: Callable, requests: advance.Request) -> tuple[Next, np.ndarray]:

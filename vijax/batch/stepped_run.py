@@ -14,7 +14,7 @@ from vijax.engine.method import HELD, Method, repeated
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, Status
 from vijax.runtime.arrays import AnyArray
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 
 class _Recording(eqx.Module):
@@ -52,7 +52,7 @@ def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) ->
     return jax.tree.map(write, table, row)
 
 
-@partial(jitted, static_argnames="room")
+@partial(jitted, static=("room",))
 def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Trajectory:
     """Step all lanes together, each until its last period is over and its last contact has ended."""
     periods, max_impacts, chunks = asked

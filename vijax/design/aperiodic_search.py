@@ -20,7 +20,7 @@ from vijax.design.ensemble import AVERAGED, Ensemble, Task, alike, fly
 from vijax.design.promise import Met, promise
 from vijax.design.response_surface import Surface, fit, unknown
 from vijax.runtime import tiles
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 _FITS = (16, 128)  # surfaces that are climbed in one compiled call
 _LOOKS = 60  # evaluations of a surface, which cost next to nothing

@@ -27,7 +27,7 @@ from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import present
 from vijax.runtime.context import door
 from vijax.runtime.lattice import lattice
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 _LEAST_BALLS = 32  # fewer give no standard error that could be trusted
 _MOST_BALLS = 2**20
@@ -302,7 +302,7 @@ def _fit(x: Float[Array, "ball 4"], y: Float[Array, "ball column"], some: Bool[A
     return _Fit(found, added * jnp.sqrt(count / left), rest, left)
 
 
-@partial(jitted, static_argnames="second")
+@partial(jitted, static=("second",))
 def _concluded(device: Harvester, at: _Inputs, flown: _FlownBalls, second: bool) -> Average:
     """Make the record of an ensemble."""
     fit = _fit(flown.x, jnp.column_stack([flown.P, flown.fixed]), flown.real, second)

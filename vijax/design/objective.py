@@ -16,7 +16,7 @@ from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.orbits import shooting, steady
 from vijax.orbits.shooting import Sequence
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 OBJECTIVES: dict[Objective, str] = {
     "P": "energy harvested per half forcing period [J]",

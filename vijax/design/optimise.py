@@ -33,7 +33,7 @@ from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
 from vijax.runtime import checks, context, tiles
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 OVER_TOLERANCES = ("mean", "worst")
 _LOG = logging.getLogger(__name__)

@@ -24,7 +24,7 @@ from vijax.orbits.periodic import Orbit
 from vijax.orbits.steady import Steady, steady
 from vijax.runtime import tiles
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 _FEW = (16, 256)  # optima of one compiled call
 
@@ -203,7 +203,7 @@ def apart(good: list[int], ends: list[End], owner: np.ndarray, same: float) -> I
         yield kept
 
 
-_steady_states = jitted(jax.vmap(steady))
+_steady_states = jitted(jax.vmap(steady), name="steady states")
 
 
 @door

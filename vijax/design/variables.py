@@ -17,7 +17,7 @@ from vijax.model.pair import ImpactPair
 from vijax.model.quantities import PARAMETERS, check
 from vijax.runtime import checks
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 # Other names of what a constant decides: each is applied after the constants.
 _ALIASES = {name: axis.alias_of for name, axis in PARAMETERS.items() if axis.alias_of}
@@ -64,7 +64,7 @@ def tuned(device: Harvester, names: tuple[str, ...], z: Any) -> Harvester:
     return device
 
 
-@partial(jitted, static_argnames="names")
+@partial(jitted, static=("names",))
 def cells(devices: Harvester, z: Float[Array, "cell variable"], names: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
     """Give devices [cell] with the quantities that the variables say, and their pairs."""
     every = jax.vmap(lambda device, z: tuned(device, names, z))(devices, z)

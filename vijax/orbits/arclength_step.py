@@ -18,7 +18,8 @@ from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting
 from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
-from vijax.runtime import linear_solve, tiles, xla
+from vijax.runtime import linear_solve, tiles
+from vijax.runtime.programs import jitted
 
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
 
@@ -139,7 +140,7 @@ class BranchPlace(NamedTuple):
     corrections: np.ndarray
 
 
-@partial(xla.jitted, often=True)
+@partial(jitted, often=True)
 def _compiled(arcs: Arc, y, tangent, length):
     def one(arc, y, tangent, length):
         at = _correct(arc, y + length * tangent, tangent)

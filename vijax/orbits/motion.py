@@ -12,7 +12,7 @@ from vijax.model import flow
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 MOST_SAMPLES = 10**6  # a piece of the motion may be asked for at so many instants
 
@@ -96,7 +96,7 @@ def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, 
     return jnp.where(inside, u, 0.5 * side * pair.d + rise), jnp.where(inside, v, speed)
 
 
-@partial(jitted, static_argnames="samples")
+@partial(jitted, static=("samples",))
 def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int) -> tuple[Array, ...]:
     """Compute (t, u, v) [impact, 2 samples] in each contact and in the flight after it, up to the time `until`."""
     parts = jnp.linspace(0.0, 1.0, samples)

@@ -20,7 +20,7 @@ from vijax.orbits.symmetry import unfolded
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 
 class Counts(NamedTuple):
@@ -124,7 +124,7 @@ def path(orbit: Orbit, samples: int = 64) -> tuple[np.ndarray, np.ndarray, np.nd
     return clock, u, v
 
 
-@partial(jitted, static_argnames="samples")
+@partial(jitted, static=("samples",))
 def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
     """Compute (t, u, v) [orbit, impact, instant] of orbits that are in full."""
     until = jax.vmap(shooting.departures)(full.pair, full.sequence, full.knots).next_t

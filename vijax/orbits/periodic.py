@@ -19,7 +19,7 @@ from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks, context, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
 # How closely the impact map must meet the next impact of a real orbit, in time, speed and duration together; marks of

@@ -106,18 +106,18 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
     wall = "rigid" if orbit.pair.rigid else "soft"
     # Numbers of one kind, however they are given: each kind would be a program of its own.
     device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
-    return _near((device, pair), (orbit.sequence, orbit.knots), wall)
+    return _near((device, pair), (orbit.sequence, orbit.knots), kind=wall)
 
 
 @differentiable
-def _near(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], wall: str) -> Steady:
+def _near(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], *, kind: str) -> Steady:
     """Find the steady state near a guess.
 
     Compiled once, and so are its derivatives and batches: as one call they are known by its identity, while loops run
     one by one would be compiled for every call, as each makes their bodies anew.
     """
     (device, pair), (sequence, guess) = moved, about
-    pair = device.pair(wall) if pair is None else pair
+    pair = device.pair(kind) if pair is None else pair
     guess = jnp.where(sequence.real[:, None], guess, 0.0)
     return response(device, pair, sequence, *find(pair, sequence, guess))
 

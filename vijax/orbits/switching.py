@@ -16,7 +16,7 @@ from vijax.orbits.parameter import check_bounds, tilts
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks
 from vijax.runtime.context import door
-from vijax.runtime.xla import jitted
+from vijax.runtime.programs import jitted
 
 MOST_SWITCHES = 64  # So many switches in a row at most: each may find several branches from every one before.
 

@@ -7,7 +7,7 @@ function is differentiated as JAX does.
 """
 
 from collections.abc import Callable, Hashable
-from functools import partial
+from functools import partial, wraps
 from typing import Any, TypeVar
 
 import jax
@@ -16,7 +16,8 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from vijax.runtime import context
-from vijax.runtime.xla import jitted, share
+from vijax.runtime.programs import jitted
+from vijax.runtime.xla import share
 
 T = TypeVar("T")
 
@@ -25,38 +26,38 @@ def differentiable(work: Callable[..., T]) -> Callable[..., T]:
     """Compile a function, and its derivatives where its arguments are numbers.
 
     Args:
-        work: Function of variables, of what is not varied (two pytrees of arrays) and of a kind that can be hashed, to
-            a pytree of arrays. Its derivative in what is not varied must be zero: it is not asked for.
+        work: Function of a module, of variables and of what is not varied (two pytrees of arrays), and of a `kind` that
+            can be hashed, to a pytree of arrays. Its derivative in what is not varied must be zero.
     """
-    program = jitted(work, static_argnums=2)
+    program = jitted(work, static=("kind",))
 
-    @partial(jitted, static_argnums=2)
-    def slopes(variables: Any, fixed: Any, kind: Hashable) -> tuple[list[jax.Array], T]:
+    @partial(jitted, static=("kind",), name=f"slopes of {work.__module__}.{work.__qualname__}")
+    def slopes(variables: Any, fixed: Any, *, kind: Hashable) -> tuple[list[jax.Array], T]:
         def numbers(variables):
-            result = work(variables, fixed, kind)
+            result = work(variables, fixed, kind=kind)
             return [leaf for leaf in jax.tree.leaves(result) if _varies(leaf)], result
 
         return jax.jacfwd(numbers, has_aux=True)(variables)
 
     @partial(jax.custom_jvp, nondiff_argnums=(2,))
     def call(variables: Any, fixed: Any, kind: Hashable) -> T:
-        return program(variables, fixed, kind)
+        return program(variables, fixed, kind=kind)
 
     @partial(call.defjvp, symbolic_zeros=True)
     def derivative(kind: Hashable, primals: Any, tangents: Any) -> tuple[T, T]:
         variables, fixed = primals
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(primals)):
             moved = jax.tree.map(_dense, tangents[0], is_leaf=_is_zero)
-            return jax.jvp(lambda variables: program(variables, fixed, kind), (variables,), (moved,))
+            return jax.jvp(lambda variables: program(variables, fixed, kind=kind), (variables,), (moved,))
         # Within a derivative JAX takes a program apart before it compiles it, and what is to be shared is shared no
         # longer: twice the operations. No other thread is within one.
         with context.pool(1) as elsewhere:
-            columns, result = elsewhere.submit(slopes, variables, fixed, kind).result()
+            columns, result = elsewhere.submit(slopes, variables, fixed, kind=kind).result()
         moved = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
         rows = iter(columns)
         return result, jax.tree.map(lambda leaf: _along(leaf, rows, moved), result)
 
-    return call
+    return wraps(work)(lambda variables, fixed, *, kind: call(variables, fixed, kind))
 
 
 @jax.custom_jvp
@@ -86,7 +87,7 @@ def _along(leaf: jax.Array, rows: Any, moved: list[Any]) -> Any:
     """Compute the tangent of a result; of what holds no real numbers, JAX's word for none."""
     if not _varies(leaf):
         return np.zeros(leaf.shape, jax.dtypes.float0)
-    # What stands still is left out: a slope that is not finite, of what nobody varies, must not spoil the others.
+    # What nobody varies costs nothing.
     parts = zip(jax.tree.leaves(next(rows)), moved, strict=True)
     return sum(
         (jnp.tensordot(row, step, jnp.ndim(step)) for row, step in parts if not _is_zero(step)),

@@ -1,17 +1,18 @@
 """Programs that are traced once: what tracing makes of them is kept on disk, beside what JAX keeps of compiling it.
 
-Tracing and lowering the program of a plane takes two seconds of every process, more than running a small plane. What
-comes of it depends on the program, on the shapes of its arguments, on these sources, on JAX, and on whether kernels are
-wanted (`xla.KERNELS`), alone.
+Tracing and lowering the program of a plane takes two seconds of every process, more than running a small plane, and the
+small programs that find an orbit take one together. What comes of it depends on the program, on the shapes of its
+arguments, on these sources, on JAX, and on whether kernels are wanted (`xla.KERNELS`), alone.
 """
 
 import hashlib
+import pickle
 from collections.abc import Callable
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -37,8 +38,15 @@ _PACKAGE = Path(__file__).parents[1]
 _DIGEST = hashlib.sha256
 
 
+class _Traced(NamedTuple):
+    """A traced program of lists of arrays, and the pytree of its results, each told by its place in the list."""
+
+    program: export.Exported
+    results: Any
+
+
 class TracedProgram:
-    """A function of pytrees of arrays to one array, compiled for every shape of its arguments, as `jax.jit` does.
+    """A function of pytrees of arrays to such a one, compiled for every shape of its arguments, as `jax.jit` does.
 
     Where JAX keeps compiled programs (`jax_compilation_cache_dir`), its traced form is kept, too.
 
@@ -47,35 +55,59 @@ class TracedProgram:
         name: What it depends on besides its arguments, as text that is the same in every process.
     """
 
-    def __init__(self, work: Callable[..., jax.Array], name: str):
+    def __init__(self, work: Callable[..., Any], name: str):
         self._work, self._name = work, name
-        self._compiled: dict[Any, Callable[..., jax.Array]] = {}
+        self._compiled: dict[Any, Callable[..., Any]] = {}
         self._lock = Lock()
 
-    def __call__(self, *args: Any) -> jax.Array:
-        """Call the function, by the program for arguments of these shapes."""
+    def __call__(self, *args: Any, brief: bool = False) -> Any:
+        """Call the function, by the program for arguments of these shapes.
+
+        Args:
+            args: Pytrees of arrays.
+            brief: Whether the program runs so briefly that its compilation is what it costs.
+        """
         leaves, tree = jax.tree.flatten(args)
-        platform = next(iter(leaves[0].devices())).platform
+        platform = _platform(leaves)
         shapes = tuple((np.shape(x), str(x.dtype)) for x in leaves)
         key = platform, tree, shapes
         with self._lock:
             if key not in self._compiled:
-                self._compiled[key] = self._jitted(platform, tree, leaves, f"{self._name} {key}")
+                self._compiled[key] = self._jitted(platform, tree, leaves, f"{self._name} {key}", brief)
         return self._compiled[key](*leaves)
 
-    def _jitted(self, platform: str, tree: Any, leaves: list[Any], name: str) -> Callable[..., jax.Array]:
+    def _jitted(self, platform: str, tree: Any, leaves: list[Any], name: str, brief: bool) -> Callable[..., Any]:
         def flat(*leaves):
             return self._work(*jax.tree.unflatten(tree, leaves))
 
-        options, folder = xla.compiler_options(), cache_folder.kept()
+        options, folder = xla.compiler_options(brief=brief), cache_folder.kept()
         if folder is None or not _ours(tree):
             return jax.jit(flat, compiler_options=options)
         path = folder / f"traced-{_DIGEST(f'{name} {xla.KERNELS} {source_digest()}'.encode()).hexdigest()}"
         known = _read(path)
         if known is None:
-            known = export.export(jax.jit(flat), platforms=[platform])(*leaves)
-            _write(path, known.serialize())
-        return jax.jit(known.call, compiler_options=options)
+            known = _trace(flat, platform, leaves)
+            _write(path, known)
+        call, results = jax.jit(known.program.call, compiler_options=options), jax.tree.structure(known.results)
+        return lambda *leaves: jax.tree.unflatten(results, call(*leaves))
+
+
+def _platform(leaves: list[Any]) -> str:
+    """Say where the arguments of a program are; NumPy's arrays are wherever JAX computes by default."""
+    devices = (device for x in leaves if isinstance(x, jax.Array) for device in x.devices())
+    return next((device.platform for device in devices), jax.default_backend())
+
+
+def _trace(flat: Callable[..., Any], platform: str, leaves: list[Any]) -> _Traced:
+    trees = []
+
+    def listed(*leaves):
+        results, tree = jax.tree.flatten(flat(*leaves))
+        trees.append(tree)
+        return results
+
+    program = export.export(jax.jit(listed), platforms=[platform])(*leaves)
+    return _Traced(program, jax.tree.unflatten(trees[0], range(trees[0].num_leaves)))
 
 
 def _ours(tree: Any) -> bool:
@@ -94,19 +126,23 @@ def source_digest(package: Path = _PACKAGE) -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> export.Exported | None:
+def _read(path: Path) -> _Traced | None:
     """Read the program there, if it is there and whole."""
     try:
         content = path.read_bytes()
     except OSError:
         return None
     size = _DIGEST().digest_size
-    whole = _DIGEST(content[size:]).digest() == content[:size]
-    return export.deserialize(bytearray(content[size:])) if whole else None
+    if _DIGEST(content[size:]).digest() != content[:size]:
+        return None
+    # Pickles can run anything, and so can programs: `cache_folder` trusts no folder that somebody else may write to.
+    program, results = pickle.loads(content[size:])
+    return _Traced(export.deserialize(bytearray(program)), results)
 
 
-def _write(path: Path, content: bytes | bytearray) -> None:
+def _write(path: Path, known: _Traced) -> None:
     """Keep a program; where nothing can be written, the next process traces it again."""
+    content = pickle.dumps((bytes(known.program.serialize()), known.results))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part:

@@ -13,12 +13,11 @@ long.
 
 import os
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Int
@@ -39,7 +38,6 @@ _CPU_OPTIONS = {
 # A program that runs for milliseconds costs what it takes to compile: LLVM leaves it as it is, which takes half the
 # time, and it runs up to five times as long.
 _BRIEF = {"xla_backend_optimization_level": 0}
-_FEW = 64  # A program for so many rows at most is one that runs briefly.
 _STAYS = {"inlineable": "false"}  # a call that XLA does not see through
 _ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
 _BLOCK = 64  # lanes: what a step stores of them stays in the first cache; with 32 LLVM runs out of registers
@@ -82,37 +80,6 @@ def compiler_options(*, brief: bool = False) -> dict[str, Any]:
     said = os.environ.get("XLA_FLAGS", "")
     options = _CPU_OPTIONS | (_BRIEF if brief else {})
     return {name: value for name, value in options.items() if name not in said} if _on_cpu() else {}
-
-
-def _rows(leaf: Any) -> int:
-    return max(np.shape(leaf)[:1], default=0)
-
-
-def jitted(work: Callable[P, T], *, often: bool = False, **settings: Any) -> Callable[P, T]:
-    """Compile a function as `jax.jit` does, with our options of the compiler where it is a program of its own.
-
-    Within a program that JAX traces it is a part of that, to which the options of that one apply.
-
-    Args:
-        work: The function.
-        often: Whether it is called so often that it must run fast on few rows, too.
-        settings: Those of `jax.jit`.
-    """
-    part = jax.jit(work, **settings)
-
-    @cache  # JAX must not look for its backend before a program is called
-    def program(brief: bool) -> Callable[P, T]:
-        return jax.jit(work, compiler_options=compiler_options(brief=brief), **settings)
-
-    @wraps(work)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        # Of what JAX makes of constants it says whether it traces a program here.
-        given = jax.tree.leaves((args, kwargs, jnp.zeros(())))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in given):
-            return part(*args, **kwargs)
-        return program(not often and max(map(_rows, given)) <= _FEW)(*args, **kwargs)
-
-    return call
 
 
 @jax.jit
