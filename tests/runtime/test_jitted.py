@@ -74,11 +74,6 @@ def test_numbers_that_are_no_arrays_are_traced_as_jax_does(folder):
     assert not list(folder.iterdir())
 
 
-def test_what_is_called_often_is_left_to_jax(folder):
-    programs.jitted(wave, often=True)(X)
-    assert not list(folder.iterdir())
-
-
 @pytest.mark.parametrize(("rows", "often", "brief"), [(64, False, True), (65, False, False), (64, True, False)])
 def test_a_program_of_few_rows_is_compiled_briefly(monkeypatch, rows, often, brief):
     asked = []

@@ -15,7 +15,6 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 from jax import export
 
 from vijax.runtime import cache_folder, xla
@@ -69,21 +68,22 @@ class TracedProgram:
         """
         leaves, tree = jax.tree.flatten(args)
         platform = _platform(leaves)
-        shapes = tuple((np.shape(x), str(x.dtype)) for x in leaves)
-        key = platform, tree, shapes
+        key = platform, tree, tuple((x.shape, x.dtype) for x in leaves)
         with self._lock:
             if key not in self._compiled:
-                self._compiled[key] = self._jitted(platform, tree, leaves, f"{self._name} {key}", brief)
+                self._compiled[key] = self._jitted(platform, tree, leaves, brief)
         return self._compiled[key](*leaves)
 
-    def _jitted(self, platform: str, tree: Any, leaves: list[Any], name: str, brief: bool) -> Callable[..., Any]:
+    def _jitted(self, platform: str, tree: Any, leaves: list[Any], brief: bool) -> Callable[..., Any]:
         def flat(*leaves):
             return self._work(*jax.tree.unflatten(tree, leaves))
 
         options, folder = xla.compiler_options(brief=brief), cache_folder.kept()
         if folder is None or not _ours(tree):
             return jax.jit(flat, compiler_options=options)
-        path = folder / f"traced-{_DIGEST(f'{name} {xla.KERNELS} {source_digest()}'.encode()).hexdigest()}"
+        shapes = tuple((x.shape, str(x.dtype)) for x in leaves)
+        name = f"{self._name} {(platform, tree, shapes)} {xla.KERNELS} {source_digest()}"
+        path = folder / f"traced-{_DIGEST(name.encode()).hexdigest()}"
         known = _read(path)
         if known is None:
             known = _trace(flat, platform, leaves)

@@ -24,11 +24,11 @@ def jitted(
     """Compile a function as `jax.jit` does, with our options of the compiler where it is a program of its own.
 
     Within a program that JAX traces it is a part of that, to which the options of that one apply. Its traced form is
-    kept between processes where the function is known by a name, is called with arrays, and not often.
+    kept between processes where the function is known by a name and is called with arrays.
 
     Args:
         work: The function.
-        often: Whether it is called so often that it must run fast on few rows, too, and start without delay.
+        often: Whether it is called so often that it must run fast on few rows, too.
         name: What it depends on besides its arguments, as text that is the same in every process; a function of a
             module is known by where it stands.
         static: Names of arguments that are no arrays, but make programs of their own; given by name.
@@ -52,7 +52,7 @@ def jitted(
             return part(*args, **kwargs)
         brief = not often and max(map(_rows, given)) <= _FEW
         arrays = all(map(_is_array, jax.tree.leaves(args))) and set(kwargs) <= set(static)
-        if known and arrays and not often and cache_folder.kept():
+        if known and arrays and cache_folder.kept():
             return traced(tuple(kwargs.items()))(*args, brief=brief)
         return program(brief)(*args, **kwargs)
 
