@@ -31,7 +31,7 @@ def wave(x, *, factor=1.0):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_folder, "kept", lambda: tmp_path)
-    monkeypatch.setattr(wave, "__module__", "vijax.wave")
+    monkeypatch.setattr(wave, "__module__", "vijax.runtime.programs")
     traced.clear()
     return tmp_path
 
