@@ -1,5 +1,7 @@
 """The picture of one motion: what is drawn lies on the motion, and the impacts on the walls."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -47,3 +49,43 @@ def test_what_cannot_be_drawn_is_said(path):
         vijax.plots.trajectory(wide, vijax.trajectory(wide, 0.0, 0.0, periods=2))
     with pytest.raises(ValueError, match="path must be"):
         vijax.plots.trajectory(PAIR, path.impacts)
+    with pytest.raises(ValueError, match="pair must have r, a number, for the contacts to be drawn"):
+        vijax.plots.trajectory(dataclasses.replace(PAIR, r=None), path)
+
+
+@pytest.mark.parametrize("wall", ["soft", "rigid"])
+def test_energies_over_time_are_those_of_the_impacts(wall):
+    """On the attractor the points are those of the orbit, whose power a sweep knows by another way."""
+    device = vijax.Harvester(s=0.3, omega0=40.0, A=2.0, omega=4.0)
+    pair, starts = device.pair(wall), vijax.sweep(device=device, wall=wall)
+    settled = vijax.trajectory(pair, 0.02, 0.3, periods=300).states
+    path = vijax.trajectory(pair, settled.u[-1], settled.v[-1], periods=4)
+    upper, lower = vijax.plots.energies(pair, path, device).axes
+    count = int(path.filled)
+    assert count == 8
+    given, harvested = points(lower, "tab:orange"), points(lower, "tab:green")
+    assert given.shape == harvested.shape == (count, 2)
+    onset = (2 * np.asarray(path.impacts.n) + np.asarray(path.impacts.t))[:count]
+    np.testing.assert_array_equal(harvested[:, 0], onset)
+    np.testing.assert_allclose(harvested[:, 1].sum() / 8, float(starts.P), rtol=1e-9)
+    np.testing.assert_allclose((harvested[:, 1] / given[:, 1]).max(), float(starts.energy_ratio), rtol=1e-9)
+    # The ball comes in with the energy of its speed.
+    line = points(upper, "black")
+    speed = np.asarray(path.impacts.v_in)[:count] * float(device.speed_unit)
+    at_onset = [line[np.flatnonzero(line[:, 0] == time)[-2 if wall == "rigid" else 0], 1] for time in onset[1:-1]]
+    np.testing.assert_allclose(at_onset, 0.5 * device.m_b * speed[1:-1] ** 2, rtol=1e-6)
+
+
+def test_impacts_that_cannot_be_are_crossed_out():
+    path = vijax.trajectory(PAIR, 0.02, 0.3, periods=6)
+    count = int(path.filled)
+    for device, crossed in (
+        (vijax.Harvester(penetration_limit=np.inf), 0),
+        (vijax.Harvester(penetration_limit=1e-9), count),
+        (vijax.Harvester(penetration_limit=np.inf, V=1e5), count),
+    ):
+        lower = vijax.plots.energies(PAIR, path, device).axes[1]
+        assert sum(len(line.get_xdata()) for line in lower.lines if line.get_marker() == "x") == crossed
+    elastic = vijax.impact_pair(0.2, 40.0, 1.0)
+    lower = vijax.plots.energies(elastic, vijax.trajectory(elastic, 0.02, 0.3, periods=6)).axes[1]
+    assert len(points(lower, "tab:orange")) == 0  # an elastic membrane is given nothing

@@ -159,6 +159,14 @@ def with_constants(device: Harvester, **constants: Real) -> Harvester:
     return dataclasses.replace(device, **constants)
 
 
+@door
+def depth_unit(device: Harvester, pair: ImpactPair) -> Real:
+    """Compute metres per unit of an impact's depth; a rigid wall's depth is recorded as that of kappa = 1."""
+    if pair.rigid:
+        return device.length_unit * device.omega / (math.pi * device.omega0)
+    return device.length_unit
+
+
 def electrical(device: Harvester) -> Harvester:
     """Leave out of a device what the energy of an impact of known depth does not depend on: those fields are None."""
     return eqx.tree_at(

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vijax.model.device import Harvester, one_device, with_constants
+from vijax.model.device import Harvester, depth_unit, one_device, with_constants
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import AXES, MEASURED
 from vijax.orbits import orbit_properties
@@ -84,7 +84,7 @@ def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
     if branch.along not in ImpactPair.__dataclass_fields__:
         device = with_constants(device, **{branch.along: tiles.arrays(branch.values[:, None])})
     hits, label = orbit_properties.impacts(branch.orbit), orbit_properties.counts(branch.orbit)
-    length = orbit_properties.depth_unit(branch.orbit, device)
+    length = depth_unit(device, branch.orbit.pair)
     columns = {
         branch.along: branch.values,
         "multiplier": np.abs(np.asarray(branch.orbit.multipliers)).max(axis=1),

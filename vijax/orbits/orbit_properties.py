@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vijax.model import flow
-from vijax.model.device import Harvester, check_device
+from vijax.model.device import Harvester, check_device, depth_unit
 from vijax.model.energy import harvested_energy
 from vijax.model.label import label
 from vijax.model.records import Impact
@@ -95,17 +95,9 @@ def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
     check_device(device)
     own = tiles.library((check_orbit(orbit), device))
     orbit, device = jax.tree.map(own.asarray, (orbit, device))
-    energy = own.asarray(harvested_energy(device, orbit.depth * depth_unit(orbit, device)))
+    energy = own.asarray(harvested_energy(device, orbit.depth * depth_unit(device, orbit.pair)))
     # The span of an orbit is in half forcing periods, for their length is the unit of time.
     return tiles.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
-
-
-@door
-def depth_unit(orbit: Orbit, device: Harvester) -> Any:
-    """Give the metres per unit of `Orbit.depth`; a rigid wall's depth is that of kappa = 1."""
-    if orbit.pair.rigid:
-        return device.length_unit * device.omega / (flow.PI * device.omega0)
-    return device.length_unit
 
 
 @door

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from vijax.plots.designs import design, design_map
     from vijax.plots.figure import save
     from vijax.plots.kind_maps import basins, label_map
-    from vijax.plots.motions import trajectory
+    from vijax.plots.motions import energies, trajectory
     from vijax.plots.number_maps import difference_map, power_map, variable_map
     from vijax.plots.orbit_diagrams import orbit_diagram
 else:
@@ -22,7 +22,7 @@ else:
         "save": "figure",
         **dict.fromkeys(("basins", "label_map"), "kind_maps"),
         **dict.fromkeys(("difference_map", "power_map", "variable_map"), "number_maps"),
-        "trajectory": "motions",
+        **dict.fromkeys(("energies", "trajectory"), "motions"),
         "orbit_diagram": "orbit_diagrams",
     }
 
@@ -38,6 +38,7 @@ __all__ = [
     "design",
     "design_map",
     "difference_map",
+    "energies",
     "label_map",
     "orbit_diagram",
     "power_map",
