@@ -450,3 +450,15 @@ def test_a_map_without_what_is_asked_for_says_what_draws_the_others():
         number_maps.power_map(held_map().drop_vars("P"))
     with pytest.raises(ValueError, match=r"name must be among P, .* got 'lyapunov'"):
         number_maps.variable_map(held_map(), "lyapunov")
+
+
+def test_the_title_of_a_map_of_kinds_stands_clear_of_its_list():
+    held = {"r": ("r", "1", 0.5), "omega": (r"\omega", "rad s-1", 3.142), "A": ("A", "m s-2", 1.0)}
+    further = {name: ((), value, {"symbol": mark, "units": unit}) for name, (mark, unit, value) in held.items()}
+    found = labelled_map(gamma=0.1).assign_coords(further)
+    figure = kind_maps.label_map(found)
+    figure.canvas.draw()
+    (listed,) = figure.legends
+    assert figure.get_suptitle().startswith("soft walls")
+    written = figure._suptitle.get_window_extent().expanded(1.05, 1.0)  # words that all but touch cannot be read apart
+    assert not listed.get_window_extent().overlaps(written)

@@ -152,7 +152,9 @@ def coded(dataset: "xr.Dataset", categories: list[_Category] | None) -> Figure:
         _shade(figure, dataset, filled, dims)
     if categories is not None:
         _list_categories(figure, categories, loc="outside right upper")
-    figure.suptitle(title(dataset), fontsize="medium")
+    # Centred it would run into a list of categories beside the map.
+    place = {} if categories is None else {"x": 0.02, "ha": "left"}
+    figure.suptitle(title(dataset), fontsize="medium", **place)
     return figure
 
 
