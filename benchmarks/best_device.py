@@ -1,7 +1,8 @@
 """Is a design the best motion of its device? Against dense scans and nested sweeps of random devices.
 
-    python benchmarks/best_device.py                        # 200 devices with their scans, some ten minutes
+    python benchmarks/best_device.py                        # 200 devices with their scans, an hour
     python benchmarks/best_device.py --devices 40 --only two scan
+    python benchmarks/best_device.py --only two-quantities --scans scans.json  # scans are kept, and made once
 
 One line a figure, what is asked in brackets; every device below 99 % of its scan has a line of its own. A device's scan
 is 1,024 kappa x 8 starts x 1,000 periods, and the neighbourhoods of its three best values at 10,000; the nested sweeps,
@@ -11,12 +12,15 @@ flown from 8 starts for 10,000.
 """
 
 import argparse
+import json
 import math
+import resource
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -131,7 +135,19 @@ def nested(of: Harvester) -> Peak:
     return max([best, *peaks(of, _about(best, width / 32, 32), 4, 2000, 0)[:1]]) if best.P else best
 
 
-def two(_count: int) -> None:
+def kept(part: str, numbers: range, work: Callable[[Harvester], Peak], file: Path | None) -> list[Peak]:
+    """Find the best of a scan of every device; what a file holds of it is not sought again."""
+    known = json.loads(file.read_text()) if file is not None and file.exists() else {}
+    own = known.setdefault(part, {})
+    for number in numbers:
+        if str(number) not in own:
+            own[str(number)] = work(device(number))
+            if file is not None:
+                file.write_text(json.dumps(known))
+    return [Peak(*own[str(number)]) for number in numbers]
+
+
+def two(_asked: argparse.Namespace) -> None:
     """Try the two devices to start with."""
     designs = optimise_all([of for of, *_ in TWO], **SEARCH)
     for (_, kappa, P), found in zip(TWO, designs, strict=True):
@@ -145,16 +161,18 @@ def two(_count: int) -> None:
         )
 
 
-def scan(count: int) -> None:
+def scan(asked: argparse.Namespace) -> None:
     """Compare random devices with scans of their own, and fly their answers again."""
-    devices = [device(number) for number in range(count)]
-    _compared("scan", devices, optimise_all(devices, **SEARCH), [scanned(of) for of in devices])
+    numbers = range(asked.devices)
+    devices = [device(number) for number in numbers]
+    _compared("scan", devices, optimise_all(devices, **SEARCH), kept("scan", numbers, scanned, asked.scans))
 
 
-def two_quantities(count: int) -> None:
+def two_quantities(asked: argparse.Namespace) -> None:
     """Compare designs in (kappa, d) with scans of their planes, and fly their answers again."""
-    devices = [device(number) for number in range(max(count // 4, 1))]
-    _compared("plane", devices, optimise_all(devices, **SEARCH_TWO), [plane(of) for of in devices])
+    numbers = range(max(asked.devices // 4, 1))
+    devices = [device(number) for number in numbers]
+    _compared("plane", devices, optimise_all(devices, **SEARCH_TWO), kept("plane", numbers, plane, asked.scans))
 
 
 def _compared(part: str, devices: list[Harvester], designs: list[Design], peaks_found: list[Peak]) -> None:
@@ -205,9 +223,9 @@ def _again(part: str, devices: list[Harvester], designs: list[Design]) -> None:
     say(f"{part}: P within 3 standard errors; largest", f"{sum(x <= 3 for x in off)} of {len(off)}; {max(off):.1f}")
 
 
-def orbits(count: int) -> None:
+def orbits(asked: argparse.Namespace) -> None:
     """Try devices whose best motion is an orbit: the same optimum as of orbits alone."""
-    devices = [device(number) for number in range(count)]
+    devices = [device(number) for number in range(asked.devices)]
     every = zip(optimise_all(devices, **SEARCH), optimise_all(devices, motion="periodic", **SEARCH), strict=True)
     moved, lost, better = [], 0.0, 0
     for found, alone in every:
@@ -226,8 +244,9 @@ def orbits(count: int) -> None:
     say("orbits: largest loss of height", f"{lost:.1e}")
 
 
-def cost(count: int) -> None:
+def cost(asked: argparse.Namespace) -> None:
     """Measure the seconds a device of many in one call, beside the nested sweeps."""
+    count = asked.devices
     devices = [device(number) for number in range(count)]
     optimise_all(devices, **SEARCH)
     # What nested sweeps cost depends on the device: one of ten, from first to last, stands for all.
@@ -255,12 +274,28 @@ def _seconds(calls: list[Callable[[], Any]]) -> float:
     return time.perf_counter() - begun
 
 
-PARTS: dict[str, Callable[[int], None]] = {
+def many(asked: argparse.Namespace) -> None:
+    """Measure seconds and memory of five times as many devices in one call."""
+    devices = [device(number) for number in range(5 * asked.devices)]
+    before = _memory()
+    took = _seconds([partial(optimise_all, devices, **SEARCH)])
+    say(f"many: {len(devices):,} devices in one call", f"{took:.0f} s")
+    say("many: most memory of the process [GB], before and at last", f"{before:.2f}, {_memory():.2f}")
+
+
+def _memory() -> float:
+    """Give the most memory that this process has held so far [GB]."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "two": two,
     "scan": scan,
     "two-quantities": two_quantities,
     "orbits": orbits,
     "cost": cost,
+    "many": many,
 }
 
 
@@ -269,10 +304,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--devices", type=int, default=200, help="how many at random [200]")
     parser.add_argument("--only", nargs="+", choices=PARTS, help="which parts [all]")
+    parser.add_argument("--scans", type=Path, help="file that keeps the best of every scan [none]")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    for run in (partial(part, asked.devices) for name, part in PARTS.items() if not asked.only or name in asked.only):
-        run()
+    for run in (part for name, part in PARTS.items() if not asked.only or name in asked.only):
+        run(asked)
     return 0
 
 

@@ -70,6 +70,22 @@ def test_giving_up_early_loses_no_start_that_may_win():
     assert flown < 0.8 * more
 
 
+def test_a_survey_looks_along_the_first_quantity_at_values_of_the_others_that_lie_evenly():
+    names, count = ("kappa", "d", "r"), 16
+    bounds = {"kappa": (3.0, 400.0), "d": (0.04, 0.25), "r": (0.2, 0.8)}
+    box = optimise.check([BEYOND], names, bounds, "P", ())
+    far = Effort(2, 1, 16, 10)._replace(settings=DesignSettings(survey_levels=count))
+    met, _ = multistart.every_start([BEYOND], names, box, far)
+    low, high = box[0]
+    places = np.unique(np.round((met.z - low) / (high - low), 9), axis=0)
+    assert len(places) == len(met.z) == 2 * count == multistart.balls(names, far)
+    others = np.unique(places[:, 1:], axis=0)
+    assert len(others) == count
+    # No motion may hide between two values, nor beyond the last one.
+    np.testing.assert_allclose(np.sort(others[:, 0]), (np.arange(count) + 0.5) / count)
+    assert np.diff(np.sort(others[:, 1]), prepend=0.0, append=1.0).max() < 2 / count
+
+
 def test_starts_of_one_device_do_not_depend_on_the_others():
     devices = [IN_CHAOS, BEYOND]
 

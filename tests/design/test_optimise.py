@@ -6,6 +6,7 @@ In one file, as the programs compiled for the one serve the other.
 import dataclasses
 import json
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,27 @@ def kappa(optimum):
 def found():
     """Both devices in one call; with `max_impacts` as low as here little is compiled."""
     return optimise.optimise_all([FAST, PAPER], survey_points=128, starts=2, max_impacts=2, motion="periodic")
+
+
+def test_devices_are_designed_in_groups_whose_balls_fit(monkeypatch):
+    groups: list[list[float]] = []
+    nothing: Any = None
+
+    def sought(task, *_):
+        assert len(task.box) == len(task.devices)
+        groups.append([one.s for one in task.devices])
+        return [optimise._Found((), nothing, 0) for _ in task.devices]
+
+    monkeypatch.setattr(optimise, "_sought", sought)
+    gaps = np.linspace(0.1, 0.2, 11).tolist()
+    devices = [Harvester(s=s) for s in gaps]
+    points = optimise._TOGETHER // (4 * 8)
+    assert len(optimise.optimise_all(devices, survey_points=points, starts=8)) == 11
+    assert groups == [gaps[:4], gaps[4:8], gaps[8:]]
+    # With a second quantity a survey has sixteen times as many balls.
+    groups.clear()
+    optimise.optimise_all(devices[:3], survey_points=points // 8, starts=8, tune=("kappa", "d"))
+    assert groups == [gaps[:2], gaps[2:3]]
 
 
 def test_the_small_fast_device(found):

@@ -114,7 +114,7 @@ def _agree(asked: DesignRequest, yes: bool) -> None:
     from vijax.design import optimise
 
     effort = optimise.effort(*(asked.search[name] for name in ("survey_points", "starts", "max_impacts")))
-    process.agree(optimise.expected(len(asked.devices), effort), yes)
+    process.agree(optimise.expected(len(asked.devices), asked.search["tune"], effort), yes)
 
 
 def _run(asked: DesignRequest) -> "tuple[dict[str, Any], xr.Dataset | None, str]":

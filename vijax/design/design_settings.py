@@ -32,6 +32,7 @@ _NUMBERS: dict[str, Rule] = {
     "limit_room": _SHARE,
 }
 _COUNTS = (
+    "survey_levels",
     "max_hills",
     "max_sure_impacts",
     "max_excess_steps",
@@ -58,8 +59,9 @@ class DesignSettings:
     Attributes:
         max_period: Forcing periods of an orbit, at most, 8. Longer ones live in windows that few starts meet; each
             period more is recorded of every chaotic motion.
-        survey_levels: Values of all tuned quantities but the first at which a survey looks, in parts of their bounds,
-            0.2, 0.5 and 0.8. Their number, to the power of the other quantities, multiplies the cells of a survey.
+        survey_levels: Values of all tuned quantities but the first, taken together, at which a survey looks along the
+            first, spread evenly over their bounds, 16. They multiply the cells of a survey. With 3, designs in
+            (kappa, d) missed motions that live between them and beyond: of 12 random devices one lost a third of its P.
         max_hills: Of a kind along the first quantity's bounds, about, that are climbed, 256: the best attractor of a
             kind climbs as far as one part of so many away. With fewer, kinds that have two hills may lose one; with
             more, many climb one hill.
@@ -117,7 +119,7 @@ class DesignSettings:
     """
 
     max_period: int = 8
-    survey_levels: tuple[float, ...] = (0.2, 0.5, 0.8)
+    survey_levels: int = 16
     max_hills: int = 256
     max_sure_impacts: int = 8
     min_promise: float = 0.8
@@ -153,9 +155,6 @@ class DesignSettings:
 
     def __post_init__(self) -> None:
         self._set("max_period", checks.whole("max_period", self.max_period, 1, _MOST_PERIOD))
-        self._set(
-            "survey_levels", tuple(_level(one) for one in checks.numbers("survey_levels", self.survey_levels).flat)
-        )
         for name, (must, holds) in _NUMBERS.items():
             self._set(name, checks.real(name, getattr(self, name), must, holds))
         for name in _COUNTS:
@@ -164,10 +163,6 @@ class DesignSettings:
     def _set(self, name: str, value: Any) -> None:
         """Put the plain value in place of the one given, as a frozen record lets only itself do."""
         object.__setattr__(self, name, value)
-
-
-def _level(value: Any) -> float:
-    return checks.real("survey_levels", float(value), "numbers from 0 to 1", lambda x: 0 <= x <= 1)
 
 
 DEFAULT = DesignSettings()

@@ -4,7 +4,6 @@
 found, for narrow windows of periodic motion lie there -> the best of every kind.
 """
 
-import itertools
 import math
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ from vijax.design.variables import LINEAR, cells, moving, values
 from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.runtime import tiles
+from vijax.runtime.lattice import lattice
 
 _TILES = (512, 4096, 32768)  # cells of one compiled call
 _REACH = 0.49, 0.6  # a ball starts within this part of the gap, and with at most this velocity
@@ -205,12 +205,21 @@ class _Scene(NamedTuple):
     @property
     def points(self) -> int:
         """Count the values of the first quantity at which is looked."""
-        return 1 if _first(self.tune) is None else self.effort.points
+        return _points(self.tune, self.effort)
 
     @property
     def cells(self) -> int:
         """Count the balls of a device that are flown in a look, at most."""
-        return len(_levels(self.tune, self.effort)) * self.points * self.effort.starts
+        return balls(self.tune, self.effort)
+
+
+def balls(tune: tuple[str, ...], effort: Effort) -> int:
+    """Count the balls of a device that are flown in a look, at most."""
+    return len(_levels(tune, effort)) * _points(tune, effort) * effort.starts
+
+
+def _points(tune: tuple[str, ...], effort: Effort) -> int:
+    return 1 if _first(tune) is None else effort.points
 
 
 def _first(tune: tuple[str, ...]) -> int | None:
@@ -219,11 +228,17 @@ def _first(tune: tuple[str, ...]) -> int | None:
 
 
 def _levels(tune: tuple[str, ...], effort: Effort) -> np.ndarray:
-    """List values [level, quantity] of the others, in parts of their bounds."""
-    first, levels = _first(tune), effort.settings.survey_levels
-    return np.array(
-        list(itertools.product(*((0.5,) if i == first or not moving(x) else levels for i, x in enumerate(tune))))
-    )
+    """List values [level, quantity] of the others together, in parts of their bounds, over which they lie evenly."""
+    first = _first(tune)
+    others = [i for i, name in enumerate(tune) if i != first and moving(name)]
+    count = effort.settings.survey_levels if others else 1
+    parts = np.full((count, len(tune)), 0.5)
+    if others:
+        # A grid along one of them; over several a lattice of as many places.
+        parts[:, others[0]] = (np.arange(count) + 0.5) / count
+        if others[1:]:
+            parts[:, others[1:]] = lattice(count, len(others) - 1).T
+    return parts
 
 
 class _Seen(NamedTuple):

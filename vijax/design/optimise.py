@@ -21,7 +21,7 @@ from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
 from vijax.design.design_settings import DEFAULT, DesignSettings, check_settings
 from vijax.design.ensemble import Task
-from vijax.design.multistart import Begun, Effort, Looked, every_start, find
+from vijax.design.multistart import Begun, Effort, Looked, balls, every_start, find
 from vijax.design.objective import OBJECTIVES, Batch, Scene
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, End, Optimum, verified
 from vijax.design.promise import Met
@@ -43,6 +43,8 @@ _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most
 _TILE = 4
 _MOST_EVALUATIONS, _MOST_POINTS, _MOST_IMPACTS = 10**5, 10**7, 256
 _BALL = 1000  # bytes that a survey keeps of a ball
+# Balls of a survey, at most, of devices that are designed together: memory does not grow with devices beyond these.
+_TOGETHER = 2**18
 
 
 @dataclass(frozen=True)
@@ -187,21 +189,22 @@ def optimise_all(
     max_evaluations = checks.whole("max_evaluations", max_evaluations, 2, _MOST_EVALUATIONS)
     far = effort(survey_points, starts, max_impacts, survey_periods)._replace(settings=check_settings(settings))
     box = check(devices, tune, bounds, objective, scatter)
-    if (asked := expected(len(devices), far)).long:
+    if (asked := expected(len(devices), tune, far)).long:
         _LOG.warning("a long run begins: %s", asked)
     task = Task(devices, tune, box, objective, scatter if objective == "expected" else (), reliability, settings)
     alone = motion == "periodic" or objective in OVER_TOLERANCES
+    found = _in_groups(task, far, nodes(scatter, samples), max_evaluations, alone)
     return [
         Design(
-            optima=found.optima,
+            optima=one.optima,
             tune=tune,
             bounds=dict(zip(tune, map(tuple, np.asarray(values(tune, limits)).T.tolist()), strict=True)),
             objective=objective,
             tolerances=scatter,
-            looked=found.looked,
-            ascents=found.ascents,
+            looked=one.looked,
+            ascents=one.ascents,
         )
-        for found, limits in zip(_sought(task, far, nodes(scatter, samples), max_evaluations, alone), box, strict=True)
+        for one, limits in zip(found, box, strict=True)
     ]
 
 
@@ -211,6 +214,16 @@ class _Found(NamedTuple):
     optima: tuple[Optimum | AperiodicOptimum, ...]
     looked: Looked
     ascents: int
+
+
+def _in_groups(task: Task, far: Effort, cloud: Nodes, max_evaluations: int, orbits_alone: bool) -> list[_Found]:
+    """Design some devices after others, as many together as memory is meant for."""
+    size, found = max(_TOGETHER // balls(task.tune, far), 1), []
+    for first in range(0, len(task.devices), size):
+        some = slice(first, first + size)
+        own = task._replace(devices=task.devices[some], box=task.box[some])
+        found += _sought(own, far, cloud, max_evaluations, orbits_alone)
+    return found
 
 
 def _sought(task: Task, far: Effort, cloud: Nodes, max_evaluations: int, orbits_alone: bool) -> list[_Found]:
@@ -280,15 +293,16 @@ def effort(survey_points: int, starts: int, max_impacts: int, survey_periods: in
     )
 
 
-def expected(devices: int, far: Effort) -> Estimate:
+def expected(devices: int, tune: tuple[str, ...], far: Effort) -> Estimate:
     """Estimate what the survey of so many devices asks of the machine; ascents take less.
 
     Raises:
-        ValueError: If its balls do not fit in memory.
+        ValueError: If the balls that are flown together do not fit in memory.
     """
-    count = devices * far.points * far.starts
-    checks.fits(("devices", "survey_points", "starts"), count * _BALL, f"{count:,} balls")
-    return estimate.of_recorded(count, far.periods, count * _BALL)
+    own = balls(tune, far)
+    count, together = devices * own, min(devices * own, max(own, _TOGETHER))
+    checks.fits(("survey_points", "starts"), together * _BALL, f"{together:,} balls")
+    return estimate.of_recorded(count, far.periods, together * _BALL)
 
 
 @door
