@@ -17,7 +17,7 @@ from vijax.batch.simulate import Starts
 from vijax.design.ascent import Box, Look, ascend
 from vijax.design.design_settings import DesignSettings
 from vijax.design.ensemble import AVERAGED, Ensemble, Task, alike, fly
-from vijax.design.promise import Met, promise
+from vijax.design.promise import Met
 from vijax.design.response_surface import Surface, fit, unknown
 from vijax.runtime import tiles
 from vijax.runtime.programs import jitted
@@ -96,7 +96,7 @@ def search(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
 def _begun(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
     """Choose the most promising places of every device, apart from each other."""
     settings, places = task.settings, []
-    hope = promise(unrest, task.objective)
+    hope = unrest.hope
     least = known + np.log(settings.min_chaos)
     for owner in np.unique(unrest.owner).tolist():
         own = np.flatnonzero(unrest.owner == owner)

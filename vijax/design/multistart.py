@@ -115,23 +115,23 @@ def find(
         effort: How far to look.
         orbits_alone: Whether chaos is no answer, but a place where narrow windows may hide an orbit.
     """
-    scene = _Scene(devices, tune, box, effort)
-    seen = _first_look(scene) if orbits_alone else _in_two_flights(scene, objective)
+    scene = _Scene(devices, tune, box, objective, effort)
+    seen = _first_look(scene) if orbits_alone else _in_two_flights(scene)
     met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
     if _first(tune) is not None:
-        most = highest_promise(objective, len(devices), *((met,) if orbits_alone else (met, unrest)))
-        good = promise(unrest, objective).total > most[unrest.owner] + math.log(effort.settings.min_promise)
+        most = highest_promise(len(devices), *((met,) if orbits_alone else (met, unrest)))
+        good = unrest.hope.total > most[unrest.owner] + math.log(effort.settings.min_promise)
         # An orbit that keeps its limits may hide in chaos that is far beyond them; the best motion of all does not.
-        good &= orbits_alone | near_limits(unrest.some(good), unrest, objective, effort.settings)
+        good &= orbits_alone | near_limits(unrest.some(good), unrest, effort.settings)
         again = _closer(unrest.some(good), effort, scene.cells)
         if again.owner.size:
             closer = _look(scene, again, 1)
             more = closer.orbits(effort.max_impacts), closer.restless(effort.max_impacts)
             met, unrest = jax.tree.map(lambda *x: np.concatenate(x), (met, unrest), more)
-    looked = [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
-    chosen = met.some(_promising(met, objective, len(devices), scene.points, effort.settings))
+    looked = _looked(scene, met, unrest, seen)
+    chosen = met.some(_promising(met, len(devices), scene.points, effort.settings))
     if not orbits_alone:
-        chosen = chosen.some(_rivals(chosen, unrest, objective, scene))
+        chosen = chosen.some(_rivals(chosen, unrest, scene))
     flights = flown(chosen.pair, chosen.ended, effort.max_impacts)
     return Begun(flights, chosen.device, chosen.z, chosen.owner), unrest, looked
 
@@ -140,9 +140,10 @@ def every_start(
     devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: Effort
 ) -> tuple[Met, list[Looked]]:
     """Find what every start came to, where that is the answer, and what each device met; arguments as in `find`."""
-    seen = _first_look(_Scene(devices, tune, box, effort))
+    scene = _Scene(devices, tune, box, "expected", effort)
+    seen = _first_look(scene)
     met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
-    return seen.every(), [_looked(one, met, unrest, seen, tune) for one in range(len(devices))]
+    return seen.every(), _looked(scene, met, unrest, seen)
 
 
 def _first_look(scene: "_Scene") -> "_Seen":
@@ -154,44 +155,50 @@ def _first_look(scene: "_Scene") -> "_Seen":
     return _look(scene, _Places(owner, level, step / max(scene.points - 1, 1), number), 0)
 
 
-def _in_two_flights(scene: "_Scene", objective: str) -> "_Seen":
+def _in_two_flights(scene: "_Scene") -> "_Seen":
     """Survey coarsely, where any motion may win: what has not settled soon flies on where it may be the best."""
     effort, devices = scene.effort, len(scene.devices)
     short = min(effort.settings.first_periods, effort.periods)
     seen = _first_look(scene._replace(effort=effort._replace(periods=short)))
     cells = seen.found.restless(effort.max_impacts)
     met, unrest = seen.orbits(effort.max_impacts), seen.motions(cells)
-    hope = promise(unrest, objective)
-    most = highest_promise(objective, devices, met, unrest)
-    good = hope.total > most[unrest.owner] + math.log(effort.settings.min_rival)
-    good = near_limits(unrest.some(good), unrest, objective, effort.settings)
+    most = highest_promise(devices, met, unrest)
+    good = unrest.hope.total > most[unrest.owner] + math.log(effort.settings.min_rival)
+    good = near_limits(unrest.some(good), unrest, effort.settings)
     if short == effort.periods or not good.any():
         return seen
     return seen._replace(found=seen.found.onward(cells[good], seen.device, effort.periods))
 
 
-def _looked(one: int, met: Met, unrest: Met, seen: "_Seen", tune: tuple[str, ...]) -> Looked:
-    """Sum up what was met of a device, by the closer survey too."""
-    met, unrest = met.some(met.owner == one), unrest.some(unrest.owner == one)
-    broken, rest = promise(met, "P").lacks < 0, promise(unrest, "P")
-    power = np.where(rest.lacks < 0, 0.0, np.nan_to_num(np.exp(rest.value)))
-    best = float(power.max(initial=0.0))
-    where = np.asarray(values(tune, unrest.z[power.argmax()])).tolist() if best else []
-    room = np.concatenate([one.found.margins(one.device) for one in (met, unrest)])
-    nearest = room[np.nan_to_num(room, nan=-np.inf).min(axis=1).argmax()] if len(room) else np.zeros(2)
-    breaks = bool(nearest.min() < 0)
-    status = seen.found.ended.status[seen.places.owner == one]
-    return Looked(
-        orbits=broken.size,
-        admissible=int((~broken).sum()),
-        restless=len(np.unique(unrest.z, axis=0)),
-        P=best,
-        values=dict(zip(tune, where, strict=bool(best))),
-        limit=LIMITS[int(nearest.argmin())] if breaks else "",
-        excess=math.expm1(-float(nearest.min())) if breaks else 0.0,
-        held=float((status == Status.PERMANENT_CONTACT).mean()),
-        silent=float((status == Status.NO_IMPACT).mean()),
-    )
+def _looked(scene: "_Scene", met: Met, unrest: Met, seen: "_Seen") -> list[Looked]:
+    """Sum up what was met of every device, by the closer survey too."""
+    power = np.where(unrest.hope.lacks < 0, 0.0, np.nan_to_num(unrest.found.P))
+    owner = np.concatenate([met.owner, unrest.owner])
+    every_room = np.concatenate([one.found.margins(one.device) for one in (met, unrest)])
+    every_status = seen.found.ended.status
+
+    def told(one: int) -> Looked:
+        orbits, others = met.owner == one, np.flatnonzero(unrest.owner == one)
+        highest = others[power[others].argmax()] if others.size else None
+        best = 0.0 if highest is None else float(power[highest])
+        where = np.asarray(values(scene.tune, unrest.z[highest])).tolist() if best else []
+        room = every_room[owner == one]
+        nearest = room[np.nan_to_num(room, nan=-np.inf).min(axis=1).argmax()] if len(room) else np.zeros(2)
+        breaks = bool(nearest.min() < 0)
+        status = every_status[seen.places.owner == one]
+        return Looked(
+            orbits=int(orbits.sum()),
+            admissible=int((met.hope.lacks[orbits] >= 0).sum()),
+            restless=len(np.unique(unrest.z[others], axis=0)),
+            P=best,
+            values=dict(zip(scene.tune, where, strict=bool(best))),
+            limit=LIMITS[int(nearest.argmin())] if breaks else "",
+            excess=math.expm1(-float(nearest.min())) if breaks else 0.0,
+            held=float((status == Status.PERMANENT_CONTACT).mean()),
+            silent=float((status == Status.NO_IMPACT).mean()),
+        )
+
+    return [told(one) for one in range(len(scene.devices))]
 
 
 class _Scene(NamedTuple):
@@ -200,6 +207,7 @@ class _Scene(NamedTuple):
     devices: list[Harvester]
     tune: tuple[str, ...]
     box: np.ndarray
+    objective: str
     effort: Effort
 
     @property
@@ -242,8 +250,9 @@ def _levels(tune: tuple[str, ...], effort: Effort) -> np.ndarray:
 
 
 class _Seen(NamedTuple):
-    """A survey at some places: the device and the variables of every cell."""
+    """A survey at some places, for an objective: the device and the variables of every cell."""
 
+    objective: str
     found: Survey
     device: Harvester
     z: np.ndarray
@@ -265,8 +274,10 @@ class _Seen(NamedTuple):
     def motions(self, cells: np.ndarray) -> Met:
         """Tell what some cells met, by their indices."""
         run = (self.found.pair, self.found.ended)
-        (pair, ended), device, z, places, step = jax.tree.map(lambda x: x[cells], (run, *self[1:]))
-        return Met(averages(device, ended), pair, ended, device, z, places.owner, places.level, step)
+        (pair, ended), device, z, places, step = jax.tree.map(lambda x: x[cells], (run, *self[2:]))
+        found = averages(device, ended)
+        hope = promise(found, device, self.objective)
+        return Met(found, hope, pair, ended, device, z, places.owner, places.level, step)
 
 
 def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
@@ -274,7 +285,7 @@ def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
 
     Draws are the same for every device, whatever the others are: designs of one do not depend on them.
     """
-    devices, tune, box, effort = scene
+    devices, tune, box, objective, effort = scene
     first, parts = _first(tune), _levels(tune, effort)[places.level]
     if first is not None:
         parts[:, first] = places.part
@@ -287,7 +298,7 @@ def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
     starts = Starts(u0 * pair.d, v0, np.zeros_like(v0))
     found = survey(pair, every, starts, longest=effort.settings.max_period, periods=effort.periods)
     step = np.round(places.part * (effort.points - 1)).astype(int)
-    return _Seen(found, every, z, places, step)
+    return _Seen(objective, found, every, z, places, step)
 
 
 def _closer(unrest: Met, effort: Effort, most_cells: int) -> _Places:
@@ -306,17 +317,17 @@ def _closer(unrest: Met, effort: Effort, most_cells: int) -> _Places:
     return jax.tree.map(lambda *x: np.concatenate(x), *places)
 
 
-def _promising(met: Met, objective: str, devices: int, points: int, settings: DesignSettings) -> np.ndarray:
+def _promising(met: Met, devices: int, points: int, settings: DesignSettings) -> np.ndarray:
     """Choose the attractors to climb from: the best of their kind as far as so many steps away.
 
     A kind is given by span and impacts; the walls may change places where the tube is level.
     """
-    hope = promise(met, objective)
+    hope = met.hope
     score = np.where(hope.lacks < 0, _HOPELESS + hope.lacks, hope.value)
     left, right = _impacts(met)
     kind = np.column_stack([met.owner, met.level, met.ended.period, left, right])
     found = highest(kind, met.step, score, max(1, points // settings.max_hills))
-    enough = hope.total > highest_promise(objective, devices, met)[met.owner] + math.log(settings.min_promise)
+    enough = hope.total > highest_promise(devices, met)[met.owner] + math.log(settings.min_promise)
     return found[(enough | (left + right <= settings.max_sure_impacts))[found]]
 
 
@@ -348,13 +359,13 @@ def _impacts(met: Met) -> tuple[np.ndarray, np.ndarray]:
     return np.where(swap, right, left), np.where(swap, left, right)
 
 
-def _rivals(met: Met, unrest: Met, objective: str, scene: _Scene) -> np.ndarray:
+def _rivals(met: Met, unrest: Met, scene: _Scene) -> np.ndarray:
     """Choose the attractors that may lead to the best design, where any motion may win.
 
     What promises too little, or exceeds a limit by far, never did.
     """
-    devices, settings, hope = len(scene.devices), scene.effort.settings, promise(met, objective)
-    most = highest_promise(objective, devices, met, unrest)
+    settings, hope = scene.effort.settings, met.hope
+    most = highest_promise(len(scene.devices), met, unrest)
     near = hope.lacks >= -_excess(scene)[met.owner]
     return np.flatnonzero(near & (hope.total >= most[met.owner] + math.log(settings.min_rival)))
 

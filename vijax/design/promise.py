@@ -11,16 +11,38 @@ from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 
 
+class Promise(NamedTuple):
+    """Of every motion the logarithm of the objective, and what is lacking to the worst constraint: 0 if nothing."""
+
+    value: np.ndarray
+    lacks: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """Compute what may be left where no constraint is broken any more."""
+        return self.value + self.lacks
+
+
+def promise(found: Averages, device: Harvester, objective: str) -> Promise:
+    """Judge motions in devices of their own: what they gave, and what they lacked."""
+    with np.errstate(divide="ignore"):
+        value = np.log(np.nan_to_num(found.value(objective, device)))
+    return Promise(value, np.nanmin(found.margins(device), axis=1, initial=0.0))
+
+
 class Met(NamedTuple):
-    """Motions that were met, [motion]: what each gave, how it ended, the device there and its variables; where it was.
+    """Motions that were met, [motion]: what each gave and promises, how it ended, in which device, where it was.
 
     Attributes:
+        hope: What it promises of the objective that is sought.
         pair, ended: Parameters, and the `Summary`.
+        z: Variables of its device.
         owner: Which of the devices given.
         level, step: Of the survey's values of the other quantities together, and of the first one.
     """
 
     found: Averages
+    hope: Promise
     pair: ImpactPair
     ended: Any
     device: Harvester
@@ -34,39 +56,19 @@ class Met(NamedTuple):
         return jax.tree.map(lambda x: x[index], self)
 
 
-class Promise(NamedTuple):
-    """Of every motion the logarithm of the objective, and what is lacking to the worst constraint: 0 if nothing."""
-
-    value: np.ndarray
-    lacks: np.ndarray
-
-    @property
-    def total(self) -> np.ndarray:
-        """Compute what may be left where no constraint is broken any more."""
-        return self.value + self.lacks
-
-
-def promise(met: Met, objective: str) -> Promise:
-    """Judge motions: what they gave, and what they lacked."""
-    with np.errstate(divide="ignore"):
-        value = np.log(np.nan_to_num(met.found.value(objective, met.device)))
-    return Promise(value, np.nanmin(met.found.margins(met.device), axis=1, initial=0.0))
-
-
-def highest_promise(objective: str, devices: int, *met: Met) -> np.ndarray:
+def highest_promise(devices: int, *met: Met) -> np.ndarray:
     """Find what the best motion of every device promises that breaks no limit; -inf where there is none."""
     most = np.full(devices, -np.inf)
     for some in met:
-        hope = promise(some, objective)
-        np.maximum.at(most, some.owner, np.where(hope.lacks < 0, -np.inf, hope.value))
+        np.maximum.at(most, some.owner, np.where(some.hope.lacks < 0, -np.inf, some.hope.value))
     return most
 
 
-def near_limits(met: Met, where: Met, objective: str, settings: DesignSettings) -> np.ndarray:
+def near_limits(met: Met, where: Met, settings: DesignSettings) -> np.ndarray:
     """Say which motions are at a step, or beside one, where one of some exceeds no limit by far."""
-    good = met.some(promise(met, objective).lacks >= -settings.max_excess)
+    good = np.flatnonzero(met.hope.lacks >= -settings.max_excess)
     shape = [1 + int(x.max(initial=0)) for x in (where.owner, where.level)]
     near = np.zeros((*shape, 3 + int(where.step.max(initial=0))), bool)
     for beside in range(3):
-        near[good.owner, good.level, good.step + beside] = True
+        near[met.owner[good], met.level[good], met.step[good] + beside] = True
     return near[where.owner, where.level, where.step + 1]
