@@ -7,9 +7,13 @@ import numpy as np
 
 import vijax
 from vijax.batch.simulate import Starts
+from vijax.design import long_flight
+from vijax.design.aperiodic_search import Place
+from vijax.design.averages import Averages
 from vijax.design.design_settings import DEFAULT
-from vijax.design.ensemble import Task, fly, on_motion
+from vijax.design.ensemble import Ensemble, Task, fly, on_motion
 from vijax.design.long_flight import out_of_step, room_left
+from vijax.design.response_surface import unknown
 
 
 def test_another_flight_as_long_seldom_leaves_less_room_than_a_proof_says():
@@ -46,6 +50,37 @@ def test_balls_of_a_proof_visit_the_bands_of_their_motion_out_of_step():
     assert (flown.found.period == 4).all()
     _, counts = np.unique(np.round(np.stack(jax.tree.leaves(flown.found.end)[:2]), 6), axis=1, return_counts=True)
     np.testing.assert_array_equal(counts, 4 * [DEFAULT.confirm_balls // 4])
+
+
+def test_a_design_that_breaks_a_limit_moves_on_until_it_keeps_it(monkeypatch):
+    device, further = vijax.Harvester(), 0.01
+    wide = np.full((1, 2, 1), [[[-np.inf], [np.inf]]])
+    task = Task([device], ("kappa",), wide, "P", (), 1.0, DEFAULT)
+    designs: list[float] = []
+
+    def flown(_task, _owner, z, _radius, starts, _periods, balls):
+        """The limit is further off than the surface says, and than its balls were spread."""
+        designs.append(float(z[0, 0]))
+        one, zero = np.ones(balls), np.zeros(balls, int)
+        depth = device.depth_limit * np.exp(further - z[0, 0]) * one
+        found = Averages(
+            1e-6 * one, one, depth, 0.1 * one, one, zero, zero, zero, zero, one, on_motion(starts[0], balls)
+        )
+        return [Ensemble(np.zeros((balls, 1)), found, device)]
+
+    monkeypatch.setattr(long_flight, "fly", flown)
+    here, begun = np.zeros(1), Starts(*(np.array([x]) for x in (0.0, 0.3, 0.0)))
+    # P falls with kappa, and room grows, as logarithms.
+    surface = unknown(1)._replace(
+        value=np.float64(0), gradient=np.array([-2.5]), margins=np.zeros(2), slopes=np.ones((2, 1))
+    )
+    place = Place(0, here, 1e-3, begun, here, surface, ahead=0.0, path=[(here, 1.0)])
+    (found,) = long_flight.prove(task, [place], np.array([-np.inf]))
+    assert found is not None
+    assert 0 < math.log(found.values["kappa"]) - further < 3 * DEFAULT.limit_room
+    assert DEFAULT.last_radius < further
+    # The three flights that set balls out of step, and those of the proof.
+    assert len(designs) <= 2 * (3 + 1) + 1
 
 
 def test_balls_that_set_out_from_one_state_are_no_copies():

@@ -17,7 +17,8 @@ from vijax.design.optimum import AperiodicOptimum
 from vijax.design.variables import tuned, values
 
 _RESERVE = 1.5  # room kept for extremes that a proof has not met, in parts of what its worst ball has less than most
-_TURNS = 8  # forcing periods, one after another, in which the balls of a proof set out
+_TURNS = 1, 2, 4  # periods that every other ball, pair and four of a proof are ahead: they set out in 8, in turn
+_BESIDE = 0.5  # part of the last radius by which a design first moves away from a window
 _NEAR = 10  # a limit is told as active within so many times the room that is kept below it
 
 
@@ -30,6 +31,7 @@ class _Proof:
         room: Kept below the limits of the fitted surface, as a logarithm.
         shift: How far beside the surface's maximum the design is.
         flights: Flights about the last place that failed.
+        mixed: How many of these ended on different motions.
         passed: What those flights showed, each the next of `Task.last_flights`, that did not refute it.
     """
 
@@ -37,6 +39,7 @@ class _Proof:
     room: float
     shift: float = 0.0
     flights: int = 0
+    mixed: int = 0
     passed: "list[_Told]" = dataclasses.field(default_factory=list)
 
     @property
@@ -105,8 +108,11 @@ def out_of_step(task: Task, owner: np.ndarray, z: np.ndarray, starts: list[Start
         return starts
     balls, none = task.settings.confirm_balls, np.zeros(len(z))
     begun = [on_motion(one, balls) for one in starts]
-    for turn in range(1, min(_TURNS, balls)):
-        late = np.arange(turn, balls, _TURNS)
+    for turn in _TURNS:
+        # Those whose number has this power of 2.
+        late = np.flatnonzero(np.arange(balls) & turn)
+        if not late.size:
+            break
         some = [jax.tree.map(lambda x, late=late: x[late], one) for one in begun]
         for one, ahead in zip(begun, fly(task, owner, z, none, some, turn, late.size), strict=True):
             for x, new in zip(*map(jax.tree.leaves, (one, ahead.found.end)), strict=True):
@@ -120,13 +126,17 @@ def _move(task: Task, proof: _Proof, mixed: bool, lacks: float) -> None:
     proof.flights += 1
     proof.passed.clear()
     if mixed:
-        # Beside a window chaos goes on: first above, then below, each time further.
-        proof.shift = settings.last_radius * (-1) ** proof.flights * (1 + proof.flights // 2)
+        # Beside a window chaos goes on: first below, then above, each time further.
+        proof.mixed += 1
+        proof.shift = _BESIDE * settings.last_radius * (-1) ** proof.mixed * (1 + proof.mixed // 2)
     else:
-        proof.room += settings.limit_room - lacks
+        more = settings.limit_room - lacks
+        proof.room += more
+        # So far on the surface is followed, or the same design would be flown again.
+        proof.places[-1].radius += more
     if proof.flights == settings.max_confirmations:
         proof.places.pop()
-        proof.room, proof.shift, proof.flights = settings.limit_room, 0.0, 0
+        proof.room, proof.shift, proof.flights, proof.mixed = settings.limit_room, 0.0, 0, 0
 
 
 @dataclasses.dataclass(frozen=True)
