@@ -18,7 +18,8 @@ from scripts import design as script
 from vijax.design import objective, off_design, optimise
 from vijax.design import robustness as around
 from vijax.design.objective import Batch, Scene
-from vijax.design.report_lines import table
+from vijax.design.report import describe
+from vijax.design.report_lines import lines, table
 from vijax.design.tolerance import Tolerance, nodes
 from vijax.model.device import Harvester
 from vijax.model.records import Status
@@ -170,6 +171,27 @@ def test_tolerances_of_a_design(found):
     wide = optimise.under(best, [Tolerance("omega0", 0.1)])
     assert wide.lost == pytest.approx((0.1 - 0.078) / 0.2, abs=0.06)
     assert wide.worst == 0
+
+
+def test_optima_are_ranked_by_what_their_devices_give_whatever_their_motion(found):
+    fast, _ = found
+    ranking = off_design.ranked(fast.optima, [Tolerance("omega0", 0.05)])
+    means = [spread.mean for _, spread in ranking]
+    assert means == sorted(means, reverse=True)
+    assert sorted(one.P for one, _ in ranking) == sorted(one.P for one in fast.optima)
+    first, spread = ranking[0]
+    assert first is fast.best
+    # Where no device leaves the orbit it is what a quadrature along the orbit says.
+    assert spread.mean == pytest.approx(optimise.under(first, [Tolerance("omega0", 0.05)]).mean, rel=0.02)
+    # Beyond the fold, 8 % off, there is no such orbit, but other motion.
+    (_, far), *_ = off_design.ranked([first], [Tolerance("omega0", 0.2)])
+    along = optimise.under(first, [Tolerance("omega0", 0.2)])
+    assert along.lost > 0.1
+    assert far.lost < 0.5 * along.lost
+    # A report tells of an optimum that is ahead there.
+    for order, ahead in ((ranking, False), (ranking[::-1], True)):
+        told = describe(fast, tolerances=[Tolerance("omega0", 0.05)], spread=spread, ranking=order)
+        assert ("another optimum gives more there" in "\n".join(lines(told))) == ahead
 
 
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):

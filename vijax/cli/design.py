@@ -235,7 +235,7 @@ def _diagram(found: "Design", device: "Harvester", points: int) -> "xr.Dataset":
 
 def _judged(found: "Design", asked: DesignRequest, alone: bool) -> dict[str, Any]:
     """Find what becomes of the best design over the tolerances; what lies around it, where it is the only one."""
-    from vijax.design.off_design import arrival, extents
+    from vijax.design.off_design import arrival, extents, ranked
     from vijax.design.optimise import under
     from vijax.design.robustness import surroundings
 
@@ -243,6 +243,8 @@ def _judged(found: "Design", asked: DesignRequest, alone: bool) -> dict[str, Any
     if found.best is None:
         return {"tolerances": scatter}
     judged: dict[str, Any] = {"tolerances": scatter, "spread": under(found.best, scatter) if scatter else None}
+    if scatter and asked.search["objective"] not in _OF_SCATTER:
+        judged["ranking"] = ranked(found.optima, scatter)
     if alone:
         judged["surroundings"] = surroundings(found.best, starts=asked.basin_starts)
         judged |= {"extents": extents(found.best), "arrival": arrival(found.best)}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -10,9 +11,9 @@ import numpy as np
 from vijax.batch.simulate import Starts
 from vijax.design.averages import Averages
 from vijax.design.design_settings import DEFAULT
-from vijax.design.ensemble import AVERAGED, Task, fly
+from vijax.design.ensemble import AVERAGED, Ensemble, Task, fly
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
-from vijax.design.tolerance import Spread, Tolerance
+from vijax.design.tolerance import Spread, Tolerance, check_samples, check_tolerances
 from vijax.design.variables import LINEAR, variables
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -83,7 +84,8 @@ def extents(optimum: Optimum | AperiodicOptimum) -> tuple[Extent, ...]:
     """
     checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     names = tuple(optimum.values)
-    ways = [_Way(index, sign, _start(optimum), optimum.P) for index in range(len(names)) for sign in (-1, 1)]
+    first = jax.tree.map(lambda x: x[:1], _starts(optimum))
+    ways = [_Way(index, sign, first, optimum.P) for index in range(len(names)) for sign in (-1, 1)]
     while going := [way for way in ways if way.going]:
         _go_on(optimum, names, going)
     sides = [way.side for way in ways]
@@ -156,12 +158,45 @@ def arrival(optimum: Optimum | AperiodicOptimum) -> ArrivalStatistics:
     return ArrivalStatistics(float(there.mean()), *when, periods)
 
 
-def scattered(optimum: AperiodicOptimum, tolerances: tuple[Tolerance, ...], samples: int | None) -> Spread:
-    """Find what becomes of a motion that is no orbit when constants scatter; see `optimise.under`."""
+@door
+def ranked(
+    optima: Iterable[Optimum | AperiodicOptimum], tolerances: Iterable[Tolerance], samples: int | None = None
+) -> tuple[tuple[Optimum | AperiodicOptimum, Spread], ...]:
+    """Rank optima by the mean P of devices that are off by tolerances, the best first.
+
+    Balls on a design's motion go on in random devices, and what they give there counts, whatever their motion. Of an
+    optimum in a narrow window most are beyond it; `optimise.under`, which follows an orbit, counts nothing of these.
+
+    Args:
+        optima: Those of one `Design`.
+        tolerances: How constants scatter.
+        samples: Random devices, 256 unless given.
+
+    Raises:
+        ValueError: A tolerance that cannot be.
+    """
+    some: Any = tuple(checks.sequence("optima", optima, AnyOptimum, "the optima of vijax.optimise(...)"))
+    spreads = scattered(some, check_tolerances(tolerances), None if samples is None else check_samples(samples))
+    return tuple(sorted(zip(some, spreads, strict=True), key=lambda one: -one[1].mean))
+
+
+def scattered(
+    optima: Sequence[Optimum | AperiodicOptimum], tolerances: tuple[Tolerance, ...], samples: int | None
+) -> list[Spread]:
+    """Find what becomes of the motions of optima when constants scatter; see `ranked`."""
+    if not optima:
+        return []
     balls = _DEVICES if samples is None else samples
-    task = _task(optimum, "P")._replace(tolerances=tolerances)
-    z, some = _z(optimum, task.tune)[None], [optimum.starts]
-    (one,) = fly(task, np.array([0]), z, np.zeros(1), some, _PERIODS, balls)
+    tune = tuple(optima[0].values)
+    wide = np.full((len(optima), 2, len(tune)), [[[-np.inf], [np.inf]]])
+    task = Task([one.device for one in optima], tune, wide, "P", tolerances, 1.0, DEFAULT)
+    z, owner = np.array([_z(one, tune) for one in optima]), np.arange(len(optima))
+    flown = fly(task, owner, z, np.zeros(len(optima)), [_starts(one) for one in optima], _PERIODS, balls)
+    return [_spread(one) for one in flown]
+
+
+def _spread(one: Ensemble) -> Spread:
+    """Sum up what the devices of an ensemble give."""
     alive = np.isin(one.found.status, AVERAGED) & (one.found.P > 0)
     kept = alive & (one.found.margins(one.device).min(axis=1) >= 0)
     P = np.where(alive, np.nan_to_num(one.found.P), 0.0)
@@ -182,10 +217,10 @@ def _z(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...]) -> np.ndarra
     return variables(names, [optimum.values[name] for name in names])
 
 
-def _start(optimum: Optimum | AperiodicOptimum) -> Starts:
-    """Put a ball on the motion: at an impact of an orbit; where the long flight left one."""
+def _starts(optimum: Optimum | AperiodicOptimum) -> Starts:
+    """Put balls on the motion: one at an impact of an orbit; those of the long flight where it left them."""
     if isinstance(optimum, AperiodicOptimum):
-        return jax.tree.map(lambda x: x[:1], optimum.starts)
+        return optimum.starts
     orbit = optimum.orbit
     t, speed, _ = np.asarray(orbit.knots)[0, 0]
     side = float(np.asarray(orbit.sequence.side)[0, 0])

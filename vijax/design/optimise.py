@@ -274,7 +274,7 @@ def under(optimum: Optimum | AperiodicOptimum, tolerances: Iterable[Tolerance], 
     checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     scatter = check_tolerances(tolerances)
     if isinstance(optimum, AperiodicOptimum):
-        return off_design.scattered(optimum, scatter, None if samples is None else check_samples(samples))
+        return off_design.scattered([optimum], scatter, None if samples is None else check_samples(samples))[0]
     cloud, none = nodes(scatter, samples), jnp.zeros((1, 0))
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), (), cloud.names, "P")
     device = jax.tree.map(lambda x: jnp.array([x], float), optimum.device)

@@ -29,6 +29,7 @@ def describe(
     diagram: "xr.Dataset | None" = None,
     tolerances: Sequence[Tolerance] = (),
     spread: Spread | None = None,
+    ranking: Sequence[tuple[AnyOptimum, Spread]] = (),
 ) -> dict[str, Any]:
     """Describe all of a design in nested dicts and lists of numbers and words.
 
@@ -39,6 +40,7 @@ def describe(
         diagram: P up and down along an axis at the best optimum, `vijax.orbit_diagram` in both directions.
         tolerances, spread: Over which tolerances the best optimum was judged, and a `vijax.design.optimise.under`
             of them.
+        ranking: All optima by what devices give that are off by the tolerances: `vijax.design.off_design.ranked`.
 
     Returns:
         `best` (None if no admissible motion was found), `others`, and what was asked. With `diagram`, `highest`: the
@@ -66,6 +68,7 @@ def describe(
         "arrival": arrival._asdict() if arrival else None,
         "tolerances": [one._asdict() for one in tolerances],
         "spread": spread._asdict() if spread else None,
+        "ranking": [{"optimum": _place(design, one)} | given._asdict() for one, given in ranking],
         "highest": _highest(diagram) if diagram is not None else None,
     }
 
@@ -133,6 +136,11 @@ def _orbit(one: Optimum) -> dict[str, Any]:
         "residual": float(state.residual),
         "evaluations": one.evaluations,
     }
+
+
+def _place(design: Design, one: AnyOptimum) -> int:
+    """Say which optimum of a design one is: 0 is the best."""
+    return next(place for place, other in enumerate(design.optima) if other is one)
 
 
 def _extent(one: Extent) -> dict[str, Any]:

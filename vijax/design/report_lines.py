@@ -206,6 +206,21 @@ def _off(report: dict[str, Any]) -> Iterator[str]:
         yield f"  {name} P {amount(spread[name], 'J')}, {100 * spread[name] / nominal:.4g} % of nominal"
     shares = ", ".join(f"{100 * spread[name]:.3g} % {text}" for name, text in _LOSSES.items())
     yield f"  of the devices, {shares}"
+    yield from _ahead(report)
+
+
+def _ahead(report: dict[str, Any]) -> Iterator[str]:
+    """Say which other optimum gives more under tolerances, whatever the motion of its devices is there."""
+    first = next(iter(report["ranking"]), None)
+    if first is None or not first["optimum"]:
+        return
+    other = report["others"][first["optimum"] - 1]
+    tuned = ", ".join(quantity(name, value) for name, value in other["values"].items())
+    own = next(one for one in report["ranking"] if not one["optimum"])
+    yield (
+        f"  another optimum gives more there: {tuned}, {other['label']}, mean P {amount(first['mean'], 'J', 5)} "
+        f"where this one's devices give {amount(own['mean'], 'J', 5)}, whatever their motion"
+    )
 
 
 def _unconstrained(report: dict[str, Any]) -> Iterator[str]:
