@@ -4,6 +4,7 @@ import math
 
 import jax
 import numpy as np
+import pytest
 
 import vijax
 from vijax.batch.simulate import Starts
@@ -52,35 +53,56 @@ def test_balls_of_a_proof_visit_the_bands_of_their_motion_out_of_step():
     np.testing.assert_array_equal(counts, 4 * [DEFAULT.confirm_balls // 4])
 
 
-def test_a_design_that_breaks_a_limit_moves_on_until_it_keeps_it(monkeypatch):
-    device, further = vijax.Harvester(), 0.01
+def proved(monkeypatch, motion, known=-math.inf):
+    """Prove a place on the limit whose P falls with the tuned quantity; where flights went, and what was proved.
+
+    Args:
+        monkeypatch: Pytest's.
+        motion: Of a variable P [J] and the room there, as a logarithm, in place of flights.
+        known: Logarithm of what the best orbit gives.
+    """
+    device, here, designs = vijax.Harvester(), np.zeros(1), []
     wide = np.full((1, 2, 1), [[[-np.inf], [np.inf]]])
     task = Task([device], ("kappa",), wide, "P", (), 1.0, DEFAULT)
-    designs: list[float] = []
 
     def flown(_task, _owner, z, _radius, starts, _periods, balls):
-        """The limit is further off than the surface says, and than its balls were spread."""
-        designs.append(float(z[0, 0]))
+        P, room = motion(float(z[0, 0]))
         one, zero = np.ones(balls), np.zeros(balls, int)
-        depth = device.depth_limit * np.exp(further - z[0, 0]) * one
-        found = Averages(
-            1e-6 * one, one, depth, 0.1 * one, one, zero, zero, zero, zero, one, on_motion(starts[0], balls)
-        )
+        designs.append(float(z[0, 0]))
+        end = on_motion(starts[0], balls)
+        depth = device.depth_limit * math.exp(-room) * one
+        found = Averages(P * one, one, depth, 0.1 * one, one, zero, zero, zero, zero, one, end)
         return [Ensemble(np.zeros((balls, 1)), found, device)]
 
     monkeypatch.setattr(long_flight, "fly", flown)
-    here, begun = np.zeros(1), Starts(*(np.array([x]) for x in (0.0, 0.3, 0.0)))
-    # P falls with kappa, and room grows, as logarithms.
+    begun = Starts(*(np.array([x]) for x in (0.0, 0.3, 0.0)))
     surface = unknown(1)._replace(
-        value=np.float64(0), gradient=np.array([-2.5]), margins=np.zeros(2), slopes=np.ones((2, 1))
+        value=np.log(1e-6), gradient=np.array([-2.5]), margins=np.zeros(2), slopes=np.ones((2, 1))
     )
-    place = Place(0, here, 1e-3, begun, here, surface, ahead=0.0, path=[(here, 1.0)])
-    (found,) = long_flight.prove(task, [place], np.array([-np.inf]))
-    assert found is not None
+    place = Place(0, here, 1e-3, begun, here, surface, ahead=math.log(1e-6), path=[(here, 1e-6)])
+    (found,) = long_flight.prove(task, [place], np.array([known]))
+    return designs, found
+
+
+def test_a_design_that_breaks_a_limit_moves_on_until_it_keeps_it(monkeypatch):
+    further = 0.01  # than the surface says, and than its balls were spread
+    assert further > DEFAULT.last_radius
+    designs, found = proved(monkeypatch, lambda z: (1e-6, z - further))
     assert 0 < math.log(found.values["kappa"]) - further < 3 * DEFAULT.limit_room
-    assert DEFAULT.last_radius < further
     # The three flights that set balls out of step, and those of the proof.
     assert len(designs) <= 2 * (3 + 1) + 1
+
+
+def test_beside_the_window_of_a_lower_orbit_a_design_is_tried_for_once_more(monkeypatch):
+    def motion(z):
+        return (0.9e-6 if -4e-4 < z < 4e-4 else 0.99e-6), 1.0
+
+    _, found = proved(monkeypatch, motion, known=math.log(0.9e-6))
+    assert pytest.approx(0.99e-6) == found.P
+    # Where the orbit gives nearly what was promised, a single flight is enough.
+    designs, found = proved(monkeypatch, motion, known=math.log(0.995e-6))
+    assert found is None
+    assert len(designs) == 3 + 1
 
 
 def test_balls_that_set_out_from_one_state_are_no_copies():

@@ -18,6 +18,7 @@ from vijax.design.variables import tuned, values
 
 _RESERVE = 1.5  # room kept for extremes that a proof has not met, in parts of what its worst ball has less than most
 _TURNS = 1, 2, 4  # periods that every other ball, pair and four of a proof are ahead: they set out in 8, in turn
+_WORTH = 0.01  # so much more than the best orbit a place has to promise, as a logarithm, to be tried for once more
 _BESIDE = 0.5  # part of the last radius by which a design first moves away from a window
 _NEAR = 10  # a limit is told as active within so many times the room that is kept below it
 
@@ -68,13 +69,18 @@ def prove(task: Task, places: list[Place], known: np.ndarray) -> list[AperiodicO
         stage = min(proof.stage for proof in proofs.values())
         some = {owner: proof for owner, proof in proofs.items() if proof.stage == stage}
         for owner, told in _flown(task, some, stage).items():
-            proof = some[owner]
+            proof, known_there = some[owner], known[owner]
             if told is None or told.lacks < 0:
                 _move(task, proof, told is None, 0.0 if told is None else told.lacks)
-                continue
-            proof.passed.append(told)
-            if proof.stage == len(task.last_flights):
-                found[owner] = told.optimum if np.log(told.optimum.height) > known[owner] else None
+            elif np.log(told.optimum.height) > known_there:
+                proof.passed.append(told)
+                if proof.stage == len(task.last_flights):
+                    found[owner] = told.optimum
+                    proof.places.clear()
+            elif proof.places[-1].ahead > known_there + _WORTH:
+                # The window of that very orbit, perhaps: the motion that was climbed with is beside it.
+                _move(task, proof, True, 0.0)
+            else:
                 proof.places.clear()
         proofs = {owner: proof for owner, proof in proofs.items() if proof.places}
     return found
