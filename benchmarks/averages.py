@@ -1,14 +1,15 @@
 """How good are derivatives of averages, and which method fails where?
 
     python benchmarks/averages.py                    # all parts, half an hour on two cores; rows and chart
-    python benchmarks/averages.py --only missed      # one part: cells, growth, edge, missed
+    python benchmarks/averages.py --only missed      # one part: cells, growth, edge, crisis, missed
     python benchmarks/averages.py --cells 20         # fewer chaotic cells
     python benchmarks/averages.py --chart averages.png  # draws the rows that are there
 
 cells: derivatives of `vijax.average` in chaotic cells against local fits of ten times as many balls drawn at random.
 growth: error of dP/dln kappa by automatic differentiation through n periods, by the orbit's implicit rule (`steady`),
 and by the ensemble, on one orbit and in chaos. edge: where averages have no derivative, and what the record says
-there. missed: what no standard error knows of, an attractor that few starts end on.
+there. crisis: chaos grows all at once; the largest depth, which limits are about, jumps by 9 %, while P goes on within
+its noise. missed: what no standard error knows of, an attractor that few starts meet.
 
 The rows that are kept hold 131 cells of the 200: the others were not waited for. Of these the printout says
 
@@ -58,7 +59,7 @@ class Row(NamedTuple):
 
     Attributes:
         part, scene, method: Of what, where, how.
-        quantity: "kappa" for dlnP/dln kappa; "P".
+        quantity: "kappa" for dlnP/dln kappa; "P"; "depth", the largest of all balls [m].
         at: Balls, periods, or kappa.
         value, stderr: As the method has it.
         reference, reference_stderr: What it should be.
@@ -229,6 +230,15 @@ def growth(_: int) -> Iterator[Row]:
 
 EDGE = np.linspace(26.7, 28.5, 37)  # where chaos ends in a cascade of orbits
 NEAR = 2e-3
+# A device whose chaos grows between kappa 35.2 and 35.225.
+THIRD = {
+    "s": 0.07367718041928888,
+    "r": 0.6174064604744505,
+    "A": 3.4272553674608117,
+    "omega": 6.370025058816405,
+    "V": 1000.0,
+}
+GROWING = np.linspace(35.0, 35.45, 19)
 SMALL = {
     "s": 0.006,
     "r": 0.5,
@@ -262,6 +272,25 @@ def edge(_: int) -> Iterator[Row]:
         yield Row("edge", "chaos to orbits", "ensemble", "P", kappa, value, near, value, 0.0, verdict(one))
 
 
+def crisis(_: int) -> Iterator[Row]:
+    """Measure P, its slope and the largest depth through a crisis."""
+    flown = vijax.sweep(
+        kappa=GROWING,
+        v0=np.linspace(-SPEED, SPEED, FLOWN),
+        device=device(float(GROWING[0]), **THIRD),
+        periods=2000,
+        outputs=["max_penetration"],
+    )
+    deepest = flown.max_penetration.max("v0").values
+    for kappa, depth in zip(GROWING.tolist(), deepest.tolist(), strict=True):
+        of = device(kappa, **THIRD)
+        one = vijax.average(of, balls=1024, spread=NEAR)
+        P, slope = (float(one.P), float(one.P_stderr)), elasticity(one, of, "kappa")
+        yield Row("crisis", "chaos grows", "ensemble", "depth", kappa, depth, 0.0, depth, 0.0, verdict(one))
+        yield Row("crisis", "chaos grows", "ensemble", "P", kappa, *P, P[0], 0.0, verdict(one))
+        yield Row("crisis", "chaos grows", "ensemble", "kappa", kappa, *slope, slope[0], 0.0, verdict(one))
+
+
 def missed(_: int) -> Iterator[Row]:
     """Measure P beside two attractors, one of which few starts end on."""
     of = device(4.00713, **SMALL)
@@ -274,7 +303,13 @@ def missed(_: int) -> Iterator[Row]:
 
 # --- rows and printout ------------------------------------------------------------------------------------------------
 
-PARTS: dict[str, Callable[[int], Iterator[Row]]] = {"cells": cells, "growth": growth, "edge": edge, "missed": missed}
+PARTS: dict[str, Callable[[int], Iterator[Row]]] = {
+    "cells": cells,
+    "growth": growth,
+    "edge": edge,
+    "crisis": crisis,
+    "missed": missed,
+}
 
 
 def read(path: Path) -> list[Row]:
@@ -328,6 +363,9 @@ def printed(rows: list[Row]) -> None:
                 f"{r.at:.0f} balls, {r.scene} on one orbit: error of P, standard error, verdict",
                 f"{far:.1e}, {r.stderr / r.value:.1e}, {r.verdict}",
             )
+        elif r.part == "crisis":
+            what = {"kappa": "dlnP/dln kappa", "P": "P [J]", "depth": "largest depth [m]"}[r.quantity]
+            say(f"kappa {r.at:.3f}, through a crisis: {what}, standard error", f"{r.value:.6g}, {r.stderr:.2g}")
         elif r.part == "edge" and r.quantity == "kappa":
             say(
                 f"kappa {r.at:.2f}: slope, standard error, between neighbours, verdict",

@@ -203,7 +203,7 @@ _BEST, _WORST = 1e-5, 1e7  # errors of derivatives: better ones are drawn at the
 
 
 def averages(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
-    """Draw four panels: errors by method and length, cells against larger fits, the edge of chaos, what errors miss.
+    """Draw five panels: errors by method, cells against larger fits, the edge of chaos, a crisis, what errors miss.
 
     Args:
         rows: Those of `averages.Row`.
@@ -218,8 +218,9 @@ def averages(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
     for row in rows:
         parts[row.part].append(row)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8.2, 6.4), layout="constrained")
-        for axes, (part, draw) in zip(figure.subplots(2, 2).flat, _PANELS.items(), strict=True):
+        figure = Figure(figsize=(8.2, 9.6), layout="constrained")
+        places = [figure.add_subplot(3, 2, number) for number in range(1, len(_PANELS) + 1)]
+        for axes, (part, draw) in zip(places, _PANELS.items(), strict=True):
             axes.grid(color="0.9", linewidth=0.4)
             axes.set_axisbelow(True)
             if parts[part]:
@@ -278,6 +279,15 @@ def _edge_of_chaos(axes: Axes, rows: list[Any]) -> None:
     axes.legend(fontsize=7)
 
 
+def _crisis(axes: Axes, rows: list[Any]) -> None:
+    axes.set(title="a crisis: chaos grows", xlabel=r"$\kappa$", ylabel="over its first value")
+    for quantity, name, colour in (("depth", "largest depth", "#d62728"), ("P", r"$P$", "#1f77b4")):
+        own = [row for row in rows if row.quantity == quantity]
+        where, value = [row.at for row in own], np.array([row.value for row in own])
+        axes.plot(where, value / value[0], "o-", color=colour, markersize=3, linewidth=0.8, label=name)
+    axes.legend(fontsize=7)
+
+
 def _missed_attractor(axes: Axes, rows: list[Any]) -> None:
     axes.set(xscale="log", yscale="log", ylim=(1e-10, 1), xlabel="balls", ylabel="of P")
     axes.set(title="0.5 % of the starts end on another attractor")
@@ -292,4 +302,10 @@ def _missed_attractor(axes: Axes, rows: list[Any]) -> None:
     axes.legend(fontsize=7, loc="lower left")
 
 
-_PANELS = {"growth": _by_length, "cells": _against_fits, "edge": _edge_of_chaos, "missed": _missed_attractor}
+_PANELS = {
+    "growth": _by_length,
+    "cells": _against_fits,
+    "edge": _edge_of_chaos,
+    "crisis": _crisis,
+    "missed": _missed_attractor,
+}

@@ -12,6 +12,9 @@ ROWS = [
     averages.Row("growth", "orbit", "automatic differentiation", "kappa", 2, -2.25, 0.0, -2.0, 0.0, ""),
     averages.Row("growth", "orbit", "ensemble", "kappa", 16, -2.1, 0.1, -2.0, 0.0, "smooth"),
     averages.Row("edge", "chaos to orbits", "ensemble", "kappa", 27.0, -2.6, 0.1, -2.5, 0.0, "smooth"),
+    averages.Row("crisis", "chaos grows", "ensemble", "depth", 35.2, 7.6e-3, 0.0, 7.6e-3, 0.0, "smooth"),
+    averages.Row("crisis", "chaos grows", "ensemble", "depth", 35.3, 8.36e-3, 0.0, 8.36e-3, 0.0, "smooth"),
+    averages.Row("crisis", "chaos grows", "ensemble", "P", 35.2, 3e-5, 1e-9, 3e-5, 0.0, "smooth"),
     averages.Row("missed", "99.5 % of the starts", "ensemble", "P", 32, 1.01, 1e-6, 1.0, 0.0, "smooth"),
 ]
 
@@ -33,10 +36,11 @@ def test_cells_are_counted_with_both_errors_and_by_verdict(capsys):
 
 def test_every_part_has_its_panel(tmp_path):
     figure = charts.averages(ROWS, tmp_path / "chart.png")
-    growth, cells, edge, missed = figure.axes
+    growth, cells, edge, crisis, missed = figure.axes
     np.testing.assert_allclose(growth.lines[0].get_xydata(), [[1, 0.5], [2, 0.25]])
     np.testing.assert_allclose(cells.lines[0].get_xydata(), [[np.hypot(0.02, 0.01) / 2, 0.005]])
     np.testing.assert_allclose(edge.lines[0].get_xydata(), [[27.0, -2.5]])
+    np.testing.assert_allclose(crisis.lines[0].get_xydata(), [[35.2, 1.0], [35.3, 1.1]])
     np.testing.assert_allclose(missed.lines[0].get_xydata(), [[32, 0.01]])
     with pytest.raises(ValueError, match="txt"):
         charts.averages(ROWS, tmp_path / "chart.txt")
