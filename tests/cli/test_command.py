@@ -256,7 +256,7 @@ def completed(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("vijax ", ["sweep", "compare", "orbit-diagram", "basins", "branch", "design"]),
+        ("vijax ", ["sweep", "compare", "orbit-diagram", "basins", "branch", "design", "docs"]),
         ("vijax b", ["basins", "branch"]),
         ("vijax sweep --me", ["--method", "--membrane"]),
         ("vijax sweep --wall ", ["soft", "rigid"]),

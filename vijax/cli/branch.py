@@ -17,6 +17,7 @@ from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
 from vijax.cli.targets import targets
 from vijax.model.quantities import AXES, BRANCH_QUANTITIES, PARAMETERS
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     from vijax.model.device import Harvester
@@ -149,8 +150,11 @@ def _found(asked: BranchRequest) -> "Orbit":
             return found
     tried = ", ".join(f"{place:.6g}" for place in asked.places)
     raise ValueError(
-        f"impacts must be those of an orbit where the branch begins; got none with {asked.impacts} at {asked.along} = "
-        f"{tried}; try more guesses"
+        see(
+            "attractors",
+            f"impacts must be those of an orbit where the branch begins; got none with {asked.impacts} at "
+            f"{asked.along} = {tried}; try more guesses",
+        )
     )
 
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from vijax.runtime.pages import see
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -56,9 +58,10 @@ def statuses(variable: "xr.DataArray", of: str = "cells") -> str:
     """Count how often each status occurs; below, say what to do about those that are not OK."""
     from vijax.model.records import Status
 
-    lines = [f"{of} by status: {flags(variable)}"]
     found = [status for status in Status if status != Status.OK and (variable == status).any()]
-    return "\n".join([*lines, *(f"    {status.name.lower()}: {status.advice}" for status in found)])
+    advice = [f"    {status.name.lower()}: {status.advice}" for status in found]
+    counted = f"{of} by status: {flags(variable)}"
+    return see("status", "\n".join([counted, *advice])) if found else counted
 
 
 def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:

@@ -19,6 +19,7 @@ _PAGES = {
     "basins": "basins",
     "branch": "branch",
     "design": "design",
+    "docs": "docs",
 }
 
 

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from vijax.runtime.pages import see
+
 if TYPE_CHECKING:
     from vijax.planes.estimate import Estimate
 
@@ -34,7 +36,9 @@ def agree(expected: "Estimate", yes: bool) -> None:
     if not expected.long or yes:
         return
     if not sys.stdin.isatty():
-        raise ValueError(f"yes must be given beyond an hour or 10 GB; got {expected}; add --yes, or ask for less")
+        raise ValueError(
+            see("studies", f"yes must be given beyond an hour or 10 GB; got {expected}; add --yes, or ask for less")
+        )
     click.confirm(f"{expected}: begin?", abort=True, err=True)
 
 

@@ -15,6 +15,7 @@ from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
 from vijax.cli.targets import targets
 from vijax.model.choices import SolverName
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -171,7 +172,7 @@ def _summary(dataset: "xr.Dataset") -> str:
         lines.append(f"cells by period: {periods}")
     if {"P", "admissible"} <= set(dataset):
         peak = best(dataset)
-        lines.append(f"largest admissible P: {'none' if peak is None else _place(peak, dataset)}")
+        lines.append(f"largest admissible P: {see('model', 'none') if peak is None else _place(peak, dataset)}")
     return "\n".join(lines)
 
 

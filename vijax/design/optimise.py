@@ -33,6 +33,7 @@ from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
 from vijax.runtime import checks, context, tiles
 from vijax.runtime.context import door
+from vijax.runtime.pages import see
 from vijax.runtime.programs import jitted
 
 OVER_TOLERANCES = ("mean", "worst")
@@ -324,7 +325,7 @@ def check(
     over = objective in OVER_TOLERANCES
     if over != bool(tolerances) and objective != "expected":
         need = "come with objective mean, worst or expected" if tolerances else "be given with objective mean or worst"
-        raise ValueError(f"tolerances must {need}; got {len(tolerances)} with objective {objective!r}")
+        raise ValueError(see("design", f"tolerances must {need}; got {len(tolerances)} with objective {objective!r}"))
     check_tolerances(tolerances, bounded=objective == "worst")
     return np.array([variables(tune, limits(tune, bounds, device)) for device in devices])
 
@@ -333,10 +334,14 @@ def check_motion(motion: str, objective: str, reliability: float) -> float:
     """Take the reliability, if motion, objective and it go together; raise ValueError as `optimise_all` does."""
     checks.choice("motion", motion, get_args(Motion))
     if motion == "periodic" and objective == "expected":
-        raise ValueError('motion must be "any" with objective expected, which takes every start; got "periodic"')
+        raise ValueError(
+            see("design", 'motion must be "any" with objective expected, which takes every start; got "periodic"')
+        )
     share = checks.real("reliability", reliability, "a number from 0.5 to 1", lambda x: 0.5 <= x <= 1)
     if share < 1 and objective != "expected":
-        raise ValueError(f"reliability must be 1 unless the objective is expected; got {share:g} with {objective!r}")
+        raise ValueError(
+            see("design", f"reliability must be 1 unless the objective is expected; got {share:g} with {objective!r}")
+        )
     return share
 
 

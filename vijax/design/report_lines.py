@@ -7,6 +7,7 @@ import numpy as np
 
 from vijax.model.units import UNITS
 from vijax.runtime import checks
+from vijax.runtime.pages import see
 
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15}
 _TIE = 1e-6  # optima whose objectives differ by less, relative, are a tie
@@ -57,7 +58,9 @@ def _instead(survey: dict[str, Any]) -> Iterator[str]:
         )
     broken = survey["orbits"] - survey["admissible"]
     if broken:
-        yield f"{broken:,} periodic orbits that break a constraint: widen the bounds or the penetration limit"
+        yield see(
+            "model", f"{broken:,} periodic orbits that break a constraint: widen the bounds or the penetration limit"
+        )
     if survey["admissible"]:
         yield f"{survey['admissible']:,} admissible orbits that led to no optimum: take more steps and balls"
     if survey["restless"]:

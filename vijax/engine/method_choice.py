@@ -11,6 +11,7 @@ from vijax.engine.method import Method
 from vijax.model.choices import MethodName, SolverName
 from vijax.model.membrane import HuntCrossley, Law, Linear
 from vijax.runtime import checks
+from vijax.runtime.pages import see
 
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 OPTIONS: dict[MethodName, tuple[str, ...]] = {
@@ -42,19 +43,26 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
     law = given.get("membrane", Linear())
     if not isinstance(law, Linear | HuntCrossley):
         raise ValueError(
-            f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {checks.shown(law)}"
+            see(
+                "methods",
+                f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {checks.shown(law)}",
+            )
         )
     if method == "exact" and not isinstance(law, Linear):
-        raise ValueError(f'membrane must be linear for method="exact"; got {describe(law)}; use method="ode"')
+        raise ValueError(
+            see("methods", f'membrane must be linear for method="exact"; got {describe(law)}; use method="ode"')
+        )
     for name in given:
         takers = [taker for taker, taken in OPTIONS.items() if name in taken]
         if method not in takers and name != "membrane":
             theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
-            raise ValueError(f"{name} must be left out unless method is {theirs}; got {got}")
+            raise ValueError(see("methods", f"{name} must be left out unless method is {theirs}; got {got}"))
     if method == "exact":
         return None
     if wall != "soft":
-        raise ValueError(f'wall must be "soft" for method={_quoted(method)}; got {wall!r}; use method="exact"')
+        raise ValueError(
+            see("methods", f'wall must be "soft" for method={_quoted(method)}; got {wall!r}; use method="exact"')
+        )
     # An engine is loaded when it is first asked for: diffrax takes a second.
     if method == "rk4":
         from vijax.engine.rk4 import Rk4

@@ -16,6 +16,7 @@ from jaxtyping import ArrayLike
 
 from vijax.model.quantities import AXES, MEASURED, QUANTITIES, synonyms
 from vijax.runtime import checks
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     from pint import Quantity
@@ -63,7 +64,9 @@ def plain(name: str, value: Any) -> Any:
     """
     if isinstance(value, list | tuple) and any(map(_has_unit, value)):
         if not all(map(_has_unit, value)):
-            raise ValueError(f"{name} must have a unit at every value or at none; got {checks.shown(value)}")
+            raise ValueError(
+                see("maps", f"{name} must have a unit at every value or at none; got {checks.shown(value)}")
+            )
         return np.array([plain(name, one) for one in value])
     return value.magnitude * _factor(name, value.units) if _has_unit(value) else value
 
@@ -95,11 +98,13 @@ def _factor(name: str, unit: Any) -> float:
             return 1.0
         others = [one for one in synonyms(name) if one in UNITS] if name in AXES else []
         hint = f"; with a unit there is {' or '.join(others)}" if others else ""
-        raise ValueError(f"{name} must be a number without a unit; got one in {unit}{hint}")
+        raise ValueError(see("maps", f"{name} must be a number without a unit; got one in {unit}{hint}"))
     try:
         factor = one.m_as(UNITS[name])
     except pint.errors.PintError:
-        raise ValueError(f"{name} must be in {UNITS[name]}, or in a unit of that kind; got one in {unit}") from None
+        raise ValueError(
+            see("maps", f"{name} must be in {UNITS[name]}, or in a unit of that kind; got one in {unit}")
+        ) from None
     # Of what turns, hertz counts the turns; to pint it is 1/s, as rad/s is.
     turns = sum(power for part, power in one.unit_items() if part.endswith("hertz")) if UNITS[name] == "rad/s" else 0
     return factor * (2 * math.pi) ** turns

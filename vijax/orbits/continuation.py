@@ -18,6 +18,7 @@ from vijax.orbits.parameter import check_along, check_bounds, tilts
 from vijax.orbits.periodic import Orbit, check_orbit
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
+from vijax.runtime.pages import see
 
 MOST_POINTS = 10**6  # of a branch: beyond, a number was mistyped, and is refused before memory is taken
 Direction = Literal["up", "down", "both"]
@@ -95,11 +96,11 @@ def set_out(
 ):
     """Make arcs and unknowns of the starts; refuse what cannot be followed."""
     if not len(check_orbit(orbit)):
-        raise ValueError("orbit must hold an orbit to follow; got none; search with more guesses")
+        raise ValueError(see("attractors", "orbit must hold an orbit to follow; got none; search with more guesses"))
     if (np.asarray(orbit.status) != Status.OK).any():
         index = int(np.argmax(np.asarray(orbit.status) != Status.OK))
         got = Status(int(orbit.status[index]))
-        raise ValueError(f"orbit must hold orbits only; got {got.name} at index {index}; {got.advice}")
+        raise ValueError(see("status", f"orbit must hold orbits only; got {got.name} at index {index}; {got.advice}"))
     device = one_device(device)
     within = check_along(orbit.pair, along, within)
     x = check_bounds(orbit.pair, along, within, device)

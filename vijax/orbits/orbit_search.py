@@ -16,6 +16,7 @@ from vijax.orbits.orbit_properties import marks_of_knots
 from vijax.orbits.periodic import SAME, Orbit, check_orbit, concatenate, guessed, judged, shot, solved
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
+from vijax.runtime.pages import see
 
 _FASTEST = 1.5  # largest speed of a guess, in units of A pi/omega; to faster orbits Newton has to come by itself
 _MOST_PERIOD = 1000  # forcing periods of an orbit
@@ -111,7 +112,12 @@ def sequences(impacts: str, period: int | None = None) -> tuple[list[tuple[int, 
         re.fullmatch(r"[LRlr]+|([0-9]+):([0-9]+)(?:/([1-9][0-9]*)T)?", impacts) if isinstance(impacts, str) else None
     )
     if match is None:
-        raise ValueError(f"impacts must be walls such as RLL or a label such as 1:2/2T; got {checks.shown(impacts)}")
+        raise ValueError(
+            see(
+                "attractors",
+                f"impacts must be walls such as RLL or a label such as 1:2/2T; got {checks.shown(impacts)}",
+            )
+        )
     period = None if period is None else checks.whole("period", period, 1, _MOST_PERIOD)
     if match[1] is None:
         _check_count(impacts, len(impacts), 1)

@@ -17,6 +17,7 @@ from vijax.model.device import Harvester
 from vijax.model.quantities import AXES, START, START_REACH, check, synonyms
 from vijax.model.units import Given
 from vijax.runtime import checks
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -79,7 +80,7 @@ def _numbers(name: str, items: list[str], text: str) -> list[float]:
     """Read numbers of which all have a unit or none has, or a reader would not know what the others are in."""
     parts = [units.split(item) for item in items]
     if len({bool(unit) for _, unit in parts}) > 1:
-        raise ValueError(f"{name} must have a unit at every number or at none; got {text!r}")
+        raise ValueError(see("maps", f"{name} must have a unit at every number or at none; got {text!r}"))
     return [_number(name, *part, text) for part in parts]
 
 
@@ -89,14 +90,14 @@ def _number(name: str, item: str, unit: str, text: str) -> float:
         value = float({"": "1", "-": "-1"}.get(factor, factor)) * math.pi if pi and not rest else float(item)
     except ValueError:
         within = "" if item == text else f" in {text!r}"
-        raise ValueError(f"{name} must be {_FORMS}; got {item!r}{within}") from None
+        raise ValueError(see("maps", f"{name} must be {_FORMS}; got {item!r}{within}")) from None
     return units.with_unit(name, value, unit) if unit else value
 
 
 def _from_range(name: str, text: str) -> np.ndarray:
     low, high, count, *spacing = text.split(":") if text.count(":") > 1 else [text, text, ""]
     if not count or spacing not in ([], ["log"]):
-        raise ValueError(f"{name} must be {_FORMS}; got {text!r}")
+        raise ValueError(see("maps", f"{name} must be {_FORMS}; got {text!r}"))
     digits = count.strip()
     # Thousands of digits are more than Python takes for a number.
     if not digits.isdecimal() or len(digits) > len(str(_MOST_VALUES)) or not 1 <= int(digits) <= _MOST_VALUES:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import jax
 
 from vijax.runtime import checks
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -109,14 +110,18 @@ def _check_ended(future: "Future") -> None:
         future.result()
     except KilledWorker as error:
         lost = error.allowed_failures + 1
-        raise ChildProcessError(f"{lost} workers were lost, one after another, at the same tile") from None
+        raise ChildProcessError(
+            see("studies", f"{lost} workers were lost, one after another, at the same tile")
+        ) from None
 
 
 def _dask() -> ModuleType:
     try:
         import distributed
     except ModuleNotFoundError:
-        raise ModuleNotFoundError("workers must have Dask to be led by; got none; install vijax[cluster]") from None
+        raise ModuleNotFoundError(
+            see("studies", "workers must have Dask to be led by; got none; install vijax[cluster]")
+        ) from None
     return distributed
 
 
@@ -128,18 +133,28 @@ def _joined(address: str, answer: float = ANSWER) -> "Iterator[Client]":
         dask.comm.get_address_host_port(address)
     except ValueError:
         raise ValueError(
-            f"workers or scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}"
+            see(
+                "studies",
+                f"workers or scheduler must be an address such as tcp://10.0.0.1:8786; got {checks.shown(address)}",
+            )
         ) from None
     try:
         client = dask.Client(address, timeout=answer, set_as_default=False)
     except TypeError as error:  # which TLS without certificates raises
         raise ValueError(
-            f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} ({error})"
+            see(
+                "studies",
+                f"workers or scheduler must be one that Dask's configuration knows how to reach; got {address} "
+                f"({error})",
+            )
         ) from None
     except OSError:
         raise ConnectionError(
-            f"workers or scheduler must answer within {answer} s; got {address}, where none did; start it, or give "
-            "its address"
+            see(
+                "studies",
+                f"workers or scheduler must answer within {answer} s; got {address}, where none did; start it, or give "
+                "its address",
+            )
         ) from None
     with _quiet(), client:
         yield client

@@ -24,6 +24,7 @@ from vijax.planes.axes import Cells
 from vijax.planes.outputs import OUTPUTS, VARIED, Found
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import tiles
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -129,7 +130,10 @@ def warn_if_held(dataset: "xr.Dataset") -> None:
     if (status == Status.PERMANENT_CONTACT).all():
         span = " to ".join(f"{x:.4g}" for x in np.unique([gamma.min(), gamma.max()]))
         advice = "from 1 on it outweighs the forcing; raise A or lower beta"
-        warnings.warn(f"gravity holds the ball: gamma = {span}, permanent contact everywhere; {advice}", stacklevel=2)
+        warnings.warn(
+            see("status", f"gravity holds the ball: gamma = {span}, permanent contact everywhere; {advice}"),
+            stacklevel=2,
+        )
 
 
 def _variable(name: str, found: Found, planned: SweepPlan) -> "xr.Variable":

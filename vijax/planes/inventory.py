@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vijax.runtime.files import write_json
+from vijax.runtime.pages import see
 
 LIST = "vijax.json"
 TILES = Path("status", "tiles")
@@ -35,7 +36,9 @@ def fault(file: Path, expected: str | None) -> str:
         FileExistsError: If a folder or a file stands in its way, which may be somebody's.
     """
     if file.is_dir():
-        raise FileExistsError(f"{file} must be a file that vijax wrote; got a folder; remove it, or take another store")
+        raise FileExistsError(
+            see("studies", f"{file} must be a file that vijax wrote; got a folder; remove it, or take another store")
+        )
     if not file.exists():
         _check_way(file)
         return "is missing"
@@ -54,7 +57,9 @@ def _check_way(file: Path) -> None:
     """Raise unless a file could be made."""
     above = next(folder for folder in file.parents if folder.exists())
     if not above.is_dir():
-        raise FileExistsError(f"{above} must be a folder of a store; got a file; remove it, or take another store")
+        raise FileExistsError(
+            see("studies", f"{above} must be a folder of a store; got a file; remove it, or take another store")
+        )
 
 
 def content(file: Path) -> dict[str, Any] | None:

@@ -12,6 +12,7 @@ import numpy as np
 from vijax.planes import inventory
 from vijax.runtime import checks
 from vijax.runtime.files import check_ending, check_folder, recover, replacing_folder
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,7 +32,9 @@ def check_store(name: str, path: str | Path, overwrite: bool = False) -> Path:
     target = check_place(name, path)
     if os.path.lexists(target):
         if not overwrite:
-            raise FileExistsError(f"{name} must not exist yet; got {path}; allow overwriting, or take another name")
+            raise FileExistsError(
+                see("studies", f"{name} must not exist yet; got {path}; allow overwriting, or take another name")
+            )
         check_ours(name, target)
     return target
 
@@ -52,11 +55,16 @@ def check_ours(name: str, target: Path) -> None:
     """Raise FileExistsError unless something is a store and all that it holds was written by vijax."""
     if target.is_dir() and (stranger := inventory.foreign(target)):
         raise FileExistsError(
-            f"{name} must not replace what vijax did not write; got {target}, which holds {stranger}; "
-            "move it elsewhere, or take another name"
+            see(
+                "studies",
+                f"{name} must not replace what vijax did not write; got {target}, which holds {stranger}; "
+                "move it elsewhere, or take another name",
+            )
         )
     if not inventory.is_store(target):
-        raise FileExistsError(f"{name} must not replace what is no store of vijax; got {target}; take another name")
+        raise FileExistsError(
+            see("studies", f"{name} must not replace what is no store of vijax; got {target}; take another name")
+        )
 
 
 def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) -> None:
@@ -130,8 +138,11 @@ def load(path: str | Path) -> "xr.Dataset":
             found = dataset.load()
     if inventory.read(path) is None:
         warnings.warn(
-            f"{path} has no {inventory.LIST}, the list of its files, as stores of earlier versions: edits of its "
-            "metadata go unseen; make it anew for a store that is checked",
+            see(
+                "studies",
+                f"{path} has no {inventory.LIST}, the list of its files, as stores of earlier versions: edits of its "
+                "metadata go unseen; make it anew for a store that is checked",
+            ),
             stacklevel=2,
         )
     return found
@@ -155,7 +166,9 @@ def _check(path: Path, faults: Iterator[tuple[str, str]]) -> None:
     name, reason = next(faults, ("", ""))
     if reason:
         remedy = "run again, the call that made it mends it" if inventory.is_study(path) else "make it anew"
-        raise ValueError(f"path must name a store as it was written; got {path}, where {name} {reason}; {remedy}")
+        raise ValueError(
+            see("studies", f"path must name a store as it was written; got {path}, where {name} {reason}; {remedy}")
+        )
 
 
 @contextmanager
@@ -167,4 +180,6 @@ def _in_one_line(path: str | Path) -> Iterator[None]:
         raise
     except Exception as error:
         said = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"path must name a store that can be read; got {path} ({said}); make it anew") from error
+        raise ValueError(
+            see("studies", f"path must name a store that can be read; got {path} ({said}); make it anew")
+        ) from error

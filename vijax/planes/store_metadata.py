@@ -15,6 +15,7 @@ from vijax.planes.dataset import SweepPlan, asked, coordinates, provenance, spec
 from vijax.planes.store import compressors, seal, view
 from vijax.planes.store import write as write_store
 from vijax.runtime.files import replacing
+from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -86,8 +87,11 @@ def mend(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path, sa
         for name, reason in faults.items():
             if inventory.fault(fresh / name, listed["files"][name]):
                 raise FileExistsError(
-                    f"out must be whole or what this plane can mend; got {path}, where {name} {reason}, "
-                    "and this plane has something else there; allow overwriting, or take another name"
+                    see(
+                        "studies",
+                        f"out must be whole or what this plane can mend; got {path}, where {name} {reason}, "
+                        "and this plane has something else there; allow overwriting, or take another name",
+                    )
                 )
             _put(name, reason, (fresh / name).read_bytes(), path, say)
 
@@ -101,9 +105,12 @@ def _mend_list(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Pa
         faults = dict(inventory.faults(path, (inventory.read(fresh) or {})["files"]))
         if any("/zarr.json" not in name for name in faults):
             raise FileExistsError(
-                f"out must be whole or what this plane can mend; got {path}, where {inventory.LIST} {reason}, "
-                f"which would tell whether {next(iter(faults))} is what was written; allow overwriting, "
-                "or take another name"
+                see(
+                    "studies",
+                    f"out must be whole or what this plane can mend; got {path}, where {inventory.LIST} {reason}, "
+                    f"which would tell whether {next(iter(faults))} is what was written; allow overwriting, "
+                    "or take another name",
+                )
             )
         for name, fault in [*faults.items(), (inventory.LIST, reason)]:
             _put(name, fault, (fresh / name).read_bytes(), path, say)
@@ -136,8 +143,11 @@ def check_same(planned: SweepPlan, path: Path) -> None:
     if found:
         more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         raise FileExistsError(
-            f"out must be new or hold the same plane; got {path}, where {'; '.join(found[:_SHOWN])}{more}; "
-            "allow overwriting, or take another name"
+            see(
+                "studies",
+                f"out must be new or hold the same plane; got {path}, where {'; '.join(found[:_SHOWN])}{more}; "
+                "allow overwriting, or take another name",
+            )
         )
 
 

@@ -27,6 +27,7 @@ from vijax.planes.store import check_store, load, save, view
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import checks, context
 from vijax.runtime.context import door
+from vijax.runtime.pages import see
 from vijax.runtime.tiles import places
 
 if TYPE_CHECKING:
@@ -185,13 +186,18 @@ def plan(
 def _levels(refine: Any, of: Cells, until: str) -> int:
     levels = checks.whole("refine", refine, 1)
     if until != "attractor":
-        raise ValueError(f"refine must be left out with until={until!r}, whose cells have no label; got {levels}")
+        raise ValueError(
+            see("maps", f"refine must be left out with until={until!r}, whose cells have no label; got {levels}")
+        )
     longest = max((of.sizes[dim] for dim in of.dynamic), default=1)
     most = refinement.most_levels(longest)
     if levels > most:
         raise ValueError(
-            f"refine must leave 4 steps of 2^refine cells along the longest axis that the motion depends on, "
-            f"at most {most} levels for {longest} values; got {levels}"
+            see(
+                "maps",
+                f"refine must leave 4 steps of 2^refine cells along the longest axis that the motion depends on, "
+                f"at most {most} levels for {longest} values; got {levels}",
+            )
         )
     return levels
 
@@ -270,10 +276,16 @@ def check_workers(planned: SweepPlan, workers: cluster.Workers, out: str | Path 
         ValueError, OSError, ModuleNotFoundError: As `cluster.check`; ValueError without a store, and with refinement.
     """
     if out is None:
-        raise ValueError(f"workers must come with out, the store that they write; got {checks.shown(workers)} alone")
+        raise ValueError(
+            see("studies", f"workers must come with out, the store that they write; got {checks.shown(workers)} alone")
+        )
     if planned.refine:
         raise ValueError(
-            f"workers must be left out with refine, which goes on from all that was found; got {checks.shown(workers)}"
+            see(
+                "studies",
+                "workers must be left out with refine, which goes on from all that was found; got "
+                f"{checks.shown(workers)}",
+            )
         )
     cluster.check(workers)
 

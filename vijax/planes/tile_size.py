@@ -2,6 +2,8 @@
 
 import os
 
+from vijax.runtime.pages import see
+
 # The largest take a core a second or two, large enough to keep lanes full and files few, small enough to lose.
 _LARGEST = 32768
 # Smaller ones leave lanes empty.
@@ -16,7 +18,7 @@ def largest() -> int:
     """
     said = os.environ.get("VIJAX_TILE", str(_LARGEST))
     if not (said.isascii() and said.isdecimal() and 0 < int(said) <= _LARGEST):
-        raise ValueError(f"VIJAX_TILE must be a whole number from 1 to {_LARGEST}; got {said[:20]!r}")
+        raise ValueError(see("studies", f"VIJAX_TILE must be a whole number from 1 to {_LARGEST}; got {said[:20]!r}"))
     return int(said)
 
 

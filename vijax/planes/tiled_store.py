@@ -24,6 +24,7 @@ from vijax.planes.axes import Cells
 from vijax.planes.dataset import SweepPlan, made_by
 from vijax.planes.store import check_place, check_store, encoded, view
 from vijax.runtime.files import beside, replacing, replacing_folder, write_json
+from vijax.runtime.pages import see
 from vijax.runtime.tiles import places
 
 if TYPE_CHECKING:
@@ -240,8 +241,11 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
     if not inventory.is_study(path):
         if not overwrite:
             raise FileExistsError(
-                f"out must be new or the store of a run that can go on; got {path}, which was saved whole; "
-                "allow overwriting, or take another name"
+                see(
+                    "studies",
+                    f"out must be new or the store of a run that can go on; got {path}, which was saved whole; "
+                    "allow overwriting, or take another name",
+                )
             )
         yield
         return
@@ -255,7 +259,9 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
         # No file that merely exists may stand in for the lock where the disk knows none: a killed run would leave it.
         alone = FileLock(lock, fallback_to_soft=False).acquire(blocking=False)
     except Timeout:
-        raise BlockingIOError(f"out must not be in use; got {path}, which another run is writing") from None
+        raise BlockingIOError(
+            see("studies", f"out must not be in use; got {path}, which another run is writing")
+        ) from None
     except OSError as error:
         raise PermissionError(f"out must be a store that can be written; got {path} ({error.strerror})") from None
     with alone:

@@ -16,6 +16,7 @@ from jax.extend import backend
 from vijax.runtime import forks
 from vijax.runtime.cache_folder import keep_programs
 from vijax.runtime.garbage import seldom_collected
+from vijax.runtime.pages import see
 from vijax.runtime.waiting import tell_of_compilation
 
 P = ParamSpec("P")
@@ -36,8 +37,11 @@ def door(function: Callable[P, T]) -> Callable[P, T]:
     def through(*args: P.args, **kwargs: P.kwargs) -> T:
         if forks.Process.orphaned:
             raise RuntimeError(
-                "vijax must not be called in a process that was forked after JAX had started, where it would hang; "
-                'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep'
+                see(
+                    "programs",
+                    "vijax must not be called in a process that was forked after JAX had started, where it would hang; "
+                    'start workers by multiprocessing\'s "spawn", as threads, or by workers= of sweep',
+                )
             )
         keep_programs()
         tell_of_compilation()
@@ -71,8 +75,11 @@ def _check_untraced(given: Any) -> None:
     """Raise where 32 bits are traced: what is made of them has 32 too, whatever is set in between."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(given)):
         raise ValueError(
-            "jax_enable_x64 must be True where a program traces vijax by jit, grad or vmap; got False; set it by "
-            'jax.config.update("jax_enable_x64", True), or trace within jax.enable_x64(True)'
+            see(
+                "programs",
+                "jax_enable_x64 must be True where a program traces vijax by jit, grad or vmap; got False; set it by "
+                'jax.config.update("jax_enable_x64", True), or trace within jax.enable_x64(True)',
+            )
         )
 
 

@@ -22,6 +22,8 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Int
 
+from vijax.runtime.pages import see
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -55,7 +57,7 @@ def _asked_for() -> bool:
     """
     said = os.environ.get("VIJAX_KERNELS", "1")
     if said not in ("0", "1"):
-        raise ValueError(f"VIJAX_KERNELS must be 0 (no kernels) or 1; got {said[:20]!r}")
+        raise ValueError(see("limits", f"VIJAX_KERNELS must be 0 (no kernels) or 1; got {said[:20]!r}"))
     return said == "1"
 
 
