@@ -128,7 +128,7 @@ def dormand_prince(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol:
 
     Args:
         d: gap, [N].
-        kappa: stiffness ratio, one for all cells; None for rigid walls.
+        kappa: stiffness ratio, [N] or one for all; None for rigid walls.
         r: coefficient of restitution, one for all.
         gamma: gravity along the capsule, one for all.
         u0, v0: starts in the gap, [N] or one for all.
@@ -138,10 +138,10 @@ def dormand_prince(d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol:
     Returns:
         Displacement and velocity, float64 [N]; NaN where a cell took too many steps.
     """
-    d, u0, v0 = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, u0, v0)))
+    stiff = 0.0 if kappa is None else kappa
+    d, u0, v0, stiff = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, u0, v0, stiff)))
     u, v = u0.copy(), v0.copy()
-    stiffness, damping = (0.0, 0.0) if kappa is None else (float(kappa) ** 2, float(kappa) * _damping(r))
-    _chain(d / 2, stiffness, damping, r, gamma, 2.0 * periods, rtol, u, v)
+    _chain(d / 2, stiff**2, stiff * _damping(r), r, gamma, 2.0 * periods, rtol, u, v)
     return u, v
 
 
@@ -184,9 +184,10 @@ def _first_look(u, v, u_new, v_new, h, side, half):
 
 
 @numba.njit(parallel=True)
-def _chain(half_gap, stiffness, damping, r, gamma, end, rtol, u_inout, v_inout):
+def _chain(half_gap, stiffnesses, dampings, r, gamma, end, rtol, u_inout, v_inout):
     for cell in numba.prange(half_gap.size):
         half, u, v, t, side = half_gap[cell], u_inout[cell], v_inout[cell], 0.0, 0
+        stiffness, damping = stiffnesses[cell], dampings[cell]
         speeds, pushes = np.empty(7), np.empty(7)
         flight = 1e-3
         contact = 0.1 / math.sqrt(stiffness) if stiffness > 0 else flight
@@ -251,7 +252,11 @@ def scipy_events(
     d, kappa, r: float, gamma: float, u0, v0, periods: int, rtol: float, solver: str
 ) -> tuple[np.ndarray, ...]:
     """Do as `dormand_prince`, by SciPy's `solve_ivp` with terminal events, cell by cell; NaN where it gives up."""
-    ends = [_scipy_cell(float(d), kappa, r, gamma, u, v, periods, rtol, solver) for d, u, v in np.broadcast(d, u0, v0)]
+    cells = np.broadcast(d, 0.0 if kappa is None else kappa, u0, v0)
+    ends = [
+        _scipy_cell(float(d), None if kappa is None else float(own), r, gamma, u, v, periods, rtol, solver)
+        for d, own, u, v in cells
+    ]
     u, v = np.array(ends).T
     return u, v
 
