@@ -192,6 +192,100 @@ def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
         axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, **style)
 
 
+_TAILS_COLUMNS = 4
+
+
+def tails(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
+    """Draw the errors of each method over the cells of a plane against its cost, a panel a method, others in grey.
+
+    Args:
+        rows: Those of `tails.Row`, in the order of settings; of one rounding, the level below which no float64 comes.
+        path: Picture to write.
+
+    Raises:
+        ValueError: A format that is none.
+    """
+    if path is not None:
+        check_format(path)
+    methods: dict[str, list[Any]] = {}
+    for row in rows:
+        methods.setdefault(row.method, []).append(row)
+    (rounding,) = methods.pop("one rounding")
+    lines = math.ceil(len(methods) / _TAILS_COLUMNS)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.6, 2.3 * lines + 0.3), layout="constrained")
+        grid = figure.subplots(lines, _TAILS_COLUMNS, sharex=True, sharey=True, squeeze=False)
+        costs = [row.us for some in methods.values() for row in some]
+        grid[0, 0].set(xscale="log", yscale="log", xlim=(min(costs) / 2, max(costs) * 2), ylim=(_ROUNDING, 30))
+        for axes, one in itertools.zip_longest(grid.flat, methods.items()):
+            if one is None:
+                axes.set_visible(False)
+                continue
+            for other, some in methods.items():
+                if other != one[0]:
+                    _tail(axes, some, "0.85", 0.0)
+            axes.axhline(rounding.most, color="0.4", linewidth=0.7, linestyle=":")
+            _tail(axes, one[1], _METHODS[one[0]][0], 0.25)
+            axes.set_title(one[0], fontsize=9)
+        figure.supxlabel("microseconds of core time per cell-period, warm", fontsize="medium")
+        figure.supylabel("error of the state after 3 periods", fontsize="medium")
+        if path is not None:
+            save_figure(figure, path)
+    return figure
+
+
+def _tail(axes: Axes, rows: list[Any], colour: str, shade: float) -> None:
+    """Draw what half of the cells keep and what 99 of 100 keep; a cross and its share where more have other motions."""
+    cost = [row.us for row in rows]
+    median, most = ([max(getattr(row, name), _ROUNDING) for row in rows] for name in ("median", "most"))
+    if not shade:
+        axes.plot(cost, most, color=colour, linewidth=0.6, marker="o", markersize=1, zorder=1)
+        return
+    axes.fill_between(cost, median, most, color=colour, alpha=shade, linewidth=0)
+    axes.plot(cost, median, color=colour, linewidth=0.8, linestyle="--", marker="o", markersize=2, fillstyle="none")
+    axes.plot(cost, most, color=colour, linewidth=1.3, marker="o", markersize=2.5)
+    for row, height in zip(rows, most, strict=True):
+        if row.other:
+            axes.plot(row.us, min(height, 10), color=colour, marker="x", markersize=5, linestyle="none")
+            said = f"{100 * row.other / row.cells:.2g} %"
+            axes.annotate(said, (row.us, min(height, 10)), (0, 4), textcoords="offset points", ha="center", fontsize=6)
+
+
+def labels(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
+    """Draw how many cells get another label, or none, against what a cell costs.
+
+    Args:
+        rows: Those of `tails.LabelRow`, in the order of settings.
+        path: Picture to write.
+
+    Raises:
+        ValueError: A format that is none.
+    """
+    if path is not None:
+        check_format(path)
+    methods: dict[str, list[Any]] = {}
+    for row in rows:
+        methods.setdefault(row.method, []).append(row)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(5.6, 3.2), layout="constrained")
+        axes = figure.subplots()
+        axes.set(xscale="log", xlabel="microseconds of core time a cell, warm", ylabel="cells, %", ylim=(-3, 103))
+        axes.grid(color="0.9", linewidth=0.4)
+        for method, some in methods.items():
+            colour, style = _METHODS[method]
+            cost = [row.us for row in some]
+            wrong = [100 * row.wrong / row.cells for row in some]
+            either = [100 * (row.wrong + row.undecided) / row.cells for row in some]
+            axes.plot(cost, wrong, color=colour, linestyle=style, marker="o", markersize=4, linewidth=1, label=method)
+            axes.plot(cost, either, color=colour, marker="o", markersize=5, linestyle="none", fillstyle="none")
+        axes.plot([], [], color="0.3", marker="o", markersize=4, linestyle="none", label="another label")
+        axes.plot([], [], color="0.3", marker="o", markersize=5, linestyle="none", fillstyle="none", label="or none")
+        axes.legend(fontsize=7, frameon=False)
+        if path is not None:
+            save_figure(figure, path)
+    return figure
+
+
 _DERIVATIVES = {
     "automatic differentiation": ("#d62728", "x", "--"),
     "ensemble": ("#1f77b4", "o", "-"),

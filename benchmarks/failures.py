@@ -24,7 +24,6 @@ Printout for two scenes, usual method and vijax side by side:
 """
 
 import argparse
-import csv
 import json
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
@@ -37,7 +36,7 @@ import mpmath
 import numpy as np
 
 import vijax
-from benchmarks import charts, naive
+from benchmarks import charts, naive, tables
 from benchmarks.peers import rk4
 from vijax.batch.run_records import Trajectory
 from vijax.engine import exact
@@ -572,25 +571,27 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small settings")
     parser.add_argument("--only", choices=list(SCENES), action="append", help="one scene; may be given again")
     parser.add_argument("--plot", type=Path, help="draw the stability map there, and measure nothing else")
-    parser.add_argument("--rows", type=Path, default=HERE / "rows", help="folder for the figures")
+    parser.add_argument("--rows", type=Path, default=tables.ROWS, help="folder for the figures")
     given = parser.parse_args()
 
     if given.plot:
         charts.stability_map(stability_map(STABILITY_SIDES[given.quick]), given.plot)
         return
-    given.rows.mkdir(parents=True, exist_ok=True)
     part = "_quick" if given.quick or given.only else ""
-    with (given.rows / f"failures{part}.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["scene", *Figure._fields])
-        for name in given.only or SCENES:
-            scene = SCENES[name]
-            print(f"{name}: {scene.wrong}")
-            for figure in scene.measure(given.quick):
-                table.writerow([name, *figure])
-                usual, ours = ("-" if x != x else f"{x:.3g}" for x in figure[1:])
-                print(f"    {figure.what:74} {usual:>9} {ours:>9}", flush=True)
-            print(f"    vijax: {scene.answer}")
+    rows = measured(given.only or list(SCENES), given.quick)
+    tables.write(given.rows / f"failures{part}.csv", ["scene", *Figure._fields], rows)
+
+
+def measured(names: list[str], quick: bool) -> Iterator[list[Any]]:
+    """Measure scenes, print each figure, and give it with its scene."""
+    for name in names:
+        scene = SCENES[name]
+        print(f"{name}: {scene.wrong}")
+        for figure in scene.measure(quick):
+            usual, ours = ("-" if x != x else f"{x:.3g}" for x in figure[1:])
+            print(f"    {figure.what:74} {usual:>9} {ours:>9}", flush=True)
+            yield [name, *figure]
+        print(f"    vijax: {scene.answer}")
 
 
 if __name__ == "__main__":

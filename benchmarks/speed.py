@@ -6,17 +6,10 @@
     python benchmarks/speed.py --ode       # method="ode" against restarts of diffrax's own event solver
 
 The plane: d 0.05..0.3, kappa 3..400 (log), r 0.5, start (0, 0.4), impacts per period over a window. Warm times are of
-whole calls of `vijax.sweep`, from axes to labelled dataset. Typical printout, two cores:
-
-    2 cores, cpu, JAX 0.10.2
-    vijax          0.1271 us per cell-period    53.5 ns per impact   0.208 s warm    9.1 s to compile
-    vijax with P   0.1554 us per cell-period    65.4 ns per impact   0.255 s warm   11.9 s to compile
-    peer           0.5840 us per cell-period   246.2 ns per impact   0.957 s warm    3.1 s to compile
-    vijax is 4.6 times faster (4.2 to 4.8)
+whole calls of `vijax.sweep`, from axes to labelled dataset; the page on accuracy and speed prints the rows.
 """
 
 import argparse
-import csv
 import json
 import os
 import resource
@@ -33,6 +26,7 @@ import jax
 import numpy as np
 
 import vijax
+from benchmarks import tables
 
 HERE = Path(__file__).parent
 REFERENCE = HERE.parent / "tests" / "data" / "trajectories.json"
@@ -268,19 +262,15 @@ def main() -> None:
     )
     which.add_argument("--ode", action="store_const", const=ode, dest="measure", help="the ode engine and its peer")
     parser.add_argument("--quick", action="store_true", help="small sizes, seconds in all: does it run?")
-    parser.add_argument("--rows", type=Path, default=HERE / "rows", help="folder for the raw rows")
+    parser.add_argument("--rows", type=Path, default=tables.ROWS, help="folder for the raw rows")
     parser.set_defaults(measure=against_peer)
     given = parser.parse_args()
 
     jax.config.update("jax_enable_compilation_cache", False)  # cold is to mean cold
     print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
-    given.rows.mkdir(parents=True, exist_ok=True)
     name = f"speed_{given.measure.__name__}{'_quick' if given.quick else ''}.csv"
-    with (given.rows / name).open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow([*Row._fields, "us_per_cell_period"])
-        for row in given.measure(given.quick):
-            table.writerow([*row, row.cell_period])
+    rows = ([*row, row.cell_period] for row in given.measure(given.quick))
+    tables.write(given.rows / name, [*Row._fields, "us_per_cell_period"], rows)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@
 Errors: the default plane (d 0.05 to 0.3, kappa 3 to 400, r 0.5) on an even grid of 1,024 cells, from one start; the
 error is that of (u, v) after three periods, against 50-digit arithmetic, so early that chaos has not made one of any
 rounding. What a method costs is measured warm on the same plane, in microseconds of core time per cell-period, which
-another load on the machine hardly changes. A cell that is off by more than 0.1 had another motion. The row of one rounding says what float64 leaves: how far the true state moves when d,
-kappa and the start are rounded.
+another load on the machine hardly changes. A cell that is off by more than 0.1 had another motion. The row of one
+rounding says what float64 leaves: how far the true state moves when d, kappa and the start are rounded.
 
 Labels: the 112 periodic reference cells with a single attractor, from their starts, 400 periods; the label is wrong
 where period or impacts differ from those of the reference. The cost there is in microseconds of core time a cell.
@@ -81,7 +81,7 @@ class Contender(NamedTuple):
     method: str
     setting: str
     answer: Callable[[np.ndarray, np.ndarray], States]
-    timed: Callable[[int, int], Any] | None
+    timed: Callable[[int, int], Any]
 
 
 # --- truth ------------------------------------------------------------------------------------------------------------
@@ -137,8 +137,7 @@ def one_rounding(d: np.ndarray, kappa: np.ndarray, true: States) -> np.ndarray:
 
 def exact(d: np.ndarray, kappa: np.ndarray, v0: float = V0, dtype: str = "float64", **options: Any) -> States:
     """Run by `vijax.trajectory`."""
-    d, kappa, r, gamma = (jnp.asarray(np.broadcast_to(x, d.shape), dtype) for x in (d, kappa, R, 0.0))
-    pair = vijax.ImpactPair(d=d, kappa=kappa, r=r, gamma=gamma)
+    pair = vijax.ImpactPair(*(jnp.asarray(np.broadcast_to(x, d.shape), dtype) for x in (d, kappa, R, 0.0)))
     states = vijax.trajectory(pair, U0, v0, PERIODS, max_impacts=ROOM, **options).states
     return np.asarray(states.u)[:, -1], np.asarray(states.v)[:, -1]
 
@@ -146,8 +145,8 @@ def exact(d: np.ndarray, kappa: np.ndarray, v0: float = V0, dtype: str = "float6
 def sweep(side: int, periods: int, **options: Any) -> Any:
     """Run a window of the plane by `vijax.sweep`."""
     d, kappa = speed.axes(side)
-    told = {"r": R, "u0": U0, "v0": V0, "until": "window", "periods": periods, "outputs": ("impacts_per_period",)}
-    return vijax.sweep(d=d, kappa=kappa, **told, **options)
+    told: dict[str, Any] = {"until": "window", "periods": periods, "outputs": ("impacts_per_period",)} | options
+    return vijax.sweep(d=d, kappa=kappa, r=R, u0=U0, v0=V0, **told)
 
 
 def theirs(solve: Callable[..., Any], side: int, periods: int, **told: Any) -> Any:
@@ -187,10 +186,6 @@ def contenders() -> Iterator[Contender]:
     for setting, numbers in tolerances(6, 8, 10):
         run = partial(located, peers.diffrax_chain, rtol=numbers["rtol"])
         yield Contender("diffrax restarts", setting, run, partial(theirs, run))
-    for setting, numbers in tolerances(6, 9, 12):
-        # Cell by cell, so that its answer is its timing.
-        run = partial(located, peers.scipy_events, solver="DOP853", rtol=numbers["rtol"])
-        yield Contender("SciPy DOP853", setting, run, None)
 
 
 QUICK = {"exact": "float64", "ode Tsit5": "1e-6", "numba RK4": "1000", "numba DP5 + events": "1e-8"}
@@ -210,7 +205,7 @@ def errors(quick: bool) -> Iterator[Row]:
         begun = time.process_time()
         error = deviation(one.answer(d, kappa), true)
         us = 1e6 * (time.process_time() - begun) / (d.size * PERIODS)
-        if one.timed is not None and not quick:
+        if not quick:
             side = next((count for name, count in TIMED.items() if one.method.startswith(name)), TIMED_ELSE)
             us = pace(partial(one.timed, side), side * side)
         yield row(one.method, one.setting, us, error)

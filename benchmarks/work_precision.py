@@ -17,7 +17,6 @@ compilation stands beside it. Typical printout, two cores:
 """
 
 import argparse
-import csv
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -31,7 +30,7 @@ import mpmath as mp
 import numpy as np
 
 import vijax
-from benchmarks import peers, yardstick
+from benchmarks import peers, tables, yardstick
 from benchmarks.charts import work_precision
 
 HERE = Path(__file__).parent
@@ -410,32 +409,24 @@ def main() -> None:
     """Measure, print, save the rows, draw the chart."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one scene, few methods, seconds in all: does it run?")
-    parser.add_argument("--rows", type=Path, default=HERE / "rows", help="folder for the raw rows")
+    parser.add_argument("--rows", type=Path, default=tables.ROWS, help="folder for the raw rows")
     parser.add_argument("--chart", type=Path, help="picture to draw; that of the README unless --quick")
     parser.add_argument("--redraw", action="store_true", help="draw the stored rows again, measure nothing")
     given = parser.parse_args()
     chart = given.chart or (None if given.quick else CHART)
-    given.rows.mkdir(parents=True, exist_ok=True)
     path = given.rows / f"work_precision{'_quick' if given.quick else ''}.csv"
     if not given.redraw:
         print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
-        with path.open("w", newline="") as file:
-            table = csv.writer(file)
-            table.writerow(Row._fields)
-            for row in measure(given.quick):
-                print(tell(row), flush=True)
-                table.writerow(row)
-                file.flush()
+        tables.write(path, Row._fields, told(measure(given.quick)))
     if chart is not None:
-        work_precision(read(path), chart)
+        work_precision(tables.read(path), chart)
 
 
-def read(path: Path) -> list[Row]:
-    """Read the rows of a CSV file."""
-    kinds = Row.__annotations__.values()
-    with path.open(newline="") as file:
-        lines = list(csv.reader(file))[1:]
-    return [Row(*(kind(cell) for kind, cell in zip(kinds, line, strict=True))) for line in lines]
+def told(rows: Iterator[Row]) -> Iterator[Row]:
+    """Print rows as they come."""
+    for row in rows:
+        print(tell(row), flush=True)
+        yield row
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Pages that the program writes of itself: options, outputs, status codes and quantities, from the tables it reads."""
+"""Pieces of pages that the program writes, from the tables that it reads and the rows that benchmarks keep."""
 
-import re
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import click
 
+from docs import measured
+from docs.markdown import escaped, table
 from vijax.cli.main import vijax as command
 from vijax.cli.page import Page
 from vijax.model.quantities import AXES, QUANTITIES
@@ -19,15 +19,11 @@ def write() -> None:
     """Write the pages into `generated`; a page that says the same as before is left, so that it is not built again."""
     INTO.mkdir(exist_ok=True)
     texts = {"command": _command(), "outputs": _outputs(), "status": _status(), "quantities": _quantities()}
-    for name, text in texts.items():
+    for name, text in (texts | measured.texts()).items():
         path = INTO / f"{name}.md"
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines) + "\n"
+    measured.draw(INTO)
 
 
 def _command() -> str:
@@ -43,28 +39,23 @@ def _page(name: str, above: click.Context) -> str:
     if isinstance(page, Page):
         for title, options in page.sections.items():
             records = [record for option in options if (record := option.get_help_record(context))]
-            parts += [f"**{title}**\n", _table(("option", "meaning"), [(f"`{a}`", _text(b)) for a, b in records])]
-        parts += [_text(page.epilog or ""), "", "Lines to begin with:\n", "```sh"]
+            parts += [f"**{title}**\n", table(("option", "meaning"), [(f"`{a}`", escaped(b)) for a, b in records])]
+        parts += [escaped(page.epilog or ""), "", "Lines to begin with:\n", "```sh"]
         parts += [f"vijax {name} {example}".rstrip() for example in page.examples] + ["```", ""]
     return "\n".join(parts)
 
 
-def _text(said: str) -> str:
-    """Escape what Markdown would read as markup in a text of help."""
-    return re.sub(r"([*_<>$\[\]])", r"\\\1", said)
-
-
 def _outputs() -> str:
     rows = [
-        (f"`{name}`", output.units, _text(output.description) + (" (on request)" if name in ON_REQUEST else ""))
+        (f"`{name}`", output.units, escaped(output.description) + (" (on request)" if name in ON_REQUEST else ""))
         for name, output in OUTPUTS.items()
     ]
-    return _table(("variable", "unit", "what it is"), rows)
+    return table(("variable", "unit", "what it is"), rows)
 
 
 def _status() -> str:
-    rows = [(str(int(one)), f"`{one.name.lower()}`", _text(one.advice)) for one in Status]
-    return _table(("value", "name", "what to do"), rows)
+    rows = [(str(int(one)), f"`{one.name.lower()}`", escaped(one.advice)) for one in Status]
+    return table(("value", "name", "what to do"), rows)
 
 
 def _quantities() -> str:
@@ -74,8 +65,8 @@ def _quantities() -> str:
     rows = []
     for name, quantity in QUANTITIES.items():
         default = quantity.default if name in AXES else _default(getattr(device, name))
-        rows.append((f"`{name}`", quantity.unit or "1", _text(quantity.long_name), default, quantity.rule.must))
-    return _table(("name", "unit", "what it is", "unless given", "values"), rows)
+        rows.append((f"`{name}`", quantity.unit or "1", escaped(quantity.long_name), default, quantity.rule.must))
+    return table(("name", "unit", "what it is", "unless given", "values"), rows)
 
 
 def _default(value: float | None) -> str:

@@ -8,6 +8,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
+from benchmarks import tables
 from benchmarks import work_precision as tool
 from benchmarks.charts import work_precision
 
@@ -21,7 +22,7 @@ def rows(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["work_precision.py", "--quick", "--rows", str(folder)])
         tool.main()
-    return tool.read(folder / "work_precision_quick.csv")
+    return tables.read(folder / "work_precision_quick.csv")
 
 
 def by_method(rows):
