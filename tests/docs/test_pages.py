@@ -1,6 +1,10 @@
 """The pages: they build without a warning, load nothing from elsewhere, and show what the program is now."""
 
+import html
+import json
 import re
+import shutil
+import subprocess
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -135,3 +139,46 @@ def test_what_a_function_returns_is_not_read_as_a_type(built):
     """Napoleon takes what stands before a colon in the first line for a type."""
     text = (built / "reference/functions.html").read_text(encoding="utf-8")
     assert not re.findall(r"Return type<|>Type<", text)
+
+
+# --- as a browser shows them -----------------------------------------------------------------------------------------
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the pages with")
+
+
+def looked_at(built: Path, pages: list[str]) -> dict[str, list[str]]:
+    """What is wrong with each page at both widths, by one run of a browser that shows one after another in a frame."""
+    text = (Path(__file__).parent / "look.html").read_text(encoding="utf-8")
+    text = text.replace("PAGES = []", f"PAGES = {json.dumps(pages)}").replace("WIDTHS = []", "WIDTHS = [1280, 400]")
+    (built / "look.html").write_text(text, encoding="utf-8")
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--allow-file-access-from-files",
+        "--window-size=1400,1000",
+    ]
+    line = [BROWSER, *options, "--virtual-time-budget=600000", "--dump-dom", (built / "look.html").as_uri()]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
+    (found,) = re.findall(r'<pre id="found">(.*?)</pre>', done.stdout, re.S)
+    return json.loads(html.unescape(found))
+
+
+@pytest.mark.browser
+@browser
+def test_pages_fit_and_show_their_pictures_and_formulas(built):
+    pages = sorted(path.relative_to(built).as_posix() for path in built.rglob("*.html") if path.name != "look.html")
+    found = looked_at(built, pages)
+    assert len(found) > 20
+    assert {page: wrong for page, wrong in found.items() if wrong} == {}
+
+
+@pytest.mark.browser
+@browser
+def test_what_does_not_fit_is_seen(tmp_path):
+    (tmp_path / "page.html").write_text(
+        '<div style="width: 500px">wide</div><img src="none.png"><span class="math">x</span>'
+    )
+    wrong = looked_at(tmp_path, ["page.html"])["page.html"]
+    assert [one.split()[0] for one in wrong] == ["broken", "formula", "508"]
