@@ -1,0 +1,103 @@
+"""Figures in prose: each stands in a row of a benchmark, in what code printed, or in a list with its command."""
+
+import re
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from docs import executed, measured
+
+ROOT = Path(__file__).parents[2]
+LISTED = tomllib.loads((ROOT / "docs/figures.toml").read_text(encoding="utf-8"))
+SOURCES = ("command", "setting", "open")
+TRACED = ("README.md", *(f"docs/{name}.md" for name in (
+    "accuracy", "developing", "failures", "how-it-works", "index", "limits", "model", "programs", "scale", "start",
+)))  # fmt: skip
+"""Pages whose figures are traced; of the others nobody has asked yet where theirs come from."""
+
+_NUMBER = r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
+_UNITS = (
+    r"%|(?:times|us|ms|s|h|min|minutes?|hours?|seconds?|days?|months?|[KMGT]i?B|GB/s|tiles/s|cells/s|bytes|rad/s|uJ|mJ|J|"
+    r"m/s|m|mm|cm|Hz|roundings)\b"
+)
+FIGURE = re.compile(
+    rf"(?<![\w.^/:=-])(?:{_NUMBER}(?: (?:to|and|or|against) {_NUMBER})?[ -]?(?:{_UNITS})"
+    rf"|{_NUMBER} (?:in|of) {_NUMBER}\b)"
+)
+_OWN_COMMAND = re.compile(r"\| (?:`(?:python|bash|time) [^|]*|the same) \|$")
+
+
+def prose(text: str) -> str:
+    """A page without its code, formulas and rows of tables that end in the command that prints them."""
+    for pattern in (r"^```.*?^```[ ]*$", r"^(?:    .*\n)+", r"\$\$.*?\$\$"):
+        text = re.sub(pattern, "", text, flags=re.M | re.S)
+    return "\n".join(line for line in text.splitlines() if not _OWN_COMMAND.search(line))
+
+
+def figures(text: str) -> Iterator[re.Match[str]]:
+    """Numbers with a unit, and shares such as 1 in 100, outside of code."""
+    for found in FIGURE.finditer(text):
+        if text[: found.start()].rpartition("\n")[2].count("`") % 2 == 0:
+            yield found
+
+
+@cache
+def of_rows() -> list[str]:
+    """What rows say, as pages show it."""
+    return list(measured.texts().values())
+
+
+def printed(page: str) -> str:
+    """What rows and the page's own code say; the README has its code from the page that begins."""
+    name = "start" if page == "README.md" else "-".join(Path(page).relative_to("docs").with_suffix("").parts)
+    said = [*of_rows()]
+    for file in executed.OUTPUTS.glob(f"{name}-????????????.ipynb"):
+        for cell in nbformat.read(file, as_version=4).cells:
+            said += [output.get("text") or output.get("data", {}).get("text/plain", "") for output in cell.outputs]
+    return " ".join(" ".join(said).split())
+
+
+def listed(page: str, text: str) -> list[tuple[int, int]]:
+    """Where the texts of the list stand on a page."""
+    own = [one["text"] for one in LISTED["figure"] if one["page"] == Path(page).name]
+    return [(at.start(), at.end()) for one in own for at in re.finditer(re.escape(one), text)]
+
+
+def untraced(page: str, text: str) -> list[str]:
+    """Figures of a page of which nothing says where they come from."""
+    if any(one["page"] == Path(page).name for one in LISTED["page"]):
+        return []
+    text, said = prose(text), printed(page)
+    spans = listed(page, text)
+    return [
+        found[0]
+        for found in figures(text)
+        if not any(low <= found.start() and found.end() <= high for low, high in spans)
+        and not re.search(rf"(?<![\d.]){re.escape(' '.join(found[0].split()))}(?!\w)", said)
+    ]
+
+
+@pytest.mark.parametrize("page", TRACED)
+def test_every_figure_is_traced(page):
+    assert untraced(page, (ROOT / page).read_text(encoding="utf-8")) == []
+
+
+def test_a_figure_without_a_source_is_found():
+    said = "It takes 3.25 s, `4 s` of code and 17 % more, in 1 of 77.\n\n| a | 5 ms | `python benchmarks/speed.py` |\n"
+    assert untraced("docs/maps.md", said) == ["3.25 s", "17 %", "1 of 77"]
+
+
+@pytest.mark.parametrize(
+    "entry", [*LISTED["figure"], *LISTED["page"]], ids=lambda entry: entry.get("text", entry["page"])
+)
+def test_what_is_listed_stands_on_its_page_and_says_its_source(entry):
+    (source,) = [name for name in SOURCES if name in entry]
+    page = (ROOT / "docs" / entry["page"]).read_text(encoding="utf-8")
+    assert entry.get("text", "") in page
+    if source != "open":
+        (file,) = re.findall(r"[\w/-]+\.(?:py|md|sh)", entry[source])
+        assert (ROOT / file).exists()
