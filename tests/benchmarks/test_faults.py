@@ -118,7 +118,7 @@ def test_a_second_process_is_refused_in_one_line(folder, capsys):
         wait_for_tiles(folder, process, 1)
         assert script.main(ARGUMENTS) == 2
         assert capsys.readouterr().err == (
-            "error: out must not be in use; got map.zarr, which another run is writing\n"
+            "error: out must not be in use; got map.zarr, which another run is writing; see docs: studies\n"
         )
         assert script.main([*ARGUMENTS, "--overwrite"]) == 2
         process.communicate(timeout=60)

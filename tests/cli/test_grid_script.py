@@ -310,7 +310,8 @@ def test_what_to_do_is_said_where_a_status_is_printed():
     status = dataset.flagged(xr.Variable("d", [0, 4, 4, 2]))
     lines = closing.statuses(xr.DataArray(status)).split("\n")
     assert lines[0] == "cells by status: ok 1, permanent_contact 1, slow 2"
-    assert lines[1:] == [f"    permanent_contact: {Status(2).advice}", f"    slow: {Status(4).advice}"]
+    assert lines[1] == f"    permanent_contact: {Status(2).advice}"
+    assert lines[2:] == [f"    slow: {Status(4).advice}; see docs: status"]
 
 
 def test_any_variable_is_shown(folder):

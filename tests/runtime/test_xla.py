@@ -156,4 +156,7 @@ def test_without_kernels_the_same_comes_out(tmp_path):
 def test_a_misspelt_switch_is_named():
     done = without_kernels("import vijax.public", switch="off")
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1] == "ValueError: VIJAX_KERNELS must be 0 (no kernels) or 1; got 'off'"
+    assert (
+        done.stderr.splitlines()[-1]
+        == "ValueError: VIJAX_KERNELS must be 0 (no kernels) or 1; got 'off'; see docs: limits"
+    )
