@@ -1,7 +1,7 @@
 """Make the pictures that README and the pages keep in `scripts/gallery`, each by the command that stands here.
 
     python scripts/pictures.py                  # all: several minutes
-    python scripts/pictures.py basins branch    # some
+    python scripts/pictures.py power_map        # some
     python scripts/pictures.py --list           # the commands
 
 Pictures of pages whose code is executed are no part of it: they are outputs, which `python docs --execute` makes anew.
@@ -20,16 +20,6 @@ GALLERY = Path(__file__).parent / "gallery"
 
 PICTURES = {
     "power_map": "-m vijax sweep --plot {}",
-    "frequency": "-m vijax sweep --s 0.2 --omega 1:12:96 --omega0 10:400:96:log --plot {}",
-    "inclined": "-m vijax sweep --d 0.05:0.3:96 --kappa 3:400:96:log --gamma 0.1 --plot {}",
-    "inclined_labels": "-m vijax sweep --show label --gamma 0.1 --d 0.05:0.3:96 --kappa 3:400:96:log --plot {}",
-    "inclined_orbits": "-m vijax orbit-diagram --along d=0.3:0.05:126 --kappa 40 --gamma 0.1 --direction both "
-    "--plot {}",
-    "orbit_diagram": "-m vijax orbit-diagram --along d=0.3:0.05:126 --kappa 400,126.5,40,12.65,4 --direction both "
-    "--plot {}",
-    "basins": "-m vijax basins --wall rigid --d 0.19 --kappa 400 --v0=-0.6:0.6:1000 --plot {}",
-    "branch": "-m vijax branch --wall rigid --d 0.19 --impacts RLL --along d=0.15:0.25 --plot {}",
-    "comparison": "-m vijax compare --d 0.05:0.3:96 --kappa 3:4000:96:log --periods 2000 --tolerance 5% --plot {}",
     "design_paper": "-m vijax design --d 0.2 --plot {}",
     "design_small": "-m vijax design --d 0.2 --r 0.5 --A 3 --omega 10pi --set V=1700 --tolerance omega0=5% --plot {}",
     "averages": "-m benchmarks.averages --chart {}",
