@@ -14,10 +14,8 @@ from docs import executed, measured
 ROOT = Path(__file__).parents[2]
 LISTED = tomllib.loads((ROOT / "docs/figures.toml").read_text(encoding="utf-8"))
 SOURCES = ("command", "setting", "open")
-TRACED = ("README.md", *(f"docs/{name}.md" for name in (
-    "accuracy", "developing", "failures", "how-it-works", "index", "limits", "model", "programs", "scale", "start",
-)))  # fmt: skip
-"""Pages whose figures are traced; of the others nobody has asked yet where theirs come from."""
+PAGES = ["README.md", *sorted(f"docs/{path.relative_to(ROOT / 'docs')}" for path in (ROOT / "docs").glob("**/*.md"))]
+TRACED = [page for page in PAGES if not page.startswith(("docs/build/", "docs/generated/"))]
 
 _NUMBER = r"\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
 _UNITS = (
@@ -63,13 +61,13 @@ def printed(page: str) -> str:
 
 def listed(page: str, text: str) -> list[tuple[int, int]]:
     """Where the texts of the list stand on a page."""
-    own = [one["text"] for one in LISTED["figure"] if one["page"] == Path(page).name]
+    own = [one["text"] for one in LISTED["figure"] if one["page"] == page.removeprefix("docs/")]
     return [(at.start(), at.end()) for one in own for at in re.finditer(re.escape(one), text)]
 
 
 def untraced(page: str, text: str) -> list[str]:
     """Figures of a page of which nothing says where they come from."""
-    if any(one["page"] == Path(page).name for one in LISTED["page"]):
+    if any(one["page"] == page.removeprefix("docs/") for one in LISTED["page"]):
         return []
     text, said = prose(text), printed(page)
     spans = listed(page, text)
