@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import monitoring
 
 from vijax.runtime.derivatives import differentiable
 
@@ -67,6 +68,27 @@ def test_results_without_derivatives_have_none():
     assert bool(result.positive)
     assert moved.rank.dtype == moved.positive.dtype == jax.dtypes.float0
     np.testing.assert_allclose(moved.powers, 3 * GIVEN["x"] ** 2, rtol=1e-15)
+
+
+def test_at_numbers_a_program_of_its_own_is_compiled():
+    @differentiable
+    def tide(moved, about, *, kind):
+        return jnp.cos(moved) * about
+
+    compiled = []
+
+    def count(event, *_, fun_name="", **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(fun_name)
+
+    monitoring.register_event_duration_secs_listener(count)
+    try:
+        slope = jax.grad(lambda x: tide(x, jnp.array(2.0), kind=None))(jnp.array(0.5))
+    finally:
+        monitoring.unregister_event_duration_listener(count)
+    np.testing.assert_allclose(slope, -2 * np.sin(0.5), rtol=1e-15)
+    assert not any("tide" in name for name in compiled)
+    assert len([name for name in compiled if "call" in name or "slopes" in name]) == 1
 
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.value_and_grad, jax.jacfwd])
