@@ -24,11 +24,8 @@ Errors of derivatives in d, kappa and r are alike in size; those in d and r are 
 """
 
 import argparse
-import csv
 import dataclasses
 import math
-import os
-import platform
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -38,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vijax
-from benchmarks import charts
+from benchmarks import charts, tables
 from vijax.batch.simulate import Starts
 from vijax.design.survey import survey
 from vijax.design.variables import tuned, value_of
@@ -312,21 +309,12 @@ PARTS: dict[str, Callable[[int], Iterator[Row]]] = {
 }
 
 
-def read(path: Path) -> list[Row]:
-    """Read the rows of a file; none if it is not there."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return [Row(*(kind(one[name]) for name, kind in Row.__annotations__.items())) for one in csv.DictReader(file)]
-
-
-def write(path: Path, rows: list[Row]) -> None:
-    """Keep rows, with the machine and the versions that made them."""
-    machine = f"{os.cpu_count()} cores, {platform.machine()}, JAX {jax.__version__}, vijax {vijax.__version__}"
-    with path.open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow([*Row._fields, "machine"])
-        table.writerows([*row, machine] for row in rows)
+def told(parts: list[str], count: int) -> Iterator[Row]:
+    """Measure parts, and print the figures of each."""
+    for part in parts:
+        rows = list(PARTS[part](count))
+        printed(rows)
+        yield from rows
 
 
 def say(what: str, value: str) -> None:
@@ -383,16 +371,11 @@ def main() -> None:
     given = parser.parse_args()
     path = given.rows / "averages.csv"
     if given.chart:
-        charts.averages(read(path), given.chart)
+        charts.averages(tables.read(path), given.chart)
         return
-    given.rows.mkdir(parents=True, exist_ok=True)
     asked = given.only or list(PARTS)
-    rows = [row for row in read(path) if row.part not in asked]
-    for part in asked:
-        fresh = list(PARTS[part](given.cells))
-        printed(fresh)
-        rows += fresh
-        write(path, rows)
+    others = [row for row in tables.read(path) if row.part not in asked]
+    tables.write(path, Row._fields, told(asked, given.cells), kept=others)
 
 
 if __name__ == "__main__":

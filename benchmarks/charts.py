@@ -1,8 +1,9 @@
 """Charts that benchmarks draw: work against precision, limits of stability, derivatives of averages."""
 
+import functools
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,33 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
 
-from vijax.plots.style import STYLE, check_format, save_figure
+from vijax.plots.figure import save, styled
+from vijax.plots.style import check_format
+
+
+def _chart(draw: Callable[[Any], Figure]) -> Callable[..., Figure]:
+    """Mark what draws rows: it does so in the style of all pictures, and writes the picture where a path is given."""
+    drawn = styled(draw)
+
+    @functools.wraps(draw)
+    def draws(rows: Any, path: str | Path | None = None) -> Figure:
+        if path is not None:
+            check_format(path)
+        figure = drawn(rows)
+        if path is not None:
+            save(figure, path)
+        return figure
+
+    return draws
+
+
+def _by(rows: Iterable[Any], field: str) -> dict[str, list[Any]]:
+    """Part rows by a field, in the order in which they come."""
+    parts: dict[str, list[Any]] = {}
+    for row in rows:
+        parts.setdefault(getattr(row, field), []).append(row)
+    return parts
+
 
 _OUTLINE: dict[str, Any] = {
     "color": "red",
@@ -23,32 +50,24 @@ _OUTLINE: dict[str, Any] = {
 }
 
 
-def stability_map(found: Any, path: str | Path | None = None) -> Figure:
+@_chart
+def stability_map(found: Any) -> Figure:
     """Draw where an explicit method stays bounded over stiffness and steps per period, under the boundary of theory.
 
     Args:
         found: A record with `kappa` [K] and `steps` [S], both ascending, `stable` [S, K], and `least_steps` [K], the
             boundary.
-        path: Where to write it, if anywhere; the ending chooses the format.
-
-    Raises:
-        ValueError: If the path does not end as a picture does.
     """
-    if path is not None:
-        check_format(path)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.2, 3.8), layout="constrained")
-        axes = figure.subplots()
-        axes.set(xscale="log", yscale="log", xlabel=r"$\kappa$", ylabel="RK4 steps per period")
-        axes.pcolormesh(found.kappa, found.steps, found.stable, cmap="Blues_r", vmin=-1, vmax=1.5, rasterized=True)
-        axes.plot(found.kappa, found.least_steps, **_OUTLINE)
-        axes.set(xlim=found.kappa[[0, -1]], ylim=found.steps[[0, -1]])
-        shades = (Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4))
-        handles = [*shades, Line2D([], [], **_OUTLINE)]
-        texts = ["bounded", "blown up within 50 periods", "theory"]
-        figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(5.2, 3.8), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xscale="log", yscale="log", xlabel=r"$\kappa$", ylabel="RK4 steps per period")
+    axes.pcolormesh(found.kappa, found.steps, found.stable, cmap="Blues_r", vmin=-1, vmax=1.5, rasterized=True)
+    axes.plot(found.kappa, found.least_steps, **_OUTLINE)
+    axes.set(xlim=found.kappa[[0, -1]], ylim=found.steps[[0, -1]])
+    shades = (Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4))
+    handles = [*shades, Line2D([], [], **_OUTLINE)]
+    texts = ["bounded", "blown up within 50 periods", "theory"]
+    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
     return figure
 
 
@@ -82,39 +101,29 @@ _LEAST = 1.0  # fewer are drawn as so many: there is no better and worse among t
 _LABEL_GAP = 0.052  # between labels, of the height of a panel
 
 
-def work_precision(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
+@_chart
+def work_precision(rows: Iterable[Any]) -> Figure:
     """Draw error against cost, a panel a scene: down and left is better, the grey stairs are what can be had.
 
     Args:
         rows: Records with scene, measure ("state", "power", "gradient"), method, us (microseconds per cell-period),
             error and noise (its standard error, of averages), in the order of panels and of settings. An infinite
             error is drawn as a cross on the upper edge.
-        path: Picture to write.
-
-    Raises:
-        ValueError: A format that is none.
     """
-    if path is not None:
-        check_format(path)
-    scenes: dict[str, list[Any]] = {}
-    for row in rows:
-        scenes.setdefault(row.scene, []).append(row)
+    scenes = _by(rows, "scene")
     columns = min(_COLUMNS, len(scenes))
     lines = math.ceil(len(scenes) / columns)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.4 * columns, 3.0 * lines + 0.3), layout="constrained")
-        grid = figure.subplots(lines, columns, squeeze=False)
-        span = _decades([row.us for panel in scenes.values() for row in panel])
-        for axes, panel in itertools.zip_longest(grid.flat, scenes.items()):
-            if panel is None:
-                axes.set_visible(False)
-            else:
-                axes.set_xlim(span)
-                _work_panel(axes, *panel)
-        figure.suptitle(_HOW_TO_READ, fontsize="medium")
-        figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(3.4 * columns, 3.0 * lines + 0.3), layout="constrained")
+    grid = figure.subplots(lines, columns, squeeze=False)
+    span = _decades([row.us for panel in scenes.values() for row in panel])
+    for axes, panel in itertools.zip_longest(grid.flat, scenes.items()):
+        if panel is None:
+            axes.set_visible(False)
+        else:
+            axes.set_xlim(span)
+            _work_panel(axes, *panel)
+    figure.suptitle(_HOW_TO_READ, fontsize="medium")
+    figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
     return figure
 
 
@@ -195,42 +204,32 @@ def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
 _TAILS_COLUMNS = 4
 
 
-def tails(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
+@_chart
+def tails(rows: Iterable[Any]) -> Figure:
     """Draw the errors of each method over the cells of a plane against its cost, a panel a method, others in grey.
 
     Args:
         rows: Those of `tails.Row`, in the order of settings; of one rounding, the level below which no float64 comes.
-        path: Picture to write.
-
-    Raises:
-        ValueError: A format that is none.
     """
-    if path is not None:
-        check_format(path)
-    methods: dict[str, list[Any]] = {}
-    for row in rows:
-        methods.setdefault(row.method, []).append(row)
+    methods = _by(rows, "method")
     (rounding,) = methods.pop("one rounding")
     lines = math.ceil(len(methods) / _TAILS_COLUMNS)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.6, 2.3 * lines + 0.3), layout="constrained")
-        grid = figure.subplots(lines, _TAILS_COLUMNS, sharex=True, sharey=True, squeeze=False)
-        costs = [row.us for some in methods.values() for row in some]
-        grid[0, 0].set(xscale="log", yscale="log", xlim=(min(costs) / 2, max(costs) * 2), ylim=(_ROUNDING, 30))
-        for axes, one in itertools.zip_longest(grid.flat, methods.items()):
-            if one is None:
-                axes.set_visible(False)
-                continue
-            for other, some in methods.items():
-                if other != one[0]:
-                    _tail(axes, some, "0.85", 0.0)
-            axes.axhline(rounding.most, color="0.4", linewidth=0.7, linestyle=":")
-            _tail(axes, one[1], _METHODS[one[0]][0], 0.25)
-            axes.set_title(one[0], fontsize=9)
-        figure.supxlabel("microseconds of core time per cell-period, warm", fontsize="medium")
-        figure.supylabel("error of the state after 3 periods", fontsize="medium")
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(9.6, 2.3 * lines + 0.3), layout="constrained")
+    grid = figure.subplots(lines, _TAILS_COLUMNS, sharex=True, sharey=True, squeeze=False)
+    costs = [row.us for some in methods.values() for row in some]
+    grid[0, 0].set(xscale="log", yscale="log", xlim=(min(costs) / 2, max(costs) * 2), ylim=(_ROUNDING, 30))
+    for axes, one in itertools.zip_longest(grid.flat, methods.items()):
+        if one is None:
+            axes.set_visible(False)
+            continue
+        for other, some in methods.items():
+            if other != one[0]:
+                _tail(axes, some, "0.85", 0.0)
+        axes.axhline(rounding.most, color="0.4", linewidth=0.7, linestyle=":")
+        _tail(axes, one[1], _METHODS[one[0]][0], 0.25)
+        axes.set_title(one[0], fontsize=9)
+    figure.supxlabel("microseconds of core time per cell-period, warm", fontsize="medium")
+    figure.supylabel("error of the state after 3 periods", fontsize="medium")
     return figure
 
 
@@ -251,38 +250,28 @@ def _tail(axes: Axes, rows: list[Any], colour: str, shade: float) -> None:
             axes.annotate(said, (row.us, min(height, 10)), (0, 4), textcoords="offset points", ha="center", fontsize=6)
 
 
-def labels(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
+@_chart
+def labels(rows: Iterable[Any]) -> Figure:
     """Draw how many cells get another label, or none, against what a cell costs.
 
     Args:
         rows: Those of `tails.LabelRow`, in the order of settings.
-        path: Picture to write.
-
-    Raises:
-        ValueError: A format that is none.
     """
-    if path is not None:
-        check_format(path)
-    methods: dict[str, list[Any]] = {}
-    for row in rows:
-        methods.setdefault(row.method, []).append(row)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.6, 3.2), layout="constrained")
-        axes = figure.subplots()
-        axes.set(xscale="log", xlabel="microseconds of core time a cell, warm", ylabel="cells, %", ylim=(-3, 103))
-        axes.grid(color="0.9", linewidth=0.4)
-        for method, some in methods.items():
-            colour, style = _METHODS[method]
-            cost = [row.us for row in some]
-            wrong = [100 * row.wrong / row.cells for row in some]
-            either = [100 * (row.wrong + row.undecided) / row.cells for row in some]
-            axes.plot(cost, wrong, color=colour, linestyle=style, marker="o", markersize=4, linewidth=1, label=method)
-            axes.plot(cost, either, color=colour, marker="o", markersize=5, linestyle="none", fillstyle="none")
-        axes.plot([], [], color="0.3", marker="o", markersize=4, linestyle="none", label="another label")
-        axes.plot([], [], color="0.3", marker="o", markersize=5, linestyle="none", fillstyle="none", label="or none")
-        axes.legend(fontsize=7, frameon=False)
-        if path is not None:
-            save_figure(figure, path)
+    methods = _by(rows, "method")
+    figure = Figure(figsize=(5.6, 3.2), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xscale="log", xlabel="microseconds of core time a cell, warm", ylabel="cells, %", ylim=(-3, 103))
+    axes.grid(color="0.9", linewidth=0.4)
+    for method, some in methods.items():
+        colour, style = _METHODS[method]
+        cost = [row.us for row in some]
+        wrong = [100 * row.wrong / row.cells for row in some]
+        either = [100 * (row.wrong + row.undecided) / row.cells for row in some]
+        axes.plot(cost, wrong, color=colour, linestyle=style, marker="o", markersize=4, linewidth=1, label=method)
+        axes.plot(cost, either, color=colour, marker="o", markersize=5, linestyle="none", fillstyle="none")
+    axes.plot([], [], color="0.3", marker="o", markersize=4, linestyle="none", label="another label")
+    axes.plot([], [], color="0.3", marker="o", markersize=5, linestyle="none", fillstyle="none", label="or none")
+    axes.legend(fontsize=7, frameon=False)
     return figure
 
 
@@ -296,31 +285,23 @@ _VERDICTS = {"smooth": "#1f77b4", "window": "#ff7f0e", "attractors": "#9467bd", 
 _BEST, _WORST = 1e-5, 1e7  # errors of derivatives: better ones are drawn at the edge, worse ones not
 
 
-def averages(rows: Iterable[Any], path: str | Path | None = None) -> Figure:
+@_chart
+def averages(rows: Iterable[Any]) -> Figure:
     """Draw five panels: errors by method, cells against larger fits, the edge of chaos, a crisis, what errors miss.
 
     Args:
         rows: Those of `averages.Row`.
-        path: Picture to write.
-
-    Raises:
-        ValueError: A format that is none.
     """
-    if path is not None:
-        check_format(path)
     parts: dict[str, list[Any]] = {part: [] for part in _PANELS}
     for row in rows:
         parts[row.part].append(row)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8.2, 9.6), layout="constrained")
-        places = [figure.add_subplot(3, 2, number) for number in range(1, len(_PANELS) + 1)]
-        for axes, (part, draw) in zip(places, _PANELS.items(), strict=True):
-            axes.grid(color="0.9", linewidth=0.4)
-            axes.set_axisbelow(True)
-            if parts[part]:
-                draw(axes, parts[part])
-        if path is not None:
-            save_figure(figure, path)
+    figure = Figure(figsize=(8.2, 9.6), layout="constrained")
+    places = [figure.add_subplot(3, 2, number) for number in range(1, len(_PANELS) + 1)]
+    for axes, (part, draw) in zip(places, _PANELS.items(), strict=True):
+        axes.grid(color="0.9", linewidth=0.4)
+        axes.set_axisbelow(True)
+        if parts[part]:
+            draw(axes, parts[part])
     return figure
 
 

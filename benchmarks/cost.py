@@ -23,7 +23,6 @@ Printout for 64 x 64 cells and 50 periods, two cores, on a busy machine:
 """
 
 import argparse
-import csv
 import os
 import statistics
 import time
@@ -36,6 +35,7 @@ import jax
 import numpy as np
 
 import vijax
+from benchmarks import tables
 from benchmarks.speed import HERE, U0, V0, R, Row, axes
 
 FREQUENCIES = 8
@@ -114,12 +114,9 @@ def main() -> None:
     given = parser.parse_args()
 
     print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, JAX {jax.__version__}")
-    given.rows.mkdir(parents=True, exist_ok=True)
-    with (given.rows / f"cost{'_quick' if given.quick else ''}.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow([*Row._fields, "us_per_cell_period"])
-        for row in measure(32, 10, 3) if given.quick else measure(128, 100, 5):
-            table.writerow([*row, row.cell_period])
+    rows = measure(32, 10, 3) if given.quick else measure(128, 100, 5)
+    told = ([*row, row.cell_period] for row in rows)
+    tables.write(given.rows / f"cost{'_quick' if given.quick else ''}.csv", [*Row._fields, "us_per_cell_period"], told)
 
 
 if __name__ == "__main__":

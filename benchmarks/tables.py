@@ -15,13 +15,21 @@ MADE_BY = "made_by"
 """The last column: what made a row."""
 
 
-def write(path: Path, fields: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write rows as they come, so that what was measured before a run is ended is there."""
+def write(path: Path, fields: Sequence[str], rows: Iterable[Sequence[Any]], kept: Iterable[Sequence[Any]] = ()) -> None:
+    """Write rows as they come, so that what was measured before a run is ended is there.
+
+    Args:
+        path: The file.
+        fields: Names of the columns, without what made the rows.
+        rows: What this run measures.
+        kept: Rows that `read` gave of an earlier run; they stand first, with what made them then.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     maker = made_by()
     with path.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow([*fields, MADE_BY])
+        table.writerows(kept)
         for row in rows:
             table.writerow([*row, maker])
             file.flush()

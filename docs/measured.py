@@ -152,5 +152,5 @@ def _percent(part: float, whole: float) -> str:
 def _made_by(path: Path) -> str:
     """Name what made the rows of a file."""
     rows = tables.read(path)
-    makers = dict.fromkeys(getattr(row, tables.MADE_BY, None) or row.machine for row in rows)
+    makers = dict.fromkeys(row.made_by for row in rows)
     return f"Rows: `benchmarks/rows/{path.name}`, by {' and '.join(makers)}.\n"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks import averages, charts
+from benchmarks import averages, charts, tables
 
 ROWS = [
     averages.Row("cells", "0", "ensemble", "kappa", 4096, -2.01, 0.02, -2.0, 0.01, "smooth"),
@@ -19,10 +19,17 @@ ROWS = [
 ]
 
 
-def test_rows_are_read_as_they_were_written(tmp_path):
-    averages.write(tmp_path / "averages.csv", ROWS)
-    assert averages.read(tmp_path / "averages.csv") == ROWS
-    assert averages.read(tmp_path / "none.csv") == []
+def test_a_part_that_is_measured_again_leaves_the_others_as_they_were(tmp_path, monkeypatch):
+    file = tmp_path / "averages.csv"
+    tables.write(file, averages.Row._fields, ROWS)
+    file.write_text(file.read_text().replace("JAX ", "JAX of another year "))
+    fresh = ROWS[-1]._replace(value=1.02)
+    monkeypatch.setitem(averages.PARTS, "missed", lambda count: iter([fresh]))
+    monkeypatch.setattr("sys.argv", ["averages.py", "--only", "missed", "--rows", str(tmp_path)])
+    averages.main()
+    found = tables.read(file)
+    assert [averages.Row(*row[:-1]) for row in found] == [*ROWS[:-1], fresh]
+    assert ["another year" in row.made_by for row in found] == [True] * (len(ROWS) - 1) + [False]
 
 
 def test_cells_are_counted_with_both_errors_and_by_verdict(capsys):

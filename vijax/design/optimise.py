@@ -4,26 +4,23 @@
 Where a trial leaves its branch, loses stability or breaks a constraint, it is cut back (`ascent`).
 """
 
-import itertools
 import logging
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax.design import aperiodic_search, long_flight, off_design
+from vijax.design import aperiodic_search, long_flight, off_design, orbit_ascents
 from vijax.design import objective as aims
-from vijax.design.ascent import Box, Climb, ascend, converged
 from vijax.design.design_settings import DEFAULT, DesignSettings, check_settings
 from vijax.design.ensemble import Task
-from vijax.design.multistart import Begun, Effort, Looked, balls, every_start, find
+from vijax.design.multistart import Effort, Looked, balls, every_start, find
 from vijax.design.objective import OBJECTIVES, Batch, Scene
-from vijax.design.optimum import AnyOptimum, AperiodicOptimum, End, Optimum, verified
+from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.promise import Met
 from vijax.design.tolerance import Nodes, Spread, Tolerance, check_samples, check_tolerances, nodes
 from vijax.design.variables import NAMES, check_names, limits, values, variables
@@ -31,17 +28,12 @@ from vijax.model.choices import Motion, Objective
 from vijax.model.device import Harvester, one_device
 from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
-from vijax.runtime import checks, context, tiles
+from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
-from vijax.runtime.programs import jitted
 
 OVER_TOLERANCES = ("mean", "worst")
 _LOG = logging.getLogger(__name__)
-_WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most there may be
-# Starts of one compiled call. Those that end soon wait for the others, in Newton's search as in the ascent, and the
-# equations of more than a few orbits of 16 impacts leave the first cache: calls of 16 take 1.4 times as long.
-_TILE = 4
 _MOST_EVALUATIONS, _MOST_POINTS, _MOST_IMPACTS = 10**5, 10**7, 256
 _BALL = 1000  # bytes that a survey keeps of a ball
 # Balls of a survey, at most, of devices that are designed together: memory does not grow with devices beyond these.
@@ -237,19 +229,12 @@ def _sought(task: Task, far: Effort, cloud: Nodes, max_evaluations: int, orbits_
     else:
         begun, met, looked = find(task.devices, task.tune, task.box, task.objective, far, orbits_alone=orbits_alone)
         ascents = np.bincount(begun.owner, minlength=count).tolist()
-        orbits = _on_orbits(task, begun, cloud, max_evaluations)
+        orbits = orbit_ascents.search(task, begun, cloud, max_evaluations)
     beyond = [None] * count if orbits_alone else _beyond(task, met, orbits)
     return [
         _Found(tuple(own) if other is None else (other, *own), *seen)
         for other, own, seen in zip(beyond, orbits, zip(looked, ascents, strict=True), strict=True)
     ]
-
-
-def _on_orbits(task: Task, starts: Begun, cloud: Nodes, max_evaluations: int) -> list[list[Optimum]]:
-    """Climb along the orbits of every device; give its optima, the best first."""
-    scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), task.tune, cloud.names, task.objective)
-    ends = _climbed(scene, starts, task.box, max_evaluations, task.settings)
-    return verified(scene, starts, ends, task.devices, max_evaluations, task.settings)
 
 
 def _beyond(task: Task, met: Met, orbits: list[list[Optimum]]) -> list[AperiodicOptimum | None]:
@@ -343,53 +328,3 @@ def check_motion(motion: str, objective: str, reliability: float) -> float:
             see("design", f"reliability must be 1 unless the objective is expected; got {share:g} with {objective!r}")
         )
     return share
-
-
-@lru_cache(maxsize=8)
-def _compiled(max_evaluations: int, settings: DesignSettings):
-    def climb(scene: Scene, batch: Batch) -> Climb:
-        box = Box(batch.low, batch.high, settings.max_step)
-        look = partial(aims.look, scene, batch)
-        return ascend(look, batch.z, aims.begin(scene, batch), box, max_evaluations, settings)
-
-    return jitted(climb, often=True)
-
-
-def _climbed(scene: Scene, starts: Begun, box: np.ndarray, max_evaluations: int, settings: DesignSettings) -> list[End]:
-    """Climb from every start, in padded tiles on every core: orbits of few impacts and of many apart."""
-    count, work = (starts.flown.side != 0).sum(axis=1), _compiled(max_evaluations, settings)
-    ends: list[End | None] = [None] * count.size
-
-    def part(some: np.ndarray, width: int, tile: tiles.Tile) -> None:
-        rows = some[tile.rows]
-        own, bounds = starts.some(rows), box[starts.owner[rows]].swapaxes(0, 1)
-        begun = (jnp.asarray(x) for x in (own.flown.knots[:, :width], own.z, *bounds))
-        end = work(scene, Batch(jax.tree.map(jnp.asarray, own.device), own.flown.sequence(width), *begun))
-        seen, lost, settled, taken = (
-            jax.tree.map(np.asarray, x) for x in (end.seen, end.lost, converged(end), end.evaluations)
-        )
-        path, heights, z = np.asarray(end.path), np.asarray(end.heights), np.asarray(end.z)
-        for row, index in enumerate(rows[: tile.real]):
-            ends[index] = End(
-                z[row],
-                float(np.exp(seen.value[row])) if seen.there[row] else np.nan,
-                seen.gradient[row],
-                seen.margins[row],
-                seen.memory.knots[row, 0],
-                bool(lost[row]),
-                bool(settled[row]),
-                int(taken[row]),
-                path[:, row],
-                heights[:, row],
-            )
-
-    jobs = []
-    most = starts.flown.side.shape[1]
-    widths = [0, *(width for width in _WIDTHS if width < most), most]
-    # The widest first, for they take longest: no core is left with one of them at the end.
-    for width, few in itertools.pairwise(reversed(widths)):
-        some = np.flatnonzero((count > few) & (count <= width))
-        jobs += [(some, width, tile) for tile in tiles.tiles(some.size, (_TILE,))]
-    with context.pool(tiles.workers()) as pool:
-        list(pool.map(lambda job: part(*job), jobs))
-    return [end for end in ends if end is not None]

@@ -4,11 +4,8 @@
 """
 
 import logging
-import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -17,18 +14,17 @@ import numpy as np
 from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
 from vijax.model.device import Harvester, one_device
 from vijax.model.membrane import HuntCrossley, Law
-from vijax.planes import cluster, dispatch, estimate, tile_size, tiled_store
+from vijax.planes import cluster, dispatch, estimate, store_filling, tile_size, tiled_store
 from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, Cells, cells
-from vijax.planes.dataset import DEFAULT, SweepPlan, label, variables, warn_if_held
-from vijax.planes.dispatch import Call, Fields
+from vijax.planes.dataset import DEFAULT, SweepPlan, label, warn_if_held
+from vijax.planes.dispatch import Fields
 from vijax.planes.outputs import ON_REQUEST, OUTPUTS
 from vijax.planes.store import check_store, load, save, view
 from vijax.planes.sweep_settings import SweepSettings
-from vijax.runtime import checks, context
+from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
-from vijax.runtime.tiles import places
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -242,9 +238,9 @@ def _run(
         save(_refined(planned, tell), out, overwrite=overwrite)
         return view(out)
     if workers is None and not out.exists():
-        _compile_ahead(planned)
+        store_filling.compile_ahead(planned)
     with tiled_store.opened(planned, out, overwrite) as plane:
-        _fill(plane, tell, workers)
+        store_filling.fill(plane, tell, workers)
     return view(out)
 
 
@@ -327,67 +323,3 @@ def _refined(planned: SweepPlan, tell: Callable[[int, int], None]) -> "xr.Datase
         "refine_shown": of.count,
     }
     return dataset
-
-
-def _compile_ahead(planned: SweepPlan) -> None:
-    """Begin to compile what the tiles of a new store need: XLA needs no Python, and importing zarr a core."""
-    most = math.prod(tiled_store.blocks(planned.cells).values())
-    whole = Call(planned, np.arange(min(most, planned.count)), dispatch.rows_for(most), 0)
-    context.pool(1).submit(dispatch.prepare, whole, places()[0])
-
-
-def _fill(plane: tiled_store.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:
-    """Simulate and write the tiles of a study that are not done."""
-    left = tiled_store.left(plane, _LOG.warning)
-    total = plane.planned.count
-    done = total - sum(map(plane.count, left))
-    tiles = map(plane.tile, left)
-    try:
-        tell(done, total)
-        # Closed at once whatever happens, or workers would go on for as long as somebody holds the error.
-        with closing(_made(tiles, dispatch.rows_for(plane.most), workers)) as made:
-            for tile in made:
-                done += tile.planned.count
-                tell(done, total)
-    except (KeyboardInterrupt, OSError) as error:
-        error.add_note(f"{done:,} of {total:,} cells are in {plane.path}; the same command goes on from there")
-        raise
-
-
-def _made(
-    tiles: Iterable[tiled_store.StudyTile], rows: int, workers: cluster.Workers | None
-) -> Generator[tiled_store.StudyTile, None, None]:
-    """Yield tiles as they are done, by whomever."""
-    if workers is None:
-        yield from _here(tiles, rows)
-    else:
-        yield from cluster.done(partial(_make, rows), tiles, workers)
-
-
-def _here(tiles: Iterable[tiled_store.StudyTile], rows: int) -> Iterator[tiled_store.StudyTile]:
-    """Yield tiles, simulated and written by this process, as they are done."""
-    running: dict[int, tiled_store.StudyTile] = {}
-
-    def one_each() -> Iterator[Call]:
-        for tile in tiles:
-            running[tile.number] = tile
-            yield _whole(tile, rows)
-
-    with closing(dispatch.in_turn(one_each())) as ended:
-        for call, found, seconds in ended:
-            tiled_store.write(running[call.number], variables(call.planned, found), seconds)
-            yield running.pop(call.number)
-
-
-@door
-def _make(rows: int, tile: tiled_store.StudyTile) -> None:
-    """Simulate and write a tile, in a worker, on its first device."""
-    call, place = _whole(tile, rows), places()[0]
-    dispatch.prepare(call, place)
-    found, seconds = dispatch.perform(call, place)
-    tiled_store.write(tile, variables(tile.planned, found), seconds)
-
-
-def _whole(tile: tiled_store.StudyTile, rows: int) -> Call:
-    """Make the call for all cells of a tile of a study."""
-    return Call(tile.planned, np.arange(tile.planned.count), rows, tile.number)
