@@ -20,7 +20,7 @@ import xarray as xr
 
 from tests.helpers import stand_in
 from vijax.batch import simulate
-from vijax.planes import cluster, tiled_store
+from vijax.planes import cluster, store_filling, tiled_store
 from vijax.planes import sweep as sweeps
 from vijax.planes.sweep import load, sweep
 
@@ -136,7 +136,7 @@ def test_a_tile_that_is_written_late_does_not_spoil_another_plane(folder):
         late = plane.tile(0)
     whole = sweep(**AXES, r=0.4, out="map.zarr", overwrite=True).load()
     with pytest.raises(FileExistsError, match="no longer the store that tile 0"):
-        sweeps._make(1024, late)
+        store_filling.fill_tile(1024, late)
     xr.testing.assert_identical(load("map.zarr"), whole)
 
 

@@ -50,7 +50,7 @@ def _made(
     if workers is None:
         yield from _here(tiles, rows)
     else:
-        yield from cluster.done(partial(_make, rows), tiles, workers)
+        yield from cluster.done(partial(fill_tile, rows), tiles, workers)
 
 
 def _here(tiles: Iterable[tiled_store.StudyTile], rows: int) -> Iterator[tiled_store.StudyTile]:
@@ -69,7 +69,7 @@ def _here(tiles: Iterable[tiled_store.StudyTile], rows: int) -> Iterator[tiled_s
 
 
 @door
-def _make(rows: int, tile: tiled_store.StudyTile) -> None:
+def fill_tile(rows: int, tile: tiled_store.StudyTile) -> None:
     """Simulate and write a tile, in a worker, on its first device."""
     call, place = _whole(tile, rows), places()[0]
     dispatch.prepare(call, place)
