@@ -30,6 +30,7 @@ def write(path: Path, fields: Sequence[str], rows: Iterable[Sequence[Any]], kept
         table = csv.writer(file)
         table.writerow([*fields, MADE_BY])
         table.writerows(kept)
+        file.flush()
         for row in rows:
             table.writerow([*row, maker])
             file.flush()
