@@ -42,6 +42,7 @@ def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     batch = jnp.where(counted & ~tracing, _batch_of(plan, settings, cell, impact), cell.batch)
     # A batch that has ended is squared away before the first impact of the next is added.
     turned = counted & ~tracing & (batch != cell.batch) & (cell.batch >= 0)
+    batch, turned = share((batch, turned))
     tally = _add(settings, cell, impact, counted, turned, event.stuck)
     if tally.deepest is not None:
         # A contact for ever has a depth although no impact ends it.
@@ -89,7 +90,7 @@ def _add(settings: Settings, cell: Cell, impact: LaneImpact, counted: Mask, turn
     """Add one impact to the tally."""
     old = cell.tally
     left, right = counted & (impact.side < 0), counted & (impact.side > 0)
-    rebound = -impact.v_out / jnp.where(impact.v_in == 0, 1.0, impact.v_in)
+    rebound = share(-impact.v_out / jnp.where(impact.v_in == 0, 1.0, impact.v_in))
     speed = jnp.where(counted, jnp.abs(impact.v_in), 0.0)
     harvest = None if old.harvest is None else _harvested(settings, cell, old.harvest, impact, counted, turned)
     momentum = deepest = None
@@ -118,7 +119,7 @@ def _harvested(
     metres = (present(impact.depth) * cell.length)[:, None] * settings.length_variant
     speeds = cell.speed[:, None] * settings.speed_variant
     device = settings.device if cell.device is None else jax.tree.map(lambda x: x[:, None], cell.device)
-    got = energy.harvested_energy(device, metres)
+    got = share(energy.harvested_energy(device, metres))
     given = device.m_b * speeds * speeds * present(impact.work)[:, None]
     wide, ended = counted[:, None], turned[:, None]
     return Harvest(

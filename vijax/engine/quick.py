@@ -77,8 +77,10 @@ def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: L
     passed = jnp.floor(0.5 * leave)
     work = None
     if deep:
-        signed = onset.v_in, -onset.side * out
-        work = energy.membrane_work(wall.kappa, 2 * wall.zeta, gamma, onset.side, onset.t, duration, *signed)
+        # `touch` is sure of no short contact, and the flight knows the forcing at its end.
+        c, q = -flight.sine, flight.cosine
+        force = c, q, c if wall.incline is None else c - onset.side * gamma
+        work = energy.long_contact_work(wall.kappa, 2 * wall.zeta, force, duration, (flight.speed, -out))
     h = left.decay * left.sine / wall.omega1
     slope = left.decay * left.cosine - wall.zeta * h
     contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)

@@ -20,6 +20,9 @@ from vijax.runtime.xla import share, shared
 # Rounds in single precision towards the exit and the crest, after the first step from the reference. With fewer, the
 # step in double precision that follows is too long more often, and the lane is declined: it costs time and no digits.
 _EXIT_ROUNDS, _CREST_ROUNDS = 2, 2
+# The last step to the crest may be such a part of the last one to the exit: the depth is then off by three roundings at
+# most. After a longer one its digits go, and with less more lanes are declined.
+_CREST_STEP = 1 / 8
 
 
 def _course(entry: "_Entry", cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> ContactCourse:
@@ -248,7 +251,7 @@ def _rough_exit(
 @shared
 def _crest_course(wall: SoftWall, entry: _Entry) -> ContactCourse:
     """Rotate the contact to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
-    cosine, sine = wall.zeta / wall.kappa, wall.omega1 / wall.kappa
+    cosine, sine = share((wall.zeta / wall.kappa, wall.omega1 / wall.kappa))
     free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
     return _course(entry, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
 
@@ -280,8 +283,8 @@ def _rough_crest(
     reached = in_reach(wall, s)
     for _ in range(_CREST_ROUNDS):
         at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
-        step = householder(at.rate, at.push, at.jerk, _snap(wall, at))
-        s, step = share((s + step, step))
+        step = share(householder(at.rate, at.push, at.jerk, _snap(wall, at)))
+        s = share(s + step)
         reached = reached & in_reach(wall, s)
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
     converged = reached & (stiffness * jnp.abs(step) < DOUBT) & (at.push < 0)
@@ -319,13 +322,14 @@ def _rough_crest(
 
 
 def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
-    """Find the greatest depth, and whether `crest`, its rough time from the free contact's, was close enough for it."""
-    at = share(motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype)))
-    fourth = _snap(wall, at)
-    step = share(householder(at.rate, at.push, at.jerk, fourth))
-    depth = entry.penetration(at) + step * (
-        at.rate + step * (0.5 * at.push + step * ((1 / 6) * at.jerk + step * (1 / 24) * fourth))
-    )
-    # The depth is stationary, and its Taylor polynomial of fifth order: a coarser time than the exit's will do.
-    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
-    return depth, stiffness * jnp.abs(step) < 16 * converged_step(jnp.finfo(depth.dtype).eps)
+    """Find the greatest depth, and whether `crest`, its rough time from the free contact's, was close enough for it.
+
+    The depth is stationary: with Newton's step h to the crest, w + h w'/2 misses it by terms of h^3 alone.
+    """
+    at = motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype))
+    # No more of the state is stored: each value that is takes a pass of its own.
+    depth, rate, push, jerk = share((entry.penetration(at), at.rate, at.push, at.jerk))
+    step = share(-rate / push)
+    close = _CREST_STEP * converged_step(jnp.finfo(depth.dtype).eps)
+    near = (wall.omega1 * jnp.abs(step) < close) & (jnp.abs(jerk * step) < close * jnp.abs(push))
+    return depth + 0.5 * step * rate, near

@@ -105,7 +105,7 @@ def membrane_work_rigid(v_in: Values, r: Values) -> Values:
 
 
 # A contact with max(kappa, pi) duration below the reach is measured through its velocity's Hermite polynomial.
-_SHORT_REACH = 0.25
+SHORT_REACH = 0.25
 _MATCHED = 4  # derivatives of the velocity that the polynomial matches at either end, the velocity itself included
 
 
@@ -157,6 +157,42 @@ def _squared_speed_short(
     return half * sum(squares)
 
 
+def _long_work(
+    kappa: Values, mu: Values, force: tuple[Values, ...], turn: tuple[Values, ...], z: tuple[Values, Values]
+) -> Values:
+    """Compute what `membrane_work` does by its closed form, which cancels in short contacts.
+
+    Args:
+        kappa, mu: The pair's.
+        force: The forcing c cos(pi s) - q sin(pi s) - g as c, q and its value at the onset, c - g.
+        turn: Sine, cosine, versine and lag of the duration.
+        z: Velocity w' at onset and at exit.
+    """
+    (c, q, onset), (sin_s, cos_s, versine, lag), (z_in, z_out) = force, turn, z
+    cos_f = onset * sin_s + 0.5 * (c * (lag - sin_s * versine) - q * sin_s * sin_s)
+    sin_f = onset * versine - 0.5 * (c * versine * versine + q * (lag + sin_s * versine))
+    cos_side, sin_side = cos_f / PI - (cos_s * z_out - z_in), sin_f / PI - sin_s * z_out
+    stiffness, loss = (kappa - PI) * (kappa + PI), mu * PI
+    square = stiffness * stiffness + loss * loss
+    drift = c * (stiffness * sin_side + loss * cos_side) + q * (stiffness * cos_side - loss * sin_side)
+    # At the undamped resonance (square = 0) the answer is zero by mu.
+    return 0.5 * (z_in - z_out) * (z_in + z_out) + PI * drift / jnp.where(square > 0, square, 1.0)
+
+
+def long_contact_work(
+    kappa: Values, mu: Values, force: tuple[Values, ...], duration: Values, z: tuple[Values, Values]
+) -> Values:
+    """Compute what `membrane_work` does of contacts that are not short and whose forcing is known: half the arithmetic.
+
+    Args:
+        kappa, mu: The pair's.
+        force: The forcing c cos(pi s) - q sin(pi s) - g as c, q and its value at the onset, c - g.
+        duration: Time from onset to exit; max(kappa, pi) duration is at least `SHORT_REACH`.
+        z: Velocity w' at onset and at exit.
+    """
+    return jnp.where(mu > 0, _long_work(kappa, mu, force, half_turn(duration), z), 0.0)
+
+
 @door
 @once
 def membrane_work(
@@ -196,21 +232,14 @@ def membrane_work(
     """
     side = jnp.asarray(side, v_in.dtype)
     sin_0, cos_0, _, _ = half_turn(t_in)
-    sin_s, cos_s, versine, lag = half_turn(duration)
+    turn = half_turn(duration)
+    sin_s, cos_s, _, _ = turn
     c, q, steady = side * cos_0, side * sin_0, side * gamma
     z_in, z_out = side * v_in, side * v_out
     onset = c - steady
+    work_long = _long_work(kappa, mu, (c, q, onset), turn, (z_in, z_out))
 
-    cos_f = onset * sin_s + 0.5 * (c * (lag - sin_s * versine) - q * sin_s * sin_s)
-    sin_f = onset * versine - 0.5 * (c * versine * versine + q * (lag + sin_s * versine))
-    cos_side, sin_side = cos_f / PI - (cos_s * z_out - z_in), sin_f / PI - sin_s * z_out
-    stiffness, loss = (kappa - PI) * (kappa + PI), mu * PI
-    square = stiffness * stiffness + loss * loss
-    drift = c * (stiffness * sin_side + loss * cos_side) + q * (stiffness * cos_side - loss * sin_side)
-    # At the undamped resonance (square = 0) the answer is zero by mu.
-    work_long = 0.5 * (z_in - z_out) * (z_in + z_out) + PI * drift / jnp.where(square > 0, square, 1.0)
-
-    short = jnp.maximum(kappa, PI) * duration < _SHORT_REACH
+    short = jnp.maximum(kappa, PI) * duration < SHORT_REACH
     half = 0.5 * jnp.where(short, duration, 0.0)
     sin_e, cos_e = c * sin_s + q * cos_s, c * cos_s - q * sin_s
     ends = (
