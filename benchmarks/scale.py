@@ -74,10 +74,10 @@ class Run(NamedTuple):
 def study(side: int, settings: str, cores: int, workers: int | None = None, engine: bool = True) -> Run:
     """Run one study, on so many cores of this machine."""
     confine(cores)
-    import vijax
+    from vijax.batch import simulate
 
     if not engine:
-        vijax.batch.simulate.summarise = idle
+        simulate.summarise = idle
     with tempfile.TemporaryDirectory() as folder:
         if workers is None:
             sweep(min(side, _WARM), settings, Path(folder) / "warm.zarr")
@@ -148,9 +148,9 @@ def inventory(out: Path) -> tuple[int, int, int]:
 def resume(side: int) -> float:
     """Measure the seconds a tile to find that a finished store is whole."""
     confine(1)
-    import vijax
+    from vijax.batch import simulate
 
-    vijax.batch.simulate.summarise = idle
+    simulate.summarise = idle
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "plane.zarr"
         sweep(side, "default", out)
