@@ -1,11 +1,12 @@
-"""A branch of periodic orbits as a curve in the space of knots and one parameter, and one step along it.
+"""A branch of periodic orbits as a path in the space of knots and one parameter, and one step along it or another path.
 
 The orbit's equations go on through grazing into orbits that are none (`shooting`). What makes an orbit real, and what
 marks a bifurcation, are smooth functions along the curve: its test functions.
 """
 
+from collections.abc import Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -68,21 +69,72 @@ class Arc(eqx.Module):
         """Give the pair at a value of the parameter."""
         return moved(self.pair, self.along, x, self.start, self.steepest)
 
+    def unpack(self, y):
+        """Split a point of the branch, or many along leading axes, into knots and parameter."""
+        return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (self.high - self.low)
 
-def unpack(arc: Arc, y):
-    """Split a point of the curve, or many along leading axes, into knots and parameter."""
-    return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (arc.high - arc.low)
+    def pair_and_knots(self, y) -> tuple[ImpactPair, shooting.Knots]:
+        """Give the orbits of points, many along a leading axis."""
+        knots, x = self.unpack(y)
+        return self.at(x), knots
+
+    def equations(self, y) -> shooting.LinearisedEquations:
+        """Compute the gap and its derivatives in knots and parameter."""
+        knots, x = self.unpack(y)
+        pair, moved = jax.jvp(self.at, (x,), (self.high - self.low,))
+        return shooting.linearise(pair, self.sequence, knots, moved)
+
+    def tests(self, y, tangent, former) -> Tests:
+        """Compute the test functions; which way the step was that led here does not matter to them."""
+        knots, x = self.unpack(y)
+        pair = self.at(x)
+        around = shooting.monodromy(pair, self.sequence, knots)
+        trace = around[0, 0] + around[1, 1]
+        determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
+        room = grazing.between(pair, self.sequence, knots).clearance
+        return Tests(
+            fold=tangent[-1],
+            plus=1 - trace + determinant,
+            minus=1 + trace + determinant,
+            speed=room.speed,
+            flight=room.flight,
+            contact=room.contact,
+            exit=room.exit,
+            low=x - self.low,
+            high=self.high - x,
+        )
 
 
-def _equations(arc: Arc, y) -> shooting.LinearisedEquations:
-    """Compute the gap and its derivatives in knots and parameter."""
-    knots, x = unpack(arc, y)
-    pair, moved = jax.jvp(arc.at, (x,), (arc.high - arc.low,))
-    return shooting.linearise(pair, arc.sequence, knots, moved)
+class Path(Protocol):
+    """What a lane follows: a branch (`Arc`), or a curve of bifurcations in two parameters (`curve_equations`).
+
+    Its points y are rows of unknowns, one more than there are equations.
+    """
+
+    @property
+    def newton_tolerance(self) -> float:
+        """Size of Newton's last correction."""
+
+    @property
+    def max_corrections(self) -> int:
+        """Corrections of a step at most."""
+
+    @property
+    def sequence(self) -> Sequence:
+        """Walls of the orbits."""
+
+    def pair_and_knots(self, y) -> tuple[ImpactPair, shooting.Knots]:
+        """Give the orbits of points, many along a leading axis."""
+
+    def equations(self, y) -> shooting.LinearisedEquations:
+        """Compute what is missing to a point, and the derivatives in all unknowns."""
+
+    def tests(self, y, tangent, former) -> Iterable[Array]:
+        """Compute the test functions at a point with its tangent, reached along a former tangent."""
 
 
 class _Corrected(NamedTuple):
-    """Newton's way back to the branch: the point, the tangent there, the size of the last correction, how many."""
+    """Newton's way back to the path: the point, the tangent there, the size of the last correction, how many."""
 
     y: Float[Array, "unknown"]
     tangent: Float[Array, "unknown"]
@@ -90,45 +142,25 @@ class _Corrected(NamedTuple):
     corrections: Int[Array, ""]
 
 
-def _correct(arc: Arc, guess, former) -> _Corrected:
+def _correct(path: Path, guess, former) -> _Corrected:
     """Correct by Newton in the plane across the former tangent, and find the tangent there."""
     ahead = jnp.zeros_like(guess).at[-1].set(1.0)
 
     def once(at: _Corrected) -> _Corrected:
-        gap, slope = _equations(arc, at.y)
+        gap, slope = path.equations(at.y)
         slope = jnp.concatenate([slope, former[None]])
         miss = jnp.append(gap, former @ (at.y - guess))
         step, tangent = jax.vmap(linear_solve.solve, in_axes=(None, 0))(slope, jnp.stack([miss, ahead]))
         return _Corrected(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.corrections + 1)
 
     def going(at: _Corrected):
-        return (at.size > arc.newton_tolerance) & (at.size < 1.0) & (at.corrections < arc.max_corrections)
+        return (at.size > path.newton_tolerance) & (at.size < 1.0) & (at.corrections < path.max_corrections)
 
     return lax.while_loop(going, once, _Corrected(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
 
 
-def _tests(arc: Arc, y, tangent) -> Tests:
-    knots, x = unpack(arc, y)
-    pair = arc.at(x)
-    around = shooting.monodromy(pair, arc.sequence, knots)
-    trace = around[0, 0] + around[1, 1]
-    determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
-    room = grazing.between(pair, arc.sequence, knots).clearance
-    return Tests(
-        fold=tangent[-1],
-        plus=1 - trace + determinant,
-        minus=1 + trace + determinant,
-        speed=room.speed,
-        flight=room.flight,
-        contact=room.contact,
-        exit=room.exit,
-        low=x - arc.low,
-        high=arc.high - x,
-    )
-
-
 class BranchPlace(NamedTuple):
-    """Points of branches, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
+    """Points of paths, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
 
     And how Newton came there: the size of its last correction, and how many it took.
     """
@@ -141,14 +173,15 @@ class BranchPlace(NamedTuple):
 
 
 @partial(jitted, often=True)
-def _compiled(arcs: Arc, y, tangent, length):
-    def one(arc, y, tangent, length):
-        at = _correct(arc, y + length * tangent, tangent)
-        return BranchPlace(at.y, at.tangent, jnp.stack(_tests(arc, at.y, at.tangent)), at.size, at.corrections)
+def _compiled(paths: Path, y, tangent, length):
+    def one(path, y, tangent, length):
+        at = _correct(path, y + length * tangent, tangent)
+        tests = jnp.stack([*path.tests(at.y, at.tangent, tangent)])
+        return BranchPlace(at.y, at.tangent, tests, at.size, at.corrections)
 
-    return jax.vmap(one)(arcs, y, tangent, length)
+    return jax.vmap(one)(paths, y, tangent, length)
 
 
-def advance(arcs: Arc, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
-    """Go on from points of branches by an arclength each: the compiled program behind every step and every search."""
-    return tiles.map_tiles(lambda rows: _compiled(*rows), (arcs, y, tangent, length), _BATCHES)
+def advance(paths: Path, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
+    """Go on from points of paths by an arclength each: the compiled program behind every step and every search."""
+    return tiles.map_tiles(lambda rows: _compiled(*rows), (paths, y, tangent, length), _BATCHES)

@@ -1,6 +1,6 @@
 """Branches of periodic orbits along a parameter, by pseudo-arclength continuation through folds, many at once.
 
-All lanes step together (`arclength_step`); what happened on the way is located afterwards (`events`).
+All lanes step together (`arclength_walk`); what happened on the way is located afterwards (`events`).
 """
 
 from typing import Any, Literal, NamedTuple
@@ -12,6 +12,7 @@ from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import periodic
 from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
+from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point, events, happenings, kind_of, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
@@ -136,45 +137,16 @@ def heading(place: BranchPlace, sign: float) -> BranchPlace:
 
 
 def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
-    """Follow one way from every start: all lanes together until none goes on; a step that does not do is halved."""
-    lanes, bend = first.y.shape[0], 1 - settings.min_cosine
-    passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]
-    y, tangent, tests = first.y, first.tangent, first.tests
-    length, going, closed = np.full(lanes, settings.first_step), np.full(lanes, True), np.full(lanes, False)
-    while going.any():
-        there = advance(arcs, y, tangent, length)
-        straight = (there.tangent * tangent).sum(axis=1)
-        # Newton may end on another branch, or far along this one: neither its direction nor its distance fits then.
-        near = np.linalg.norm(there.y - y, axis=1) < 2 * length
-        # Of two things within a step one may hide the other's change of sign, so that each gets a step of its own.
-        single = (happenings(tests, there.tests) <= 1) | (length < settings.crowded_step)
-        good = going & (there.size <= settings.newton_tolerance) & (straight > settings.min_cosine) & near & single
-        for lane in np.flatnonzero(good):
-            passed[lane].append((there.y[lane], there.tangent[lane], there.tests[lane], length[lane]))
-        easy = (there.corrections <= settings.easy_corrections) & (straight > 1 - settings.easy_bend * bend)
-        longer = np.where(easy, np.minimum(settings.growth * length, settings.max_step), length)
-        new = (there.y, there.tangent, there.tests)
-        y, tangent, tests = (np.where(good[:, None], *pair) for pair in zip(new, (y, tangent, tests), strict=True))
-        length = np.where(good, longer, 0.5 * length)
-        # Past a grazing or a bound there is no orbit. The first such point is kept: between it and the last is the end.
-        real = (tests[:, FIRST_END:] > 0).all(axis=1) | ~good
-        short = np.array([len(lane) < points for lane in passed])
-        # A closed branch comes by its start again, in the same direction.
-        back = np.linalg.norm(y - first.y, axis=1) < settings.max_step
-        along_start = (tangent * first.tangent).sum(axis=1) > settings.min_cosine
-        home = back & along_start & np.array([len(lane) > settings.closing_steps for lane in passed])
-        closed |= going & home
-        going = going & (length > settings.min_step) & real & short & ~home
-    ends = np.where(closed, "closed", np.where([len(rows) >= points for rows in passed], "points", "lost"))
-    lanes_of = [jax.tree.map(lambda x, i=i: x[i], arcs) for i in range(lanes)]
-    told = zip(lanes_of, passed, ends, strict=True)
-    return [_branch(arc, rows, along, str(end), settings) for arc, rows, end in told]
+    """Follow one way from every start."""
+    walked = walk(arcs, first, points, settings, happenings, FIRST_END)
+    lanes_of = [jax.tree.map(lambda x, i=i: x[i], arcs) for i in range(len(walked))]
+    return [_branch(arc, one, along, settings) for arc, one in zip(lanes_of, walked, strict=True)]
 
 
-def _branch(arc: Arc, rows: list[tuple], along: str, end: str, settings: ContinuationSettings) -> Branch:
+def _branch(arc: Arc, walked: Walked, along: str, settings: ContinuationSettings) -> Branch:
     """Make a branch of a lane's record: what was met between its points, and where it ends."""
-    y, tangent, tests, lengths = (np.array(column) for column in zip(*rows, strict=True))
-    last, met, ys = len(rows), [], y
+    y, tangent, tests, lengths, end = walked
+    last, met, ys = len(y), [], y
     found = events(arc, y, tangent, tests, lengths, settings)
     for event in sorted(found, key=lambda event: (event.place, event.s)):
         kind = kind_of(arc, event, y[event.place : event.place + 2], settings)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from vijax.orbits import periodic, symmetry
-from vijax.orbits.arclength_step import FIRST_END, FOLD, PLUS, Arc, Tests, advance, unpack
+from vijax.orbits.arclength_step import FIRST_END, FOLD, PLUS, Arc, Path, Tests, advance
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.periodic import Orbit
 
@@ -58,7 +58,7 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
     if not index.size:
         return []
     before = (y[index], tangent[index], lengths[index + 1])
-    s, there, zero = _locate(arc, *before, test, tests[index, test], settings)
+    s, there, zero = locate(arc, *before, test, tests[index, test], settings)
     found = [
         _Event(int(i), float(at), Tests._fields[t], y)
         for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
@@ -72,8 +72,8 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
 # `scipy.optimize.elementwise.find_root` locates a fold, a flip or a grazing to the same digit in two thirds of the
 # time. That is a tenth of a second in a family of branches, and importing it takes 0.3 s; and a pitchfork, which is no
 # simple root, it leaves at a multiplier up to 2e-9 off, where this one comes to 4e-10.
-def _locate(
-    arc: Arc,
+def locate(
+    path: Path,
     y: np.ndarray,
     tangent: np.ndarray,
     length: np.ndarray,
@@ -81,12 +81,12 @@ def _locate(
     low_f: np.ndarray,
     settings: ContinuationSettings,
 ):
-    """Find arclengths from points of a branch at which test functions vanish, the points, and which are no poles."""
+    """Find arclengths from points of a path at which test functions vanish, the points, and which are no poles."""
     rows = np.arange(test.size)
-    arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
+    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), path)
 
     def look(s):
-        at = advance(arcs, y, tangent, s)
+        at = advance(wide, y, tangent, s)
         return at.tests[rows, test], at.y
 
     low, high = np.zeros_like(length), length
@@ -126,8 +126,8 @@ def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray, settings: Continuat
     return "pitchfork" if meets[0] and turns != meets[1:].all() else "fold"
 
 
-def orbits_at(arc: Arc, ys: np.ndarray) -> Orbit:
-    """Make orbits of points of a branch, verified."""
-    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), arc)
-    knots, x = unpack(wide, ys)
-    return periodic.proven(wide.at(x), wide.sequence, knots)
+def orbits_at(path: Path, ys: np.ndarray) -> Orbit:
+    """Make orbits of points of a path, verified."""
+    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), path)
+    pair, knots = wide.pair_and_knots(ys)
+    return periodic.proven(pair, wide.sequence, knots)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vijax.engine import contact_search, flight_search
 from vijax.model import flow
@@ -15,6 +15,9 @@ from vijax.orbits import shooting
 from vijax.orbits.shooting import Knots, Sequence
 
 _NOTHING = 1.0  # clearance where there is nothing to clear
+# Half periods between two turning points that are one, found twice: far more than the search is off, except where the
+# acceleration vanishes too, and far less than the ball takes from one to another.
+_SAME_TURN = 1e-6
 
 
 class Clearance(NamedTuple):
@@ -27,17 +30,19 @@ class Clearance(NamedTuple):
 
 
 class _Flight(eqx.Module):
-    """A flight on its way: how far it was looked at, the velocity there, and the least room at a turning point yet."""
+    """A flight on its way: how far it was looked at, the velocity there, the least room at a turn yet, and when."""
 
     s: Float[Array, ""]
     v: Float[Array, ""]
     room: Float[Array, ""]
+    when: Float[Array, ""]
 
 
-def _flight_room(pair: ImpactPair, side, speed, t, length, real):
+def _flight_room(pair: ImpactPair, side, speed, t, length, real, touch):
     """Find the least distance from a wall at a turning point of the flight that follows a contact.
 
-    Between zeros of the acceleration the velocity is monotone, so that no turning point is missed.
+    Between zeros of the acceleration the velocity is monotone, so that no turning point is missed. One may be known to
+    touch the wall, `touch` after the flight began, and is left out.
     """
     force, v0 = flow.flight_force(pair.gamma, t), -side * speed
 
@@ -47,10 +52,12 @@ def _flight_room(pair: ImpactPair, side, speed, t, length, real):
         rise, _ = flow.flight(force, v0, turn)
         # Where the velocity changes from rising to falling the wall ahead is the right one.
         room = 0.5 * pair.d - jnp.sign(at.v) * (0.5 * side * pair.d + rise)
-        return _Flight(end, v_end, jnp.where(turns, jnp.minimum(at.room, room), at.room))
+        least = turns & ~(jnp.abs(turn - touch) < _SAME_TURN) & (room < at.room)
+        return _Flight(end, v_end, jnp.where(least, room, at.room), jnp.where(least, turn, at.when))
 
-    start = _Flight(jnp.zeros_like(t), v0, jnp.full_like(t, _NOTHING))
-    return lax.while_loop(lambda at: real & (at.s < length), onward, start).room
+    start = _Flight(jnp.zeros_like(t), v0, jnp.full_like(t, _NOTHING), jnp.full_like(t, jnp.nan))
+    end = lax.while_loop(lambda at: real & (at.s < length), onward, start)
+    return end.room, end.when
 
 
 class Between(NamedTuple):
@@ -71,11 +78,14 @@ def _contact(pair: ImpactPair, side, knot, real):
     return deepest, jnp.where(turns.lost, jnp.nan, shallow)
 
 
-def between(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Between:
+def between(pair: ImpactPair, sequence: Sequence, knots: Knots, touch: Float[Array, "impact"] | None = None) -> Between:
     """Find the motion of an orbit between its onsets; clearances are the least of all impacts, NaN if not known.
 
     Every turning point is visited, as the engine does it: of the hundreds in a long contact samples would miss the one
     that decides.
+
+    Args:
+        touch: How long after the end of each contact the ball is known to touch a wall; NaN where it is not.
     """
     real = sequence.real
     # Padded impacts are given harmless knots.
@@ -85,8 +95,9 @@ def between(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Between:
     def least(values):
         return jnp.where(real, values, _NOTHING).min()
 
-    flights = jax.vmap(_flight_room, in_axes=(None, 0, 0, 0, 0, 0))
-    flight = flights(pair, departure.side, departure.speed, departure.t, departure.next_t - departure.t, real)
+    if touch is None:
+        touch = jnp.full_like(departure.t, jnp.nan)
+    flight, _ = _flights(pair, departure, real, touch)
     if pair.rigid:
         deepest = jnp.full_like(departure.side, jnp.nan)
         contact = leaves = jnp.full_like(pair.d, _NOTHING)
@@ -94,3 +105,22 @@ def between(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Between:
         deepest, shallow = jax.vmap(_contact, in_axes=(None, 0, 0, 0))(pair, departure.side, knots, real)
         contact, leaves = least(shallow), least(departure.speed / knots[:, 1])
     return Between(Clearance(least(knots[:, 1]), least(flight), contact, leaves), deepest)
+
+
+def _flights(pair: ImpactPair, departure: shooting.Departure, real, touch):
+    """Find the least room in every flight, and how long after the contact it is."""
+    each = jax.vmap(_flight_room, in_axes=(None, 0, 0, 0, 0, 0, 0))
+    return each(pair, departure.side, departure.speed, departure.t, departure.next_t - departure.t, real, touch)
+
+
+def closest_turn(
+    pair: ImpactPair, sequence: Sequence, knots: Knots
+) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Find where the ball turns closest to a wall in flight: after which impact, how long after it, and which wall."""
+    real = sequence.real
+    departure = shooting.departures(pair, sequence, jnp.where(real[:, None], knots, 1.0))
+    room, when = _flights(pair, departure, real, jnp.full_like(departure.t, jnp.nan))
+    index = jnp.where(real, room, jnp.inf).argmin().astype(jnp.int32)
+    one = jax.tree.map(lambda leaf: leaf[index], departure)
+    rise, _ = flow.flight(flow.flight_force(pair.gamma, one.t), -one.side * one.speed, when[index])
+    return index, when[index], jnp.sign(0.5 * one.side * pair.d + rise)

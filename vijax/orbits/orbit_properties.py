@@ -32,8 +32,8 @@ class Counts(NamedTuple):
 
 
 @door
-def counts(orbit: Orbit) -> Counts:
-    """Count what is in the label of each orbit, over the fewest whole periods after which it recurs."""
+def counts(orbit: Orbit, tolerance: float = SAME) -> Counts:
+    """Count what is in the label of each orbit, over the fewest whole periods after which it recurs to a tolerance."""
     full = jax.tree.map(np.asarray, unfolded(orbit))
     side, number = full.sequence.side, full.count
     period = np.round(0.5 * full.sequence.span).astype(int)
@@ -44,7 +44,7 @@ def counts(orbit: Orbit) -> Counts:
         there = np.minimum(index + shift, side.shape[1] - 1)
         wait = np.array([1.0, 0.0, 0.0]) * (full.sequence.span / parts)[:, None, None]
         moved = np.take_along_axis(full.knots, there[..., None], axis=1) - full.knots - wait
-        same = (np.abs(moved).max(axis=2) < SAME) & (np.take_along_axis(side, there, axis=1) == side)
+        same = (np.abs(moved).max(axis=2) < tolerance) & (np.take_along_axis(side, there, axis=1) == side)
         recurs = (period % parts == 0) & (shift[:, 0] > 0) & (same | (index >= number[:, None] - shift)).all(axis=1)
         turns = np.where(recurs, parts, turns)
     left, right = ((side == wall).sum(axis=1) for wall in (-1, 1))

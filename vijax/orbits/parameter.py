@@ -29,6 +29,8 @@ _POWERS: dict[str, dict[str, float]] = {
 # What moves with each quantity that a branch can be followed along: of the pair itself alone, of the device several.
 MOVED: dict[str, tuple[str, ...]] = {name: (name,) for name in ("d", "kappa", "r", "gamma")}
 MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("gamma",)}
+# When each is moved, of several: the inclination sets gamma, which other quantities of the device change then.
+_TURN = {"beta": 0} | {name: 2 for name in ("d", "kappa", "r", "gamma")}
 
 
 def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Values) -> ImpactPair:
@@ -42,6 +44,15 @@ def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Valu
         if fields[name] is not None:  # a rigid wall has no kappa
             fields[name] = fields[name] * (x / start) ** power
     return ImpactPair(**fields)
+
+
+def moved_together(
+    pair: ImpactPair, along: tuple[str, ...], x: tuple[Values, ...], start: tuple[Values, ...], steepest: Values
+) -> ImpactPair:
+    """Move several parameters of a pair at once; of the pair itself they are last, for what is given stays given."""
+    for index in sorted(range(len(along)), key=lambda i: _TURN.get(along[i], 1)):
+        pair = moved(pair, along[index], x[index], start[index], steepest)
+    return pair
 
 
 def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:

@@ -122,20 +122,30 @@ def _following(sequence: Sequence):
     return after, wall, closes
 
 
-def _joined(sequence: Sequence, knots: Knots):
-    """Give wall, next wall and joint knots of every impact; harmless numbers where there is none."""
+def _joined(sequence: Sequence, knots: Knots, onward: Knots | None = None):
+    """Give wall, next wall and joint knots of every impact; harmless numbers where there is none.
+
+    The orbit closes onto its own first impact, or leads to that of a next turn where one is given.
+    """
     after, wall, closes = _following(sequence)
     later = jnp.where(closes, sequence.span, 0.0)
-    joined = jnp.concatenate([knots, (knots[after, 0] + later)[:, None], knots[after, 1:2]], axis=1)
+    follow = knots[after, :2]
+    if onward is not None:
+        follow = jnp.where(closes[:, None], onward[0, :2], follow)
+    joined = jnp.concatenate([knots, (follow[:, 0] + later)[:, None], follow[:, 1:]], axis=1)
     real = sequence.real
     blank = jnp.array([0.0, 1.0, 0.5, 1.0, 1.0], knots.dtype)
     side = jnp.where(real, sequence.side, 1).astype(knots.dtype)
     return side, jnp.where(real, wall, -1).astype(knots.dtype), jnp.where(real[:, None], joined, blank)
 
 
-def gap(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "3*impact"]:
-    """Compute what is missing to an orbit: zero at one, and where there is no impact."""
-    side, wall, joined = _joined(sequence, knots)
+def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None = None) -> Float[Array, "3*impact"]:
+    """Compute what is missing to an orbit: zero at one, and where there is no impact.
+
+    Args:
+        onward: Knots of the next turn, a span earlier than they come, where they differ from those of this one.
+    """
+    side, wall, joined = _joined(sequence, knots, onward)
     pieces, _ = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
@@ -285,6 +295,51 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
     start = jnp.eye(2, dtype=knots.dtype)
     around, _ = lax.scan(one, start, (side, t, speed, stay, next_t - t - stay, sequence.real))
     return jnp.where(sequence.mirrored, -1.0, 1.0) * around
+
+
+# Speed into a rigid wall below which its matrix is weighed down. It is asked when weighted matrices vanish, no more, so
+# that it may be anything that is small beside an impact.
+_SLOW = 0.1
+
+
+class MultiplierConditions(NamedTuple):
+    """det(M - 1) and det(M + 1) once around, times a positive weight that makes them regular at a graze."""
+
+    plus: Float[Array, ""]
+    minus: Float[Array, ""]
+
+
+def multiplier_conditions(pair: ImpactPair, sequence: Sequence, knots: Knots) -> MultiplierConditions:
+    """Compute what vanishes where a multiplier is 1, and where one is -1, regular at a graze of a rigid wall too.
+
+    There the matrix of an impact grows as 1/v. Each is weighed by v/(v + 0.1), and det M taken in closed form.
+    """
+    side, _, joined = _joined(sequence, knots)
+    t, speed, stay, next_t, _ = joined.T
+    real = sequence.real
+    if pair.rigid:
+        slow = speed + _SLOW
+        weight = jnp.where(real, speed / slow, 1.0).prod()
+        product = pair.r ** (2.0 * real.sum(dtype=speed.dtype))
+    else:
+        slow, weight = jnp.ones_like(speed), jnp.ones_like(pair.d)
+        product = jnp.exp(-flow.membrane(pair, rolled=True).mu * jnp.where(real, stay, 0.0).sum())
+
+    def one(before, here):
+        side, t, speed, stay, flight, slow, real = here
+        if pair.rigid:
+            # The matrix for v = v + 0.1, and that part of r which remains.
+            contact = flow.rigid_matrix(pair.r, flow.acceleration(pair.gamma, t), side * slow)
+            keep = speed / slow
+            contact = contact * jnp.array([[keep, 1.0], [1.0, keep]])
+        else:
+            contact = flow.contact_matrix(flow.membrane(pair, rolled=True), stay)
+        return jnp.where(real, flow.flight_matrix(flight) @ contact @ before, before), None
+
+    start = jnp.eye(2, dtype=knots.dtype)
+    around, _ = lax.scan(one, start, (side, t, speed, stay, next_t - t - stay, slow, real))
+    trace = jnp.where(sequence.mirrored, -1.0, 1.0) * (around[0, 0] + around[1, 1])
+    return MultiplierConditions(weight * (1 + product) - trace, weight * (1 + product) + trace)
 
 
 def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:

@@ -25,13 +25,17 @@ def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"
 
 
 @door
-def halved(orbit: Orbit) -> Orbit:
+def halved(orbit: Orbit, tolerance: float = 1e-9) -> Orbit:
     """Close symmetric orbits half way, onto their mirror image: half the impacts, and a pitchfork becomes a flip.
+
+    Args:
+        orbit: Orbits.
+        tolerance: How far from its mirror image an orbit may be; the ones returned are symmetric.
 
     Raises:
         ValueError: An orbit that is not symmetric.
     """
-    good = symmetric(orbit)
+    good = symmetric(orbit, tolerance)
     if not good.all():
         index = int(np.argmin(good))
         raise ValueError(f"orbit must be symmetric to be closed half way; got one that is not at index {index}")

@@ -1,0 +1,178 @@
+"""A curve of bifurcations in a plane of two parameters as a path in the space of knots and both parameters.
+
+To the equations of the orbit come those of what it is that happens: a multiplier is 1 or -1, or the ball just touches
+a wall in flight. Past the end of real orbits the equations go on, as those of orbits do; test functions say where.
+"""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.orbits import grazing, shooting
+from vijax.orbits.criticality import cubic_coefficient
+from vijax.orbits.parameter import moved_together
+from vijax.orbits.shooting import LinearisedEquations, Sequence
+from vijax.runtime.arrays import AnyArray
+
+Condition = Literal["multiplier", "touch"]
+
+
+class CurveTests(NamedTuple):
+    """Functions whose sign changes mark what happens on a curve; those from `push` on are positive on real orbits."""
+
+    turn: Float[Array, ""]  # how far a step goes on in the plane the way that it came: it turns back at a cusp
+    cubic: Float[Array, ""]  # the cubic coefficient of a flip: on which side the doubled orbits lie
+    plus: Float[Array, ""]  # at a graze: a multiplier passes +1
+    minus: Float[Array, ""]  # at a graze: one passes -1
+    push: Float[Array, ""]  # at a graze: acceleration away from the wall
+    speed: Float[Array, ""]  # the clearances of `Tests`, but for the graze itself
+    flight: Float[Array, ""]
+    contact: Float[Array, ""]
+    exit: Float[Array, ""]
+    low_first: Float[Array, ""]
+    high_first: Float[Array, ""]
+    low_second: Float[Array, ""]
+    high_second: Float[Array, ""]
+
+
+TURN, CUBIC = CurveTests._fields.index("turn"), CurveTests._fields.index("cubic")
+FIRST_CURVE_END = CurveTests._fields.index("push")
+
+
+class Touch(eqx.Module):
+    """Where the ball touches a wall: after which impact, and which wall."""
+
+    impact: Int[AnyArray, "*orbit"]
+    wall: Float[AnyArray, "*orbit"]
+
+
+class CurvePath(eqx.Module):
+    """What a lane follows: unknowns are all knots, at a graze how long after a contact it is, and both parameters.
+
+    Parameters count over their range, so that the plane is a square of side 1; one whose bounds are more than a decade
+    apart counts in its logarithm.
+
+    Attributes:
+        pair: Parameters of the orbit where the curve began.
+        sequence: Walls that it meets.
+        start: Both parameters there.
+        steepest: g/A of the device, gamma of a vertical tube (along "beta" only).
+        low, high: Corners of the plane.
+        multiplier: Which one of the orbit's multipliers is: +1. or -1. (flips, pitchforks of orbits closed half way).
+        touch: Where the ball touches a wall, on curves of grazing.
+        along: Which parameters move.
+        logarithmic: Which of them count in their logarithms.
+        condition: Whether a multiplier is given, or a wall touched.
+        newton_tolerance, max_corrections: See `ContinuationSettings`.
+    """
+
+    pair: ImpactPair
+    sequence: Sequence
+    start: Float[AnyArray, "*orbit 2"]
+    steepest: Float[AnyArray, "*orbit"]
+    low: Float[AnyArray, "*orbit 2"]
+    high: Float[AnyArray, "*orbit 2"]
+    multiplier: Float[AnyArray, "*orbit"]
+    touch: Touch
+    along: tuple[str, str] = eqx.field(static=True)
+    logarithmic: tuple[bool, bool] = eqx.field(static=True)
+    condition: Condition = eqx.field(static=True)
+    newton_tolerance: float = eqx.field(static=True)
+    max_corrections: int = eqx.field(static=True)
+
+    def places(self, y):
+        """Give both parameters at points, along the last axis."""
+        z = y[..., -2:]
+        line = self.low + z * (self.high - self.low)
+        # Where a quantity is no logarithm's the other form is never computed of a bound that may be negative.
+        power = [
+            self.low[..., i] * (self.high[..., i] / self.low[..., i]) ** z[..., i] if logarithm else line[..., i]
+            for i, logarithm in enumerate(self.logarithmic)
+        ]
+        return (jnp if isinstance(y, jax.Array) else np).stack(power, axis=-1)
+
+    def at(self, z) -> ImpactPair:
+        """Give the pair where the last two unknowns are these."""
+        x, start = self.places(z), self.start
+        both = (x[..., 0], x[..., 1]), (start[..., 0], start[..., 1])
+        return moved_together(self.pair, self.along, *both, self.steepest)
+
+    def pair_and_knots(self, y) -> tuple[ImpactPair, shooting.Knots]:
+        """Give the orbits of points, many along a leading axis."""
+        return self.at(y[..., -2:]), self._knots(y)
+
+    def _knots(self, y):
+        width = self.sequence.side.shape[-1]
+        return y[..., : 3 * width].reshape(*y.shape[:-1], width, 3)
+
+    def condition_at(self, y) -> Float[Array, "condition"]:
+        """Compute what vanishes on the curve besides the gap of the orbit."""
+        pair, knots = self.pair_and_knots(y)
+        if self.condition == "multiplier":
+            both = shooting.multiplier_conditions(pair, self.sequence, knots)
+            return jnp.where(self.multiplier > 0, both.plus, both.minus)[None]
+        leave = jax.tree.map(lambda leaf: leaf[self.touch.impact], shooting.departures(pair, self.sequence, knots))
+        rise, v = flow.flight(flow.flight_force(pair.gamma, leave.t), -leave.side * leave.speed, y[-3])
+        return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])
+
+    def equations(self, y) -> LinearisedEquations:
+        """Compute the gap and the condition, and their derivatives in all unknowns."""
+        pair, knots = self.pair_and_knots(y)
+        orbit = shooting.linearise(pair, self.sequence, knots)
+        tilt = jax.jacfwd(lambda z: shooting.gap(self.at(z), self.sequence, knots))(y[-2:])
+        idle = jnp.zeros((orbit.gap.size, y.size - orbit.gap.size - 2), y.dtype)
+        slope = jax.jacfwd(self.condition_at)(y)
+        return LinearisedEquations(
+            jnp.concatenate([orbit.gap, self.condition_at(y)]),
+            jnp.concatenate([jnp.concatenate([orbit.slope, idle, tilt], axis=1), slope]),
+        )
+
+    def tests(self, y, tangent, former) -> CurveTests:
+        """Compute the test functions at a point with its tangent, reached along a former tangent."""
+        pair, knots = self.pair_and_knots(y)
+        one = jnp.ones_like(pair.d)
+        cubic, plus, minus, push, touch = one, one, one, one, None
+        if self.condition == "touch":
+            plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
+            here = jnp.arange(knots.shape[0], dtype=jnp.int32) == self.touch.impact
+            touch = jnp.where(here, y[-3], jnp.nan)
+            leave = shooting.departures(pair, self.sequence, knots).t[self.touch.impact]
+            push = -self.touch.wall * flow.acceleration(pair.gamma, leave + y[-3])
+        else:
+            cubic = jnp.where(self.multiplier > 0, one, cubic_coefficient(pair, self.sequence, knots))
+        room = grazing.between(pair, self.sequence, knots, touch).clearance
+        z = y[-2:]
+        return CurveTests(
+            turn=(tangent[-2:] @ former[-2:]) / jnp.linalg.norm(former[-2:]),
+            cubic=cubic,
+            plus=plus,
+            minus=minus,
+            push=push,
+            speed=room.speed,
+            flight=room.flight,
+            contact=room.contact,
+            exit=room.exit,
+            low_first=z[0],
+            high_first=1 - z[0],
+            low_second=z[1],
+            high_second=1 - z[1],
+        )
+
+
+def passed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Say which test functions change sign between rows of them; a step begins the way that it goes."""
+    begun = np.sign(before)
+    begun[:, TURN] = 1.0
+    return begun * np.sign(after) < 0
+
+
+def happenings_on_curves(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Count what happens between two rows of test functions; of ends the first alone matters."""
+    met = passed(before, after)
+    return met[:, :FIRST_CURVE_END].sum(axis=1) + met[:, FIRST_CURVE_END:].any(axis=1)

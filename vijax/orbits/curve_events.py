@@ -1,0 +1,110 @@
+"""What a curve of bifurcations meets: where exactly, what it is called, and whether the curve ends there.
+
+The product of an orbit's two multipliers is exp(-mu contact time) or r^(2 impacts), between 0 and 1. So they can be 1
+or -1 one at a time only, and never be a pair on the unit circle: there is no Neimark-Sacker bifurcation, no fold-flip
+and no resonance 1:1 or 1:2 to be looked for.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from vijax.orbits import orbit_properties, symmetry
+from vijax.orbits.arclength_step import advance
+from vijax.orbits.arclength_walk import Walked
+from vijax.orbits.continuation_settings import ContinuationSettings
+from vijax.orbits.curve_equations import CUBIC, TURN, CurvePath, CurveTests, passed
+from vijax.orbits.events import locate, orbits_at
+from vijax.orbits.periodic import Orbit
+
+# Part of a tangent that lies in the plane at which a curve stands still there: beside a cusp it is the distance from
+# it, along a curve that only bends it is what it was.
+_STILL = 1e-4
+_TEST = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
+
+
+class CurvePoint(NamedTuple):
+    """What a curve met: a point of codimension 2.
+
+    Attributes:
+        kind: "cusp", "generalised flip", "degenerate pitchfork", "fold-graze", "flip-graze", "pitchfork-graze", "double
+            graze", "degenerate graze" (no acceleration where the ball touches).
+        test: What grazes besides, where the curve ends: flight, impact, contact or exit; else "".
+        values: Of both parameters.
+        orbit: The orbit there, alone.
+    """
+
+    kind: str
+    test: str
+    values: tuple[float, float]
+    orbit: Orbit
+
+
+class CurveEvent(NamedTuple):
+    """A sign change: the point before it, the arclength from there, what it is, the point itself, whether it ends."""
+
+    place: int
+    s: float
+    kind: str
+    test: str
+    y: np.ndarray
+    ends: bool
+
+
+def curve_events(path: CurvePath, walked: Walked, kind: str, settings: ContinuationSettings) -> list[CurveEvent]:
+    """Find what happens between neighbours of a curve in order, up to the first thing that ends it."""
+    index, test = np.nonzero(passed(walked.tests[:-1], walked.tests[1:]))
+    if not index.size:
+        return []
+    y, tangent, lengths = walked.y[index], walked.tangent[index], walked.lengths[index + 1]
+    begun = np.where(test == TURN, np.linalg.norm(tangent[:, -2:], axis=1), walked.tests[index, test])
+    s, there, zero = locate(path, y, tangent, lengths, test, begun, settings)
+    still = _still(path, y, tangent, s)
+    found = []
+    for number in np.lexsort((s, index)):
+        which = int(test[number])
+        if not zero[number] or (which == TURN and not still[number]):
+            continue
+        name, ends = _named(path, which, there[number], kind, settings)
+        what = _TEST.get(CurveTests._fields[which], "")
+        found.append(CurveEvent(int(index[number]), float(s[number]), name, what, there[number], ends))
+        if ends:
+            break
+    return found
+
+
+def _still(path: CurvePath, y: np.ndarray, tangent: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Say whether the curve stands still in the plane there."""
+    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (s.size, *leaf.shape)), path)
+    return np.linalg.norm(advance(wide, y, tangent, s).tangent[:, -2:], axis=1) < _STILL
+
+
+def _named(path: CurvePath, test: int, y: np.ndarray, kind: str, settings: ContinuationSettings) -> tuple[str, bool]:
+    """Name what a sign change means on a curve of a kind, and say whether the curve ends there."""
+    name = CurveTests._fields[test]
+    if test == TURN:
+        return _turning(orbits_at(path, y[None]), settings)
+    if test == CUBIC:
+        return ("degenerate pitchfork" if kind == "pitchfork" else "generalised flip"), False
+    if name in ("plus", "minus"):
+        flip = "pitchfork" if bool(path.sequence.mirrored) else "flip"
+        return f"{'fold' if name == 'plus' else flip}-graze", False
+    if name == "push":
+        return "degenerate graze", True
+    if name in _TEST:
+        return ("double graze" if kind == "grazing" else f"{kind}-graze"), True
+    bound, _, which = name.partition("_")
+    return f"{path.along[which == 'second']} {bound}", True
+
+
+def _turning(orbit: Orbit, settings: ContinuationSettings) -> tuple[str, bool]:
+    """Tell a cusp of folds from where folds of a mirror pair, or of doubled orbits, meet what these bifurcate from.
+
+    There the curve goes on with the other one of the pair, or with the same orbit shifted, over the same places.
+    """
+    if not bool(orbit.sequence.mirrored[0]) and bool(symmetry.symmetric(orbit, settings.asymmetry)[0]):
+        return "degenerate pitchfork", True
+    if int(orbit_properties.counts(orbit, settings.asymmetry).period[0]) < 0.5 * float(orbit.sequence.span[0]):
+        return "generalised flip", True
+    return "cusp", False

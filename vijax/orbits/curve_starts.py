@@ -1,0 +1,102 @@
+"""Where curves begin: at what branches met, brought into the one form in which each kind of bifurcation is followed."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Status
+from vijax.orbits import grazing, symmetry
+from vijax.orbits.curve_equations import Touch
+from vijax.orbits.events import Point
+from vijax.orbits.periodic import Orbit, guessed, proven
+from vijax.orbits.shooting import Sequence
+from vijax.runtime.programs import jitted
+
+KINDS = ("fold", "flip", "pitchfork", "grazing")
+
+
+class CurveStart(NamedTuple):
+    """A bifurcation from which a curve is to be followed.
+
+    Attributes:
+        kind: One of `KINDS`.
+        orbit: The orbit there, alone: closed half way at a pitchfork; at a graze without the impact that fades.
+        place: Both parameters of the plane.
+        impact, wait, wall: At a graze, how long after the end of which contact the ball touches which wall; else of no
+            meaning.
+    """
+
+    kind: str
+    orbit: Orbit
+    place: tuple[float, float]
+    impact: int = 0
+    wait: float = 0.0
+    wall: float = 1.0
+
+
+def curve_start(point: Point, place: tuple[float, float], asymmetry: float) -> CurveStart | str:
+    """Make a start of what a branch met, or say why no curve can be followed from there.
+
+    Args:
+        point: What was met.
+        place: Both parameters of the plane there.
+        asymmetry: How far from its mirror image an orbit at a pitchfork may be.
+    """
+    kind, orbit = point.kind, point.orbit
+    if kind in ("grazing contact", "grazing exit"):
+        return f"curves of {kind} are not followed"
+    if kind == "grazing flight":
+        index, wait, wall = _closest(*_only(orbit))
+        return CurveStart("grazing", orbit, place, int(index), float(wait), float(wall))
+    if kind == "grazing impact":
+        return _without_impact(orbit, place)
+    if int(orbit.status[0]) != Status.OK:
+        return "no ball flies its orbit"
+    if kind == "pitchfork":
+        orbit = symmetry.halved(orbit, asymmetry)
+    return CurveStart(kind, orbit, place)
+
+
+_closest = jitted(grazing.closest_turn)
+
+
+def _only(orbit: Orbit):
+    """Give pair, sequence and knots of an orbit that is alone."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], (orbit.pair, orbit.sequence, orbit.knots))
+
+
+def _without_impact(orbit: Orbit, place: tuple[float, float]) -> CurveStart | str:
+    """Leave out the impact whose speed has come to zero: what is left is an orbit that touches a wall in flight."""
+    pair, sequence, knots = _only(orbit)
+    count = int(sequence.real.sum())
+    index = int(np.where(sequence.real, knots[:, 1], np.inf).argmin())
+    side, t = int(sequence.side[index]), knots[index, 0]
+    if count == 1:
+        return "no impact would be left"
+    if side * float(flow.acceleration(pair.gamma, t)) > 0:
+        return "the forcing holds the ball on its wall"
+    rest = np.delete(np.arange(len(knots)), index)
+    rest = np.append(rest, rest[-1:])  # as wide as before
+    walls = np.where(np.arange(len(knots)) < count - 1, sequence.side[rest], 0)
+    # The impact before it; of the first one that is the last, a turn earlier.
+    before, again = (index - 1, False) if index else (count - 2, True)
+    wall = -side if again and sequence.mirrored else side
+    given = guessed(walls[None], np.atleast_1d(sequence.span), np.atleast_1d(sequence.mirrored), knots[rest][None])
+    kept = proven(orbit.pair, *given)
+    leave = knots[rest[before], 0] + knots[rest[before], 2]
+    wait = t + (float(sequence.span) if again else 0.0) - leave
+    return CurveStart("grazing", kept, place, before, float(wait), float(wall))
+
+
+def with_touch(pair: ImpactPair, knots, sequence: Sequence, touch: Touch, wait: np.ndarray) -> Orbit:
+    """Make orbits of some that touch a wall in flight: with an impact of speed 0 there."""
+    place = int(touch.impact) + 1
+    more = np.stack(
+        [knots[:, place - 1, 0] + knots[:, place - 1, 2] + wait, np.zeros_like(wait), np.zeros_like(wait)], axis=1
+    )
+    ways = np.asarray(sequence.span), np.asarray(sequence.mirrored)
+    side = np.insert(sequence.side, place, touch.wall.astype(np.int32), axis=1)
+    return proven(pair, *guessed(side, *ways, np.insert(knots, place, more, axis=1)))

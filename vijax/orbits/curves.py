@@ -1,0 +1,348 @@
+"""Curves of bifurcations in a plane of two parameters, by pseudo-arclength continuation, many at once.
+
+They begin where branches met something (`curve_starts`); all lanes step together (`arclength_walk`); what they meet is
+located afterwards (`curve_events`).
+"""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from vijax.model.device import Harvester, one_device
+from vijax.model.quantities import synonyms
+from vijax.model.records import Status
+from vijax.orbits import orbit_properties, periodic, symmetry
+from vijax.orbits.arclength_step import advance
+from vijax.orbits.arclength_walk import Walked, walk
+from vijax.orbits.continuation import MOST_POINTS
+from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
+from vijax.orbits.curve_equations import (
+    FIRST_CURVE_END,
+    Condition,
+    CurvePath,
+    Touch,
+    happenings_on_curves,
+)
+from vijax.orbits.curve_events import CurvePoint, curve_events
+from vijax.orbits.curve_starts import CurveStart, curve_start, with_touch
+from vijax.orbits.events import Point, orbits_at
+from vijax.orbits.parameter import MOVED, check_along
+from vijax.orbits.periodic import Orbit
+from vijax.runtime import checks, tiles
+from vijax.runtime.context import door
+
+# A quantity whose bounds are farther apart than this counts in its logarithm.
+_DECADE = 10.0
+# Two starts on one curve differ from it by less than a step's bend; other curves of the same label are farther apart.
+_ON_CURVE = 5e-4
+
+
+class BifurcationCurve(NamedTuple):
+    """A curve of one bifurcation in a plane, in the order in which it was followed.
+
+    Attributes:
+        kind: "fold", "flip", "pitchfork" or "grazing" (the ball touches a wall in flight).
+        along: Both parameters of the plane.
+        values: Of both, a row an orbit.
+        orbit: The orbits, with multipliers; those of a graze without the impact that begins there.
+        points: What of codimension 2 was met on the way, in order.
+        ends: Why it stops at its first and at its last orbit: the bound ("d low"), a kind of `CurvePoint`, "closed",
+            "points" (as many as asked for), "lost" (no step was short enough).
+    """
+
+    kind: str
+    along: tuple[str, str]
+    values: np.ndarray
+    orbit: Orbit
+    points: list[CurvePoint]
+    ends: tuple[str, str]
+
+    @property
+    def stable(self) -> np.ndarray:
+        """Say whether stable orbits border on each point.
+
+        Always at folds, flips and pitchforks: the other multiplier is smaller than 1, as the product of both is. A
+        graze may be one of an unstable orbit.
+        """
+        largest = np.abs(np.asarray(self.orbit.multipliers)).max(axis=1)
+        return largest < 1 if self.kind == "grazing" else np.full(len(largest), True)
+
+
+@door
+def follow_curves(
+    points: list[Point],
+    along: str,
+    within: Mapping[str, tuple[float, float]],
+    *,
+    device: Harvester | None = None,
+    max_points: int = 4000,
+    settings: ContinuationSettings = DEFAULT,
+) -> list[BifurcationCurve]:
+    """Follow bifurcations, as branches met them, in a plane of two parameters.
+
+    Args:
+        points: What branches met. From folds, flips, pitchforks and grazings of flights and impacts curves are
+            followed; of others a warning says so.
+        along: The parameter of these branches.
+        within: The two parameters of the plane with their bounds, as in {"d": (0.05, 0.3), "kappa": (3, 400)}. Bounds
+            more than a decade apart are gone through in logarithms.
+        device: For quantities of the device: its other constants, as branches were told.
+        max_points: Most points of a curve each way.
+        settings: Of steps and events; arclengths are in units of the plane's sides and of knots.
+
+    Returns:
+        Every curve once, however many of the points lie on it; mirror images are one.
+
+    Raises:
+        ValueError: Not two parameters, two names of one, bounds in the wrong order, or a point outside.
+    """
+    listed = checks.sequence("points", points, Point, "points of branches, such as branch.points")
+    max_points, settings = checks.whole("max_points", max_points, 2, MOST_POINTS), check_settings(settings)
+    if not listed:
+        raise ValueError("points must hold at least one to begin at; got none; branches meet them")
+    device = one_device(device)
+    plane = check_plane(listed[0].orbit.pair, within)
+    checks.choice("along", along, MOVED)
+    starts: list[CurveStart] = []
+    refused: list[str] = []
+    for point in listed:
+        start = curve_start(point, _place(point, along, plane, device), settings.asymmetry)
+        if isinstance(start, str):
+            refused.append(start)
+        else:
+            starts.append(start)
+    if refused:
+        warnings.warn(f"{len(refused)} of {len(listed)} points begin no curve: {refused[0]}", stacklevel=2)
+    return curves_from(starts, plane, device, max_points, settings)
+
+
+Plane = dict[str, tuple[float, float]]
+
+
+def check_plane(pair: Any, within: Any) -> Plane:
+    """Take the bounds of two parameters in which curves of such a pair can be followed."""
+    if not isinstance(within, Mapping) or len(within) != 2:
+        raise ValueError(f"within must give two parameters their bounds; got {checks.shown(within)}")
+    plane = {name: check_along(pair, name, bounds) for name, bounds in within.items()}
+    one, other = plane
+    if other in synonyms(one):
+        raise ValueError(f"within must name two parameters; got {one} and {other}, which say the same; keep one")
+    return plane
+
+
+def _place(point: Point, along: str, plane: Plane, device: Harvester) -> tuple[float, float]:
+    """Find both parameters at a point of a branch; raise ValueError where the plane does not hold it."""
+    pair = point.orbit.pair
+    place = []
+    for name, (low, high) in plane.items():
+        if name == along:
+            value = point.value
+        elif name in ("d", "kappa", "r", "gamma"):
+            value = float(getattr(pair, name)[0])
+        elif along in plane:
+            value = float(device.m_b * device.omega0**2 if name == "k" else getattr(device, name))
+        else:
+            raise ValueError(f"along must be in the plane of {' and '.join(plane)}; got branches along {along}")
+        if not low <= value <= high:
+            raise ValueError(f"within must hold the points; got {(low, high)} and {name} = {value:.6g}")
+        place.append(value)
+    return place[0], place[1]
+
+
+def curves_from(
+    starts: list[CurveStart], plane: Plane, device: Harvester, max_points: int, settings: ContinuationSettings
+) -> list[BifurcationCurve]:
+    """Follow every start that lies on no curve yet: one of each family at a time, all these together."""
+    found: list[BifurcationCurve] = []
+    left = starts
+    while left:
+        first: dict[tuple, CurveStart] = {}
+        for start in left:
+            first.setdefault(_family(start), start)
+        batches: dict[tuple, list[CurveStart]] = {}
+        for start in first.values():
+            batches.setdefault((start.kind == "grazing", start.orbit.knots.shape[1]), []).append(start)
+        for batch in batches.values():
+            found += _followed(batch, plane, device, max_points, settings)
+        taken = set(map(id, first.values()))
+        left = [start for start in left if id(start) not in taken and not any(_on(start, one, plane) for one in found)]
+    return found
+
+
+def _family(start: CurveStart) -> tuple:
+    """Tell starts apart of which no two lie on one curve: by kind, walls met and time."""
+    sequence, sides = start.orbit.sequence, np.asarray(start.orbit.sequence.side)[0]
+    walls = sorted(int((sides == side).sum()) for side in (-1, 1))
+    return start.kind, float(sequence.span[0]), bool(sequence.mirrored[0]), *walls
+
+
+def _on(start: CurveStart, curve: BifurcationCurve, plane: Plane) -> bool:
+    """Say whether a start lies on a curve, or its mirror image does."""
+    if start.kind != curve.kind:
+        return False
+    path = np.column_stack([_traits(curve.orbit), units(curve.values, plane)])
+    place = units(np.array(start.place), plane)
+    return any(_distance(path, np.append(one, place)) < _ON_CURVE for one in _traits(start.orbit, images=True))
+
+
+def _traits(orbit: Orbit, images: bool = False) -> np.ndarray:
+    """Give numbers that tell orbits apart, whichever impact they begin with; those of their mirror images, too."""
+    full = jax.tree.map(np.asarray, symmetry.unfolded(orbit))
+    own = orbit_properties.marks_of_knots(full.sequence.side, full.knots)
+    if not images or np.any(full.pair.gamma):
+        return own
+    mirror = orbit_properties.marks_of_knots(-full.sequence.side, full.knots + np.array([1.0, 0.0, 0.0]))
+    return np.concatenate([own, mirror])
+
+
+def _distance(path: np.ndarray, point: np.ndarray) -> float:
+    """Find how far a point is from a chain of points, in the largest of its coordinates."""
+    if len(path) == 1:
+        return float(np.abs(path[0] - point).max())
+    begin, step = path[:-1], np.diff(path, axis=0)
+    square = np.maximum((step * step).sum(axis=1), np.finfo(float).tiny)
+    share = np.clip(((point - begin) * step).sum(axis=1) / square, 0.0, 1.0)
+    return float(np.abs(begin + share[:, None] * step - point).max(axis=1).min())
+
+
+def _logarithmic(plane: Plane) -> tuple[bool, ...]:
+    """Say which parameters count in their logarithms."""
+    return tuple(low > 0 and high > _DECADE * low for low, high in plane.values())
+
+
+def units(values: np.ndarray, plane: Plane) -> np.ndarray:
+    """Measure places in the plane in its sides, from its lower corner."""
+    values = np.asarray(values, float)
+    columns = []
+    for index, ((low, high), logarithm) in enumerate(zip(plane.values(), _logarithmic(plane), strict=True)):
+        x = values[..., index]
+        columns.append(np.log(x / low) / np.log(high / low) if logarithm else (x - low) / (high - low))
+    return np.stack(columns, axis=-1)
+
+
+def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings: ContinuationSettings):
+    """Make paths and unknowns of starts with as many impacts."""
+    orbit = periodic.concatenate([start.orbit for start in starts])
+    size, (one, other), logarithmic = len(starts), plane, _logarithmic(plane)
+    place = np.array([start.place for start in starts], float)
+    touches = starts[0].kind == "grazing"
+    rows = tiles.arrays(
+        {
+            "start": place,
+            "steepest": np.full(size, float(device.g / device.A)),
+            "low": np.tile(np.array([low for low, _ in plane.values()]), (size, 1)),
+            "high": np.tile(np.array([high for _, high in plane.values()]), (size, 1)),
+            "multiplier": np.array([1.0 if start.kind == "fold" else -1.0 for start in starts]),
+        }
+    )
+    condition: Condition = "touch" if touches else "multiplier"
+    paths = CurvePath(
+        pair=orbit.pair,
+        sequence=orbit.sequence,
+        touch=Touch(
+            *tiles.arrays(
+                (np.array([start.impact for start in starts], np.int32), np.array([start.wall for start in starts]))
+            )
+        ),
+        along=(one, other),
+        logarithmic=(logarithmic[0], logarithmic[1]),
+        condition=condition,
+        newton_tolerance=settings.newton_tolerance,
+        max_corrections=settings.max_corrections,
+        **rows,
+    )
+    paths = jax.tree.map(np.asarray, paths)
+    knots = np.where(paths.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
+    waits = np.array([[start.wait] for start in starts])[:, : int(touches)]
+    return paths, np.concatenate([knots, waits, units(place, plane)], axis=1)
+
+
+def _followed(
+    starts: list[CurveStart], plane: Plane, device: Harvester, max_points: int, settings: ContinuationSettings
+) -> list[BifurcationCurve]:
+    """Follow some starts both ways, all at once."""
+    paths, y = _set_out(starts, plane, device, settings)
+    # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
+    across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
+    across = np.broadcast_to(across / np.linalg.norm(across), y.shape)
+    first = advance(paths, y, across, np.zeros(len(y)))
+    real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1)
+    good = np.flatnonzero((first.size <= settings.newton_tolerance) & real)
+    if good.size < len(starts):
+        told = ", ".join(f"{starts[i].kind} at {starts[i].place}" for i in np.setdiff1d(np.arange(len(starts)), good))
+        warnings.warn(
+            f"{len(starts) - good.size} points begin no curve, as no real orbit is there: {told}", stacklevel=2
+        )
+    if not good.size:
+        return []
+    both = np.concatenate([good, good])
+    sign = np.repeat([-1.0, 1.0], good.size)[:, None]
+    lanes = jax.tree.map(lambda leaf: leaf[both], paths)
+    first = jax.tree.map(lambda leaf: leaf[both], first)
+    walked = walk(
+        lanes, first._replace(tangent=sign * first.tangent), max_points, settings, happenings_on_curves, FIRST_CURVE_END
+    )
+    found = []
+    for number, index in enumerate(good):
+        path = jax.tree.map(lambda leaf, i=index: leaf[i], paths)
+        ways = [_one_way(path, walked[number + shift], starts[index].kind, settings) for shift in (0, good.size)]
+        found.append(_joined(path, starts[index].kind, ways))
+    return found
+
+
+class _HalfCurve(NamedTuple):
+    """A curve one way from its start: its points, what it met, why it ends."""
+
+    y: np.ndarray
+    points: list[CurvePoint]
+    end: str
+
+
+def _one_way(path: CurvePath, walked: Walked, kind: str, settings: ContinuationSettings) -> _HalfCurve:
+    """Put what happened between the points of a path among them, and end it where it ends."""
+    rows, points, end, begin = [], [], walked.end, 0
+    last = len(walked.y)
+    for event in curve_events(path, walked, kind, settings):
+        rows += [walked.y[begin : event.place + 1], event.y[None]]
+        begin = event.place + 1
+        if event.ends:
+            end, last = event.kind, begin
+        if not event.kind.endswith((" low", " high")):
+            values = path.places(event.y)
+            place = float(values[0]), float(values[1])
+            points.append(CurvePoint(event.kind, event.test, place, orbits_of(path, event.y[None])))
+    beyond = last == len(walked.y) and not (walked.tests[-1, FIRST_CURVE_END:] > 0).all()
+    rows.append(walked.y[begin : last - beyond])
+    return _HalfCurve(np.concatenate(rows), points, end)
+
+
+def orbits_of(path: CurvePath, ys: np.ndarray) -> Orbit:
+    """Make orbits of points of a curve, verified.
+
+    Where a ball just touches a wall rounding decides whether the impact map meets it. Either will do: the orbit is
+    real as it is, or with an impact of speed 0 there.
+    """
+    found = orbits_at(path, ys)
+    if path.condition == "multiplier" or (np.asarray(found.status) == Status.OK).all():
+        return found
+    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), path)
+    pair, knots = wide.pair_and_knots(ys)
+    touching = with_touch(pair, knots, wide.sequence, path.touch, ys[:, -3])
+    real = np.asarray(touching.status) == Status.OK
+    status = np.where(real, Status.OK, found.status).astype(np.int32)
+    return eqx.tree_at(lambda orbit: orbit.status, found, tiles.arrays(status))
+
+
+def _joined(path: CurvePath, kind: str, ways: list[_HalfCurve]) -> BifurcationCurve:
+    """Join both ways from a start to one curve; where it closes one way is all of it."""
+    back, ahead = ways
+    if back.end == "closed":
+        y, points, ends = back.y, back.points, ("closed", "closed")
+    else:
+        y = np.concatenate([back.y[::-1], ahead.y[1:]])
+        points, ends = back.points[::-1] + ahead.points, (back.end, ahead.end)
+    return BifurcationCurve(kind, path.along, path.places(y), orbits_of(path, y), points, ends)
