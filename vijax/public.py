@@ -23,6 +23,9 @@ from vijax.orbits.branch_dataset import dataset as branch_dataset
 from vijax.orbits.continuation import Branch
 from vijax.orbits.continuation import follow as follow_orbits
 from vijax.orbits.continuation_settings import ContinuationSettings
+from vijax.orbits.curve_dataset import curve_dataset
+from vijax.orbits.curves import BifurcationCurve, follow_curves
+from vijax.orbits.map_curves import MapCurves, bifurcation_curves
 from vijax.orbits.orbit_properties import impacts as orbit_impacts
 from vijax.orbits.orbit_properties import labels as orbit_labels
 from vijax.orbits.orbit_properties import path as orbit_path
@@ -45,6 +48,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AperiodicOptimum",
     "Average",
+    "BifurcationCurve",
     "Branch",
     "ContinuationSettings",
     "Design",
@@ -53,6 +57,7 @@ __all__ = [
     "HuntCrossley",
     "Impact",
     "ImpactPair",
+    "MapCurves",
     "Optimum",
     "Orbit",
     "Smoothness",
@@ -65,12 +70,15 @@ __all__ = [
     "average",
     "basin_fractions",
     "basins",
+    "bifurcation_curves",
     "branch_dataset",
     "cheapest_model",
     "compare",
+    "curve_dataset",
     "design_arrival",
     "design_extents",
     "find_orbits",
+    "follow_curves",
     "follow_families",
     "follow_orbits",
     "harvested_energy",

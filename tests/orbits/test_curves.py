@@ -4,7 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
+import vijax
 from vijax.model.device import Harvester
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
@@ -142,3 +144,66 @@ def test_a_curve_of_the_device_moves_what_the_device_does(met):
     points = [point for one in branches for point in one.points if point.kind == "pitchfork"]
     (curve,) = curves.follow_curves(points, "omega", {"omega": (3.0, 4.5), "s": (0.15, 0.3)}, device=device)
     np.testing.assert_allclose(curve.values[:, 1] * curve.values[:, 0] ** 2 / np.pi**2, pitchfork(0.5), rtol=1e-12)
+
+
+def test_the_dataset_has_what_the_curves_have(found, tmp_path):
+    listed = list(found.values())
+    table = vijax.curve_dataset(listed)
+    assert table.attrs["along"] == "d r"
+    for index, curve in enumerate(listed):
+        one = table.isel(curve=index)
+        assert (one["kind"].item(), one["end_first"].item(), one["end_last"].item()) == (curve.kind, *curve.ends)
+        assert one["label"].item() == "1:1"
+        size = len(curve.values)
+        np.testing.assert_array_equal(one["d"][:size], curve.values[:, 0])
+        assert np.isnan(one["d"][size:]).all()
+        assert [kind for kind in one["event"].values if kind] == [point.kind for point in curve.points]
+        if curve.points:
+            assert float(one["event_r"][0]) == curve.points[0].values[1]
+    vijax.save(table, tmp_path / "curves.zarr")
+    assert vijax.load(tmp_path / "curves.zarr")["kind"].values.tolist() == list(found)
+
+
+def test_a_picture_has_a_line_a_kind_and_a_mark_a_point(found):
+    table = vijax.curve_dataset(list(found.values()))
+    figure = vijax.plots.curves(table, unstable=True)
+    drawn = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
+    assert len({line.get_color() for line in drawn}) == 3
+    marks = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 1]
+    # The flip's end and the point of the graze there are one place.
+    assert len(marks) == len({point.kind + f"{point.values[0]:.4g}" for c in found.values() for point in c.points})
+
+
+def made_map(label=lambda d, r: d < pitchfork(r)):
+    """Make a map of rigid walls whose labels, "1:2" and "1:1", border on the pitchfork."""
+    d, r = np.linspace(0.2, 0.3, 9), np.linspace(0.3, 0.6, 7)
+    below = label(d[:, None], r[None])
+    one = np.ones(below.shape, int)
+    variables = {"period": one, "impacts_left": one, "impacts_right": one + below, "status": 0 * one}
+    still = {"gamma": 0.0, "v0": -0.3, "u0": 0.05}
+    return xr.Dataset({name: (("d", "r"), x) for name, x in variables.items()}, coords={"d": d, "r": r, **still})
+
+
+def test_a_map_is_explained_by_the_curve_on_its_border():
+    dataset = made_map()
+    found = vijax.bifurcation_curves(dataset, max_rounds=1, round_borders=4)
+    assert found.borders > 0
+    assert found.explained == found.borders
+    curve = max((one for one in found.curves if one.kind == "pitchfork"), key=lambda one: len(one.values))
+    np.testing.assert_allclose(curve.values[:, 0], pitchfork(curve.values[:, 1]), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(np.sort(curve.values[[0, -1], 1]), [0.3, 0.6], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "message"),
+    [
+        (made_map().drop_vars("period"), "dataset must hold period"),
+        (made_map().isel(d=0), "dataset must be a map over two parameters; got one over r"),
+        (made_map().isel(d=[0]), "dataset must have at least two values along each axis; got 1 and 7"),
+        (made_map().assign(period=0 * made_map()["period"]), "dataset must have periodic cells with impacts"),
+        (5, "dataset must be a dataset"),
+    ],
+)
+def test_a_map_without_labels_is_told(dataset, message):
+    with pytest.raises(ValueError, match=message):
+        vijax.bifurcation_curves(dataset)

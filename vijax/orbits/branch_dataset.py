@@ -38,15 +38,15 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     device = one_device(device)
     along = branches[0].along
     columns = [_columns(branch, device) for branch in branches]
-    found = {name: _padded([column[name] for column in columns]) for name in columns[0]}
+    found = {name: padded([column[name] for column in columns]) for name in columns[0]}
     dims = ("branch", "point", "impact")
     variables = {name: (dims[: values.ndim], values, _ABOUT[name]) for name, values in found.items() if name != along}
     events = [[point.kind for point in branch.points] for branch in branches]
     text = np.dtypes.StringDType()
     most = max(map(len, events), default=0)
     kinds = np.array([names + [""] * (most - len(names)) for names in events], dtype=text).reshape(len(branches), most)
-    values = _padded([np.array([point.value for point in branch.points]) for branch in branches])
-    places = _padded([_places(branch) for branch in branches])
+    values = padded([np.array([point.value for point in branch.points]) for branch in branches])
+    places = padded([_places(branch) for branch in branches])
     return xr.Dataset(
         variables
         | {"event": (("branch", "event_number"), kinds), "event_value": (("branch", "event_number"), values)}
@@ -110,7 +110,7 @@ def _places(branch: Branch) -> np.ndarray:
     return np.array([np.abs(passed - traits).sum(axis=1).argmin() for traits in met], dtype=float)
 
 
-def _padded(rows: list[np.ndarray]) -> np.ndarray:
+def padded(rows: list[np.ndarray]) -> np.ndarray:
     """Stack arrays of several shapes, NaN beyond each."""
     shape = np.max([row.shape for row in rows], axis=0)
     table = np.full((len(rows), *shape), np.nan)

@@ -59,8 +59,9 @@ def curve_events(path: CurvePath, walked: Walked, kind: str, settings: Continuat
         return []
     y, tangent, lengths = walked.y[index], walked.tangent[index], walked.lengths[index + 1]
     begun = np.where(test == TURN, np.linalg.norm(tangent[:, -2:], axis=1), walked.tests[index, test])
-    s, there, zero = locate(path, y, tangent, lengths, test, begun, settings)
-    still = _still(path, y, tangent, s)
+    paths = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), path)
+    s, there, zero = locate(paths, y, tangent, lengths, test, begun, settings)
+    still = np.linalg.norm(advance(paths, y, tangent, s).tangent[:, -2:], axis=1) < _STILL
     found = []
     for number in np.lexsort((s, index)):
         which = int(test[number])
@@ -72,12 +73,6 @@ def curve_events(path: CurvePath, walked: Walked, kind: str, settings: Continuat
         if ends:
             break
     return found
-
-
-def _still(path: CurvePath, y: np.ndarray, tangent: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Say whether the curve stands still in the plane there."""
-    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (s.size, *leaf.shape)), path)
-    return np.linalg.norm(advance(wide, y, tangent, s).tangent[:, -2:], axis=1) < _STILL
 
 
 def _named(path: CurvePath, test: int, y: np.ndarray, kind: str, settings: ContinuationSettings) -> tuple[str, bool]:

@@ -15,8 +15,8 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.quantities import synonyms
 from vijax.model.records import Status
-from vijax.orbits import orbit_properties, periodic, symmetry
-from vijax.orbits.arclength_step import advance
+from vijax.orbits import orbit_properties, periodic
+from vijax.orbits.arclength_step import BranchPlace, advance
 from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.continuation import MOST_POINTS
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
@@ -37,6 +37,7 @@ from vijax.runtime.context import door
 
 # A quantity whose bounds are farther apart than this counts in its logarithm.
 _DECADE = 10.0
+_AT_ONCE = 4  # starts of one family that are followed at once, though they may turn out to lie on one curve
 # Two starts on one curve differ from it by less than a step's bend; other curves of the same label are farther apart.
 _ON_CURVE = 5e-4
 
@@ -154,23 +155,95 @@ def _place(point: Point, along: str, plane: Plane, device: Harvester) -> tuple[f
 
 
 def curves_from(
-    starts: list[CurveStart], plane: Plane, device: Harvester, max_points: int, settings: ContinuationSettings
+    starts: list[CurveStart],
+    plane: Plane,
+    device: Harvester,
+    max_points: int,
+    settings: ContinuationSettings,
+    known: list[BifurcationCurve] | None = None,
 ) -> list[BifurcationCurve]:
-    """Follow every start that lies on no curve yet: one of each family at a time, all these together."""
+    """Follow every start that lies on no curve yet: one of each family at a time, all these together.
+
+    Args:
+        starts: All of one kind of wall, in the plane.
+        plane, device, max_points, settings: See `follow_curves`.
+        known: Curves that are there already.
+    """
+    left = unmet(_lanes(starts, plane, device, settings), known or [], plane)
     found: list[BifurcationCurve] = []
-    left = starts
     while left:
-        first: dict[tuple, CurveStart] = {}
-        for start in left:
-            first.setdefault(_family(start), start)
-        batches: dict[tuple, list[CurveStart]] = {}
-        for start in first.values():
-            batches.setdefault((start.kind == "grazing", start.orbit.knots.shape[1]), []).append(start)
+        chosen: dict[tuple, list[_Lane]] = {}
+        for lane in left:
+            family = chosen.setdefault(_family(lane.start), [])
+            if len(family) < _AT_ONCE:
+                family.append(lane)
+        batches: dict[tuple, list[_Lane]] = {}
+        for lane in (lane for family in chosen.values() for lane in family):
+            batches.setdefault((lane.path.condition, lane.first.y.size), []).append(lane)
+        new: list[BifurcationCurve] = []
         for batch in batches.values():
-            found += _followed(batch, plane, device, max_points, settings)
-        taken = set(map(id, first.values()))
-        left = [start for start in left if id(start) not in taken and not any(_on(start, one, plane) for one in found)]
+            new += _followed(batch, plane, max_points, settings)
+        taken = {id(lane) for batch in batches.values() for lane in batch}
+        left = unmet([lane for lane in left if id(lane) not in taken], new, plane)
+        found += new
     return found
+
+
+Traits = np.ndarray
+"""What tells an orbit from others, and its mirror image, a row each."""
+
+
+class _Lane(NamedTuple):
+    """A start on its curve, ready to be followed: what it is told apart by, the path, the first point."""
+
+    start: CurveStart
+    traits: Traits
+    path: CurvePath
+    first: BranchPlace
+
+
+def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: ContinuationSettings) -> list[_Lane]:
+    """Bring starts onto their curves; those are left out, with a warning, at which no real orbit is."""
+    batches: dict[tuple, list[CurveStart]] = {}
+    for start in starts:
+        batches.setdefault((start.kind == "grazing", start.orbit.knots.shape[1]), []).append(start)
+    lanes, lost = [], []
+    for batch in batches.values():
+        paths, y = _set_out(batch, plane, device, settings)
+        # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
+        across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
+        across = np.broadcast_to(across / np.linalg.norm(across), y.shape)
+        first = advance(paths, y, across, np.zeros(len(y)))
+        near = np.abs(first.y - y).max(axis=1) < settings.max_step
+        real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
+        for index, good in enumerate(real & (first.size <= settings.newton_tolerance)):
+            path, place = jax.tree.map(lambda leaf, i=index: leaf[i], (paths, first))
+            if good:
+                lanes.append(_Lane(batch[index], _traits(batch[index].orbit, images=True), path, place))
+            else:
+                lost.append(batch[index])
+    if lost:
+        told = ", ".join(f"{start.kind} at ({start.place[0]:.6g}, {start.place[1]:.6g})" for start in lost[:3])
+        warnings.warn(
+            f"{len(lost)} of {len(starts)} points begin no curve, as no ball flies the orbits around: {told}",
+            stacklevel=2,
+        )
+    return lanes
+
+
+def unmet(lanes: list[_Lane], curves: list[BifurcationCurve], plane: Plane) -> list[_Lane]:
+    """Keep the starts that lie on none of the curves, nor do their mirror images."""
+    paths = [(one.kind, np.column_stack([_traits(one.orbit), units(one.values, plane)])) for one in curves]
+
+    def lies(lane: _Lane) -> bool:
+        place = units(np.array(lane.start.place), plane)
+        return any(
+            kind == lane.start.kind and _distance(path, np.append(one, place)) < _ON_CURVE
+            for kind, path in paths
+            for one in lane.traits
+        )
+
+    return [lane for lane in lanes if not lies(lane)]
 
 
 def _family(start: CurveStart) -> tuple:
@@ -180,23 +253,21 @@ def _family(start: CurveStart) -> tuple:
     return start.kind, float(sequence.span[0]), bool(sequence.mirrored[0]), *walls
 
 
-def _on(start: CurveStart, curve: BifurcationCurve, plane: Plane) -> bool:
-    """Say whether a start lies on a curve, or its mirror image does."""
-    if start.kind != curve.kind:
-        return False
-    path = np.column_stack([_traits(curve.orbit), units(curve.values, plane)])
-    place = units(np.array(start.place), plane)
-    return any(_distance(path, np.append(one, place)) < _ON_CURVE for one in _traits(start.orbit, images=True))
-
-
-def _traits(orbit: Orbit, images: bool = False) -> np.ndarray:
+def _traits(orbit: Orbit, images: bool = False) -> Traits:
     """Give numbers that tell orbits apart, whichever impact they begin with; those of their mirror images, too."""
-    full = jax.tree.map(np.asarray, symmetry.unfolded(orbit))
-    own = orbit_properties.marks_of_knots(full.sequence.side, full.knots)
-    if not images or np.any(full.pair.gamma):
+    host = jax.tree.map(np.asarray, orbit)
+    side, knots = host.sequence.side, host.knots
+    half = orbit_properties.marks_of_knots(side, knots)
+
+    def later(wait: Any) -> np.ndarray:
+        return knots + np.array([1.0, 0.0, 0.0]) * np.broadcast_to(wait, host.sequence.span.shape)[:, None, None]
+
+    # An orbit closed half way goes on as its own mirror image.
+    again = orbit_properties.marks_of_knots(-side, later(host.sequence.span))
+    own = half + np.where(host.sequence.mirrored[:, None], again, 0.0)
+    if not images or np.any(host.pair.gamma) or host.sequence.mirrored.any():
         return own
-    mirror = orbit_properties.marks_of_knots(-full.sequence.side, full.knots + np.array([1.0, 0.0, 0.0]))
-    return np.concatenate([own, mirror])
+    return np.concatenate([own, orbit_properties.marks_of_knots(-side, later(1.0))])
 
 
 def _distance(path: np.ndarray, point: np.ndarray) -> float:
@@ -262,35 +333,21 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
 
 
 def _followed(
-    starts: list[CurveStart], plane: Plane, device: Harvester, max_points: int, settings: ContinuationSettings
+    batch: list[_Lane], plane: Plane, max_points: int, settings: ContinuationSettings
 ) -> list[BifurcationCurve]:
-    """Follow some starts both ways, all at once."""
-    paths, y = _set_out(starts, plane, device, settings)
-    # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
-    across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
-    across = np.broadcast_to(across / np.linalg.norm(across), y.shape)
-    first = advance(paths, y, across, np.zeros(len(y)))
-    real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1)
-    good = np.flatnonzero((first.size <= settings.newton_tolerance) & real)
-    if good.size < len(starts):
-        told = ", ".join(f"{starts[i].kind} at {starts[i].place}" for i in np.setdiff1d(np.arange(len(starts)), good))
-        warnings.warn(
-            f"{len(starts) - good.size} points begin no curve, as no real orbit is there: {told}", stacklevel=2
-        )
-    if not good.size:
-        return []
-    both = np.concatenate([good, good])
-    sign = np.repeat([-1.0, 1.0], good.size)[:, None]
-    lanes = jax.tree.map(lambda leaf: leaf[both], paths)
-    first = jax.tree.map(lambda leaf: leaf[both], first)
-    walked = walk(
-        lanes, first._replace(tangent=sign * first.tangent), max_points, settings, happenings_on_curves, FIRST_CURVE_END
-    )
-    found = []
-    for number, index in enumerate(good):
-        path = jax.tree.map(lambda leaf, i=index: leaf[i], paths)
-        ways = [_one_way(path, walked[number + shift], starts[index].kind, settings) for shift in (0, good.size)]
-        found.append(_joined(path, starts[index].kind, ways))
+    """Follow some starts both ways, all at once; of several on one curve one is kept."""
+    twice = [*batch, *batch]
+    paths = jax.tree.map(lambda *leaves: np.stack(leaves), *(lane.path for lane in twice))
+    first = jax.tree.map(lambda *leaves: np.stack(leaves), *(lane.first for lane in twice))
+    sign = np.repeat([-1.0, 1.0], len(batch))[:, None]
+    first = first._replace(tangent=sign * first.tangent)
+    walked = walk(paths, first, max_points, settings, happenings_on_curves, FIRST_CURVE_END)
+    found: list[BifurcationCurve] = []
+    for number, lane in enumerate(batch):
+        if unmet([lane], found, plane):
+            kind = lane.start.kind
+            ways = [_one_way(lane.path, walked[number + shift], kind, settings) for shift in (0, len(batch))]
+            found.append(_joined(lane.path, kind, ways))
     return found
 
 

@@ -58,7 +58,8 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
     if not index.size:
         return []
     before = (y[index], tangent[index], lengths[index + 1])
-    s, there, zero = locate(arc, *before, test, tests[index, test], settings)
+    arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
+    s, there, zero = locate(arcs, *before, test, tests[index, test], settings)
     found = [
         _Event(int(i), float(at), Tests._fields[t], y)
         for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
@@ -73,7 +74,7 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
 # time. That is a tenth of a second in a family of branches, and importing it takes 0.3 s; and a pitchfork, which is no
 # simple root, it leaves at a multiplier up to 2e-9 off, where this one comes to 4e-10.
 def locate(
-    path: Path,
+    paths: Path,
     y: np.ndarray,
     tangent: np.ndarray,
     length: np.ndarray,
@@ -81,12 +82,11 @@ def locate(
     low_f: np.ndarray,
     settings: ContinuationSettings,
 ):
-    """Find arclengths from points of a path at which test functions vanish, the points, and which are no poles."""
+    """Find arclengths from points of paths at which test functions vanish, the points, and which are no poles."""
     rows = np.arange(test.size)
-    wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), path)
 
     def look(s):
-        at = advance(wide, y, tangent, s)
+        at = advance(paths, y, tangent, s)
         return at.tests[rows, test], at.y
 
     low, high = np.zeros_like(length), length

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vijax.plots.branch_diagrams import branches
+    from vijax.plots.curve_maps import curves
     from vijax.plots.designs import design, design_map
     from vijax.plots.figure import save
     from vijax.plots.kind_maps import basins, label_map
@@ -18,6 +19,7 @@ else:
     # What stands where; a room is loaded, and matplotlib with it, when something of it is first asked for.
     _ROOMS = {
         "branches": "branch_diagrams",
+        "curves": "curve_maps",
         **dict.fromkeys(("design", "design_map"), "designs"),
         "save": "figure",
         **dict.fromkeys(("basins", "label_map"), "kind_maps"),
@@ -35,6 +37,7 @@ else:
 __all__ = [
     "basins",
     "branches",
+    "curves",
     "design",
     "design_map",
     "difference_map",

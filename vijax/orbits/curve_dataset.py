@@ -1,0 +1,108 @@
+"""Curves of bifurcations as one `xarray.Dataset`: what every orbit on them is, and what of codimension 2 was met."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vijax.model.label import label
+from vijax.model.quantities import AXES, MEASURED
+from vijax.orbits import orbit_properties
+from vijax.orbits.branch_dataset import padded
+from vijax.orbits.curves import BifurcationCurve
+from vijax.runtime import checks
+from vijax.runtime.context import door
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_ABOUT = {
+    "multiplier": MEASURED["multiplier"].attributes,
+    "multiplier_product": {"units": "1", "long_name": "product of both Floquet multipliers"},
+    "residual": {"units": "1", "long_name": "largest violation of the equations of the orbit"},
+    "status": {"units": "1", "long_name": "0: verified by the impact map"},
+    "stable": {"units": "1", "long_name": "whether stable orbits border on the curve there: 1 or 0"},
+}
+
+
+@door
+def curve_dataset(curves: list[BifurcationCurve]) -> "xr.Dataset":
+    """Make one dataset of curves in a plane: what every orbit is, and what was met, padded with NaN.
+
+    Args:
+        curves: Of one plane.
+
+    Returns:
+        Over (curve, point) both parameters, `multiplier` (largest modulus), `multiplier_product`, `residual`, `status`,
+        `stable`; over curve `kind`, the `label` of its orbits, `end_first`, `end_last`; over (curve, event) what of
+        codimension 2 was met: `event`, the grazing that ends the curve there as `event_test`, both parameters as
+        `event_` and their name.
+    """
+    import xarray as xr  # here, as importing vijax must not load it
+
+    listed = checks.sequence("curves", curves, BifurcationCurve, "curves, as curves.follow_curves returns them")
+    if not listed:
+        raise ValueError("curves must hold at least one; got none")
+    along = listed[0].along
+    if any(curve.along != along for curve in listed):
+        raise ValueError(f"curves must be of one plane; got {sorted({curve.along for curve in listed})}")
+    columns = [_columns(curve) for curve in listed]
+    found = {name: padded([column[name] for column in columns]) for name in columns[0]}
+    dims = ("curve", "point")
+    most = max(len(curve.points) for curve in listed)
+    events = [[point.kind for point in curve.points] for curve in listed]
+    tests = [[point.test for point in curve.points] for curve in listed]
+    places = padded([np.array([point.values for point in curve.points]).reshape(-1, 2) for curve in listed])
+    return xr.Dataset(
+        {name: (dims, found[name], about) for name, about in _ABOUT.items()}
+        | {
+            "kind": ("curve", _texts([curve.kind for curve in listed])),
+            "label": ("curve", _texts([_label(curve) for curve in listed])),
+            "end_first": ("curve", _texts([curve.ends[0] for curve in listed])),
+            "end_last": ("curve", _texts([curve.ends[1] for curve in listed])),
+            "event": (("curve", "event_number"), _table(events, most)),
+            "event_test": (("curve", "event_number"), _table(tests, most)),
+        }
+        | {
+            f"event_{name}": (("curve", "event_number"), places[..., index], AXES[name].attributes)
+            for index, name in enumerate(along)
+        },
+        coords={name: (dims, found[name], AXES[name].attributes) for name in along},
+        attrs={
+            "title": "Curves of bifurcations of a vibro-impact pair",
+            "along": " ".join(along),
+            "wall": "rigid" if listed[0].orbit.pair.rigid else "soft",
+        },
+    )
+
+
+def _columns(curve: BifurcationCurve) -> dict[str, np.ndarray]:
+    """Lay out what the dataset holds of a curve, a row a point."""
+    multipliers = np.asarray(curve.orbit.multipliers)
+    columns = {
+        curve.along[0]: curve.values[:, 0],
+        curve.along[1]: curve.values[:, 1],
+        "multiplier": np.abs(multipliers).max(axis=1),
+        "multiplier_product": multipliers.prod(axis=1).real,
+        "residual": curve.orbit.residual,
+        "status": curve.orbit.status,
+        "stable": curve.stable,
+    }
+    return {name: np.asarray(values, float) for name, values in columns.items()}
+
+
+def _label(curve: BifurcationCurve) -> str:
+    """Name the orbits of a curve, mirror images alike; where a curve ends they may be those of another."""
+    middle = len(curve.values) // 2
+    orbit = curve.orbit[middle : middle + 1]
+    counts = orbit_properties.counts(orbit)
+    merge = np.asarray(orbit.pair.gamma) == 0
+    return str(label(counts.period, counts.left, counts.right, merge_mirrors=merge)[0])
+
+
+def _texts(words: list[str]) -> np.ndarray:
+    return np.array(words, dtype=np.dtypes.StringDType())
+
+
+def _table(rows: list[list[str]], width: int) -> np.ndarray:
+    """Make a table of words of rows of several lengths."""
+    return _texts([word for row in rows for word in row + [""] * (width - len(row))]).reshape(len(rows), width)

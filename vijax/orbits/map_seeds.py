@@ -1,0 +1,161 @@
+"""What the orbits of some cells of a map meet along one of its axes: where curves over the map begin."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Status
+from vijax.orbits import orbit_search, periodic, symmetry
+from vijax.orbits.arclength_step import FIRST_END, Arc, Tests, advance
+from vijax.orbits.arclength_walk import walk
+from vijax.orbits.continuation import heading
+from vijax.orbits.continuation_settings import ContinuationSettings
+from vijax.orbits.curve_starts import CurveStart, curve_start
+from vijax.orbits.events import Point, changed, happenings, locate
+from vijax.orbits.map_borders import LabelledPlane
+from vijax.orbits.parameter import tilts
+from vijax.orbits.periodic import Orbit
+from vijax.runtime import tiles
+
+_SETTLE = 200  # forcing periods that a cell's ball is flown before Newton looks for its orbit
+_MOST_PERIOD, _MOST_IMPACTS = 4, 8  # of the orbits that seed curves; others are rare, and each width is a program
+_KINDS = {"speed": "grazing impact", "flight": "grazing flight", "fold": "fold", "minus": "flip"}
+
+
+def seeds(
+    plane: LabelledPlane,
+    cells: np.ndarray,
+    axis: np.ndarray,
+    reach: float,
+    steepest: float,
+    max_points: int,
+    settings: ContinuationSettings,
+) -> list[CurveStart]:
+    """Find the bifurcations that the orbits of some cells meet, each along an axis of the map.
+
+    Args:
+        plane: The map.
+        cells: Row and column of each.
+        axis: Along which of the map's parameters each orbit is followed.
+        reach: How many cells, at most.
+        steepest: g/A of the device.
+        max_points, settings: As in `follow`.
+    """
+    groups: dict[tuple, list[tuple[Orbit, np.ndarray]]] = {}
+    period = plane.period[tuple(cells.T)]
+    for number in np.unique(period[period <= _MOST_PERIOD]):
+        mine = np.flatnonzero(period == number)
+        for orbit, rows in _orbits(plane, cells[mine], int(number)):
+            for way in (0, 1):
+                some = axis[mine[rows]] == way
+                if some.any():
+                    key = way, orbit.knots.shape[1]
+                    groups.setdefault(key, []).append((orbit[np.flatnonzero(some)], mine[rows[some]]))
+    found = []
+    for (way, _), parts in groups.items():
+        orbit = periodic.concatenate([part for part, _ in parts])
+        where = cells[np.concatenate([rows for _, rows in parts])]
+        found += _met(plane, orbit, where, way, reach, steepest, max_points, settings)
+    return found
+
+
+def _orbits(plane: LabelledPlane, cells: np.ndarray, period: int) -> list[tuple[Orbit, np.ndarray]]:
+    """Find the orbits that attract the balls of some cells of a period, by width, with the rows of their cells."""
+    # As often as a power of two, so that few programs are compiled.
+    index = tuple(np.resize(cells, (tiles.padded(len(cells)), 2)).T)
+    given: dict[str, Any] = {name: None if x is None else x[index] for name, x in plane.cells.items()}
+    u, v = given.pop("u0"), given.pop("v0")
+    orbit = orbit_search.from_state(ImpactPair(**tiles.arrays(given)), u, v, period=period, settle=_SETTLE)
+    orbit = orbit[: len(cells)]
+    attracts = np.abs(np.asarray(orbit.multipliers)).max(axis=1) < 1
+    good = np.flatnonzero(
+        (np.asarray(orbit.status) == Status.OK) & attracts & (np.asarray(orbit.count) <= _MOST_IMPACTS)
+    )
+    closes = np.asarray(symmetry.symmetric(orbit))[good] & (not any(map(tilts, plane.along)))
+    found = []
+    for rows, half in ((good[closes], True), (good[~closes], False)):
+        if rows.size:
+            some = symmetry.halved(orbit[rows]) if half else orbit[rows]
+            width = np.array([tiles.padded(int(count)) for count in np.asarray(some.count)])
+            found += [(_trimmed(some[width == size], int(size)), rows[width == size]) for size in np.unique(width)]
+    return found
+
+
+def _trimmed(orbit: Orbit, width: int) -> Orbit:
+    """Leave out what pads orbits beyond a width; orbits of one width are followed by one program."""
+    host = jax.tree.map(np.asarray, orbit)
+    have = host.knots.shape[1]
+    more = ((0, 0), (0, max(width - have, 0)))
+    side = np.pad(host.sequence.side[:, :width], more)
+    knots = np.pad(host.knots[:, :width], (*more, (0, 0)), constant_values=np.nan)
+    return periodic.proven(host.pair, *periodic.guessed(side, host.sequence.span, host.sequence.mirrored, knots))
+
+
+def _met(
+    plane: LabelledPlane,
+    orbit: Orbit,
+    cells: np.ndarray,
+    way: int,
+    reach: float,
+    steepest: float,
+    max_points: int,
+    settings: ContinuationSettings,
+) -> list[CurveStart]:
+    """Follow orbits of one width both ways along one axis, and locate what they meet, all at once."""
+    values, size = plane.axes[way], len(orbit)
+    place = cells[:, way]
+    low, high = (np.interp(place + shift, np.arange(len(values)), values) for shift in (-reach, reach))
+    start, *others = tiles.arrays((values[place], np.full(size, steepest), low, high))
+    arcs = Arc(
+        orbit.pair,
+        orbit.sequence,
+        start,
+        *others,
+        along=plane.along[way],
+        newton_tolerance=settings.newton_tolerance,
+        max_corrections=settings.max_corrections,
+    )
+    arcs = jax.tree.map(np.asarray, arcs)
+    knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
+    y = np.concatenate([knots, (values[place] / (high - low))[:, None]], axis=1)
+    ahead = np.zeros_like(y)
+    ahead[:, -1] = 1.0
+    first = advance(arcs, y, ahead, np.zeros(size))
+    twice = np.tile(np.arange(size), 2)
+    both = jax.tree.map(lambda *leaves: np.concatenate(leaves), heading(first, -1.0), heading(first, 1.0))
+    wide = jax.tree.map(lambda leaf: leaf[twice], arcs)
+    walked = walk(wide, both, max_points, settings, happenings, FIRST_END)
+    # What happened, of all lanes: lane, point before it, test function.
+    parts = [(lane, *np.nonzero(changed(one.tests[:-1], one.tests[1:]))) for lane, one in enumerate(walked)]
+    rows = [(lane, i, t) for lane, index, test in parts for i, t in zip(index, test, strict=True)]
+    rows = [row for row in rows if Tests._fields[row[2]] in _KINDS]
+    if not rows:
+        return []
+    lanes, index, test = (np.array(column) for column in zip(*rows, strict=True))
+    begin = [np.stack([column[i] for column, i in _pick(walked, lanes, index, name)]) for name in ("y", "tangent")]
+    length = np.array([walked[lane].lengths[i + 1] for lane, i in zip(lanes, index, strict=True)])
+    before = np.array([walked[lane].tests[i, t] for lane, i, t in rows])
+    paths = jax.tree.map(lambda leaf: leaf[lanes], wide)
+    _, there, zero = locate(paths, *begin, length, test, before, settings)
+    pair, at = paths.pair_and_knots(there)
+    met = periodic.proven(pair, paths.sequence, at)
+    x = there[:, -1] * (paths.high - paths.low)
+    # A branch of mirror pairs turns where the two of a pair meet.
+    alike = np.asarray(symmetry.symmetric(met, settings.asymmetry)) & ~np.asarray(met.sequence.mirrored)
+    found = []
+    for row in np.flatnonzero(zero):
+        kind = _KINDS[Tests._fields[test[row]]]
+        if (kind == "flip" and met.sequence.mirrored[row]) or (kind == "fold" and alike[row]):
+            kind = "pitchfork"
+        other = plane.axes[1 - way][cells[twice[lanes[row]], 1 - way]]
+        where = (float(x[row]), float(other)) if way == 0 else (float(other), float(x[row]))
+        begun = curve_start(Point(kind, float(x[row]), met[row : row + 1]), where, settings.asymmetry)
+        if not isinstance(begun, str):
+            found.append(begun)
+    return found
+
+
+def _pick(walked: list, lanes: np.ndarray, index: np.ndarray, name: str) -> list[tuple[np.ndarray, int]]:
+    return [(getattr(walked[lane], name), int(i)) for lane, i in zip(lanes, index, strict=True)]

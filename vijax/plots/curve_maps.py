@@ -1,0 +1,114 @@
+"""Pictures of curves of bifurcations in their plane, alone or over a map."""
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal, Stroke
+
+from vijax.plots.figure import styled
+from vijax.plots.kind_maps import label_map
+from vijax.plots.number_maps import power_map
+from vijax.plots.style import axis_label, title
+from vijax.runtime import checks
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Ground = Literal["label", "P"]
+_NEEDED = ("kind", "stable", "event", "end_first")
+_COLOURS = {"fold": "tab:red", "flip": "tab:blue", "pitchfork": "black", "grazing": "tab:green"}
+_EDGE: list[Any] = [Stroke(linewidth=2.6, foreground="white"), Normal()]
+_POINT: dict[str, Any] = {"marker": "o", "markersize": 4, "color": "white", "mec": "black", "linestyle": "none"}
+_MOST_LISTED = 24  # points beside a picture; all of them stand in the dataset
+_FAINT = 0.25
+
+
+@styled
+def curves(
+    dataset: "xr.Dataset", over: "xr.Dataset | None" = None, *, ground: Ground = "label", unstable: bool = False
+) -> Figure:
+    """Draw curves of bifurcations in their plane, with numbered points of codimension 2, alone or over a map.
+
+    Args:
+        dataset: What `vijax.curve_dataset` returned.
+        over: The map that they are drawn over, with the same two axes and no others.
+        ground: What the map shows: its labels, or P as `power_map` does.
+        unstable: Whether grazings of unstable orbits are drawn too, faintly.
+
+    Raises:
+        ValueError: A map with other axes.
+    """
+    checks.variables("dataset", dataset, _NEEDED, "vijax.curve_dataset")
+    checks.choice("ground", ground, ("label", "P"))
+    names = dataset.attrs["along"].split()
+    if over is None:
+        figure, x, y = _bare(dataset, names), names[0], names[1]
+    else:
+        checks.variables("over", over, ("period",), "vijax.sweep")
+        x, y = map(str, over["period"].dims) if over["period"].ndim == 2 else ("", "")
+        if {x, y} != set(names):
+            got = ", ".join(map(str, over["period"].dims))
+            raise ValueError(f"over must be a map over {names[0]} and {names[1]} alone; got one over {got}")
+        figure = label_map(over) if ground == "label" else power_map(over)
+    axes = figure.axes[0]
+    kinds = _draw(axes, dataset, x, y, unstable)
+    lines = [Line2D([], [], color=_COLOURS[kind], label=kind) for kind in _COLOURS if kind in kinds]
+    figure.legend(handles=lines, loc="outside upper right", ncols=len(lines) or 1, frameon=False)
+    if listed := _number(axes, dataset, x, y):
+        handles = [Line2D([], [], **_POINT, label=text) for text in listed]
+        figure.legend(handles=handles, loc="outside right center", frameon=False, fontsize="x-small")
+    return figure
+
+
+def _bare(dataset: "xr.Dataset", names: list[str]) -> Figure:
+    """Make a figure of empty axes that hold all curves."""
+    figure = Figure(figsize=(5.2, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for name, limit, scale in zip(
+        names, (axes.set_xlim, axes.set_ylim), (axes.set_xscale, axes.set_yscale), strict=True
+    ):
+        low, high = float(dataset[name].min()), float(dataset[name].max())
+        scale("log" if low > 0 and high > 10 * low else "linear")
+        limit(low, high)
+    axes.set(xlabel=axis_label(dataset[names[0]]), ylabel=axis_label(dataset[names[1]]))
+    figure.suptitle(title(dataset), fontsize="medium")
+    return figure
+
+
+def _draw(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> set[str]:
+    """Draw every curve, and say which kinds there are."""
+    drawn = set()
+    for index in range(dataset.sizes["curve"]):
+        one = dataset.isel(curve=index)
+        kind, stable = str(one["kind"].item()), one["stable"].values == 1
+        across, up = one[x].values, one[y].values
+        parts = [(stable, {"path_effects": _EDGE, "linewidth": 1.2})]
+        if unstable:
+            parts.append((~stable, {"alpha": _FAINT, "linewidth": 0.8}))
+        for shown, style in parts:
+            if (shown & np.isfinite(across)).any():
+                axes.plot(np.where(shown, across, np.nan), up, color=_COLOURS[kind], **style)
+                drawn.add(kind)
+    return drawn
+
+
+def _number(axes: Axes, dataset: "xr.Dataset", x: str, y: str) -> list[str]:
+    """Mark and number the points of codimension 2, each place once, and tell what they are."""
+    rows = zip(
+        dataset["event"].values.flat,
+        dataset[f"event_{x}"].values.flat,
+        dataset[f"event_{y}"].values.flat,
+        strict=True,
+    )
+    listed: list[str] = []
+    for kind, across, up in rows:
+        text = f"{kind} ({across:.4g}, {up:.4g})"
+        if not kind or any(text == known.partition(" ")[2] for known in listed):
+            continue
+        listed.append(f"{len(listed) + 1} {text}")
+        axes.plot(across, up, **_POINT, zorder=6)
+        axes.annotate(str(len(listed)), (across, up), xytext=(3, 3), textcoords="offset points", fontsize="x-small")
+    return listed[:_MOST_LISTED] + ([f"and {len(listed) - _MOST_LISTED} more"] if len(listed) > _MOST_LISTED else [])
