@@ -17,7 +17,9 @@ One motion: `trajectory` returns a `Trajectory`, impact by impact, differentiabl
 Periodic orbits, stable or not: `find_orbits` from a sequence of impacts, `orbits_from_states` from states; an `Orbit`
 has its Floquet `multipliers`, and `orbit_impacts`, `orbit_labels`, `orbit_power` and `orbit_path` tell more.
 `follow_orbits` gives the `Branch` of each along a parameter, `follow_families` also those that begin on it,
-`branch_dataset` both as a dataset; `ContinuationSettings` decide the steps.
+`branch_dataset` both as a dataset; `ContinuationSettings` decide the steps. `follow_curves` follows what branches met
+in a plane of two parameters, each a `BifurcationCurve`; `bifurcation_curves` finds those that explain a map, as
+`MapCurves`; `curve_dataset` makes a dataset of them.
 
 The best device: `steady` is the steady state of an orbit, a `Steady` with derivatives; `average` is that of any motion,
 chaos too, an `Average` with derivatives, their errors and their `Smoothness`; `optimise` finds the `Design` that

@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from vijax.model.device import Harvester, one_device
-from vijax.model.quantities import synonyms
 from vijax.model.records import Status
 from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.arclength_step import BranchPlace, advance
@@ -28,15 +27,14 @@ from vijax.orbits.curve_equations import (
     happenings_on_curves,
 )
 from vijax.orbits.curve_events import CurvePoint, curve_events
+from vijax.orbits.curve_plane import Plane, check_plane, logarithmic, place_of, units
 from vijax.orbits.curve_starts import CurveStart, curve_start, with_touch
 from vijax.orbits.events import Point, orbits_at
-from vijax.orbits.parameter import MOVED, check_along
+from vijax.orbits.parameter import MOVED
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
-# A quantity whose bounds are farther apart than this counts in its logarithm.
-_DECADE = 10.0
 _AT_ONCE = 4  # starts of one family that are followed at once, though they may turn out to lie on one curve
 # Two starts on one curve differ from it by less than a step's bend; other curves of the same label are farther apart.
 _ON_CURVE = 5e-4
@@ -111,7 +109,7 @@ def follow_curves(
     starts: list[CurveStart] = []
     refused: list[str] = []
     for point in listed:
-        start = curve_start(point, _place(point, along, plane, device), settings.asymmetry)
+        start = curve_start(point, place_of(point, along, plane, device), settings.asymmetry)
         if isinstance(start, str):
             refused.append(start)
         else:
@@ -119,39 +117,6 @@ def follow_curves(
     if refused:
         warnings.warn(f"{len(refused)} of {len(listed)} points begin no curve: {refused[0]}", stacklevel=2)
     return curves_from(starts, plane, device, max_points, settings)
-
-
-Plane = dict[str, tuple[float, float]]
-
-
-def check_plane(pair: Any, within: Any) -> Plane:
-    """Take the bounds of two parameters in which curves of such a pair can be followed."""
-    if not isinstance(within, Mapping) or len(within) != 2:
-        raise ValueError(f"within must give two parameters their bounds; got {checks.shown(within)}")
-    plane = {name: check_along(pair, name, bounds) for name, bounds in within.items()}
-    one, other = plane
-    if other in synonyms(one):
-        raise ValueError(f"within must name two parameters; got {one} and {other}, which say the same; keep one")
-    return plane
-
-
-def _place(point: Point, along: str, plane: Plane, device: Harvester) -> tuple[float, float]:
-    """Find both parameters at a point of a branch; raise ValueError where the plane does not hold it."""
-    pair = point.orbit.pair
-    place = []
-    for name, (low, high) in plane.items():
-        if name == along:
-            value = point.value
-        elif name in ("d", "kappa", "r", "gamma"):
-            value = float(getattr(pair, name)[0])
-        elif along in plane:
-            value = float(device.m_b * device.omega0**2 if name == "k" else getattr(device, name))
-        else:
-            raise ValueError(f"along must be in the plane of {' and '.join(plane)}; got branches along {along}")
-        if not low <= value <= high:
-            raise ValueError(f"within must hold the points; got {(low, high)} and {name} = {value:.6g}")
-        place.append(value)
-    return place[0], place[1]
 
 
 def curves_from(
@@ -280,25 +245,10 @@ def _distance(path: np.ndarray, point: np.ndarray) -> float:
     return float(np.abs(begin + share[:, None] * step - point).max(axis=1).min())
 
 
-def _logarithmic(plane: Plane) -> tuple[bool, ...]:
-    """Say which parameters count in their logarithms."""
-    return tuple(low > 0 and high > _DECADE * low for low, high in plane.values())
-
-
-def units(values: np.ndarray, plane: Plane) -> np.ndarray:
-    """Measure places in the plane in its sides, from its lower corner."""
-    values = np.asarray(values, float)
-    columns = []
-    for index, ((low, high), logarithm) in enumerate(zip(plane.values(), _logarithmic(plane), strict=True)):
-        x = values[..., index]
-        columns.append(np.log(x / low) / np.log(high / low) if logarithm else (x - low) / (high - low))
-    return np.stack(columns, axis=-1)
-
-
 def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings: ContinuationSettings):
     """Make paths and unknowns of starts with as many impacts."""
     orbit = periodic.concatenate([start.orbit for start in starts])
-    size, (one, other), logarithmic = len(starts), plane, _logarithmic(plane)
+    size, (one, other), logarithms = len(starts), plane, logarithmic(plane)
     place = np.array([start.place for start in starts], float)
     touches = starts[0].kind == "grazing"
     rows = tiles.arrays(
@@ -320,7 +270,7 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
             )
         ),
         along=(one, other),
-        logarithmic=(logarithmic[0], logarithmic[1]),
+        logarithmic=(logarithms[0], logarithms[1]),
         condition=condition,
         newton_tolerance=settings.newton_tolerance,
         max_corrections=settings.max_corrections,

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 _SPREAD = 5  # so many cells a side are followed across the whole map at first
 _WHOLE_POINTS = 300  # of such a branch
 _REACH = 3.0  # cells on either side of a border that is looked at
-# Steps across a few cells, in units of these.
-_SHORT = {"first_step": 0.02, "max_step": 0.05}
+_FIRST_STEP, _MAX_STEP = 0.02, 0.05  # across them, in units of all that way
 
 
 class MapCurves(NamedTuple):
@@ -90,7 +89,7 @@ def bifurcation_curves(
     cells = _spread(plane)
     both = np.repeat([0, 1], len(cells))
     go_on(seeds(plane, np.tile(cells, (2, 1)), both, np.inf, steepest, _WHOLE_POINTS, settings))
-    short = dataclasses.replace(settings, **_SHORT)
+    short = dataclasses.replace(settings, first_step=_FIRST_STEP, max_step=_MAX_STEP)
     untried = left
     for _ in range(max_rounds):
         chosen = draw.permutation(len(untried))[:round_borders]

@@ -9,7 +9,7 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
 from vijax.orbits.arclength_step import FIRST_END, Arc, Tests, advance
-from vijax.orbits.arclength_walk import walk
+from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.continuation import heading
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start
@@ -107,12 +107,14 @@ def _met(
     values, size = plane.axes[way], len(orbit)
     place = cells[:, way]
     low, high = (np.interp(place + shift, np.arange(len(values)), values) for shift in (-reach, reach))
-    start, *others = tiles.arrays((values[place], np.full(size, steepest), low, high))
+    start, gravity, low_end, high_end = tiles.arrays((values[place], np.full(size, steepest), low, high))
     arcs = Arc(
-        orbit.pair,
-        orbit.sequence,
-        start,
-        *others,
+        pair=orbit.pair,
+        sequence=orbit.sequence,
+        start=start,
+        steepest=gravity,
+        low=low_end,
+        high=high_end,
         along=plane.along[way],
         newton_tolerance=settings.newton_tolerance,
         max_corrections=settings.max_corrections,
@@ -125,37 +127,48 @@ def _met(
     first = advance(arcs, y, ahead, np.zeros(size))
     twice = np.tile(np.arange(size), 2)
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), heading(first, -1.0), heading(first, 1.0))
-    wide = jax.tree.map(lambda leaf: leaf[twice], arcs)
-    walked = walk(wide, both, max_points, settings, happenings, FIRST_END)
-    # What happened, of all lanes: lane, point before it, test function.
-    parts = [(lane, *np.nonzero(changed(one.tests[:-1], one.tests[1:]))) for lane, one in enumerate(walked)]
-    rows = [(lane, i, t) for lane, index, test in parts for i, t in zip(index, test, strict=True)]
-    rows = [row for row in rows if Tests._fields[row[2]] in _KINDS]
-    if not rows:
+    paths = jax.tree.map(lambda leaf: leaf[twice], arcs)
+    walked = walk(paths, both, max_points, settings, happenings, FIRST_END)
+    still = plane.axes[1 - way][cells[twice, 1 - way]]
+    return _starts(paths, walked, still, way, settings)
+
+
+def _starts(
+    paths: Arc, walked: list[Walked], still: np.ndarray, way: int, settings: ContinuationSettings
+) -> list[CurveStart]:
+    """Locate what paths met, and make starts of it.
+
+    Args:
+        paths: A lane a row.
+        walked: What each passed.
+        still: The plane's other parameter of each.
+        way: Which of the two they were followed along.
+        settings: Of events.
+    """
+    lane = np.repeat(np.arange(len(walked)), [len(one.y) - 1 for one in walked])
+    before, after = (np.concatenate([one.tests[part] for one in walked]) for part in (slice(-1), slice(1, None)))
+    met, test = np.nonzero(changed(before, after) & np.isin(Tests._fields, list(_KINDS)))
+    if not met.size:
         return []
-    lanes, index, test = (np.array(column) for column in zip(*rows, strict=True))
-    begin = [np.stack([column[i] for column, i in _pick(walked, lanes, index, name)]) for name in ("y", "tangent")]
-    length = np.array([walked[lane].lengths[i + 1] for lane, i in zip(lanes, index, strict=True)])
-    before = np.array([walked[lane].tests[i, t] for lane, i, t in rows])
-    paths = jax.tree.map(lambda leaf: leaf[lanes], wide)
-    _, there, zero = locate(paths, *begin, length, test, before, settings)
-    pair, at = paths.pair_and_knots(there)
-    met = periodic.proven(pair, paths.sequence, at)
-    x = there[:, -1] * (paths.high - paths.low)
+    y = np.concatenate([one.y[:-1] for one in walked])[met]
+    tangent = np.concatenate([one.tangent[:-1] for one in walked])[met]
+    length = np.concatenate([one.lengths[1:] for one in walked])[met]
+    own = jax.tree.map(lambda leaf: leaf[lane[met]], paths)
+    _, there, zero = locate(own, y, tangent, length, test, before[met, test], settings)
+    pair, knots = own.pair_and_knots(there)
+    orbit = periodic.proven(pair, own.sequence, knots)
+    x, other = there[:, -1] * (own.high - own.low), still[lane[met]]
+    mirrored = np.asarray(orbit.sequence.mirrored)
     # A branch of mirror pairs turns where the two of a pair meet.
-    alike = np.asarray(symmetry.symmetric(met, settings.asymmetry)) & ~np.asarray(met.sequence.mirrored)
+    alike = np.asarray(symmetry.symmetric(orbit, settings.asymmetry)) & ~mirrored
     found = []
     for row in np.flatnonzero(zero):
         kind = _KINDS[Tests._fields[test[row]]]
-        if (kind == "flip" and met.sequence.mirrored[row]) or (kind == "fold" and alike[row]):
+        if (kind == "flip" and mirrored[row]) or (kind == "fold" and alike[row]):
             kind = "pitchfork"
-        other = plane.axes[1 - way][cells[twice[lanes[row]], 1 - way]]
-        where = (float(x[row]), float(other)) if way == 0 else (float(other), float(x[row]))
-        begun = curve_start(Point(kind, float(x[row]), met[row : row + 1]), where, settings.asymmetry)
+        value = float(x[row])
+        place = (value, float(other[row])) if way == 0 else (float(other[row]), value)
+        begun = curve_start(Point(kind, value, orbit[row : row + 1]), place, settings.asymmetry)
         if not isinstance(begun, str):
             found.append(begun)
     return found
-
-
-def _pick(walked: list, lanes: np.ndarray, index: np.ndarray, name: str) -> list[tuple[np.ndarray, int]]:
-    return [(getattr(walked[lane], name), int(i)) for lane, i in zip(lanes, index, strict=True)]

@@ -67,12 +67,9 @@ def _bare(dataset: "xr.Dataset", names: list[str]) -> Figure:
     """Make a figure of empty axes that hold all curves."""
     figure = Figure(figsize=(5.2, 4.6), layout="constrained")
     axes = figure.subplots()
-    for name, limit, scale in zip(
-        names, (axes.set_xlim, axes.set_ylim), (axes.set_xscale, axes.set_yscale), strict=True
-    ):
-        low, high = float(dataset[name].min()), float(dataset[name].max())
-        scale("log" if low > 0 and high > 10 * low else "linear")
-        limit(low, high)
+    limits = [(float(dataset[name].min()), float(dataset[name].max())) for name in names]
+    scales = ["log" if low > 0 and high > 10 * low else "linear" for low, high in limits]
+    axes.set(xscale=scales[0], yscale=scales[1], xlim=limits[0], ylim=limits[1])
     axes.set(xlabel=axis_label(dataset[names[0]]), ylabel=axis_label(dataset[names[1]]))
     figure.suptitle(title(dataset), fontsize="medium")
     return figure
@@ -85,7 +82,7 @@ def _draw(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> 
         one = dataset.isel(curve=index)
         kind, stable = str(one["kind"].item()), one["stable"].values == 1
         across, up = one[x].values, one[y].values
-        parts = [(stable, {"path_effects": _EDGE, "linewidth": 1.2})]
+        parts: list[tuple[np.ndarray, dict[str, Any]]] = [(stable, {"path_effects": _EDGE, "linewidth": 1.2})]
         if unstable:
             parts.append((~stable, {"alpha": _FAINT, "linewidth": 0.8}))
         for shown, style in parts:

@@ -1,0 +1,62 @@
+"""The plane in which curves are followed: two parameters between bounds, what is asked of them, and its units."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vijax.model.device import Harvester
+from vijax.model.quantities import synonyms
+from vijax.orbits.events import Point
+from vijax.orbits.parameter import check_along
+from vijax.runtime import checks
+
+# A quantity whose bounds are farther apart than this counts in its logarithm.
+_DECADE = 10.0
+
+Plane = dict[str, tuple[float, float]]
+
+
+def check_plane(pair: Any, within: Any) -> Plane:
+    """Take the bounds of two parameters in which curves of such a pair can be followed."""
+    if not isinstance(within, Mapping) or len(within) != 2:
+        raise ValueError(f"within must give two parameters their bounds; got {checks.shown(within)}")
+    plane = {name: check_along(pair, name, bounds) for name, bounds in within.items()}
+    one, other = plane
+    if other in synonyms(one):
+        raise ValueError(f"within must name two parameters; got {one} and {other}, which say the same; keep one")
+    return plane
+
+
+def place_of(point: Point, along: str, plane: Plane, device: Harvester) -> tuple[float, float]:
+    """Find both parameters at a point of a branch; raise ValueError where the plane does not hold it."""
+    pair = point.orbit.pair
+    place = []
+    for name, (low, high) in plane.items():
+        if name == along:
+            value = point.value
+        elif name in ("d", "kappa", "r", "gamma"):
+            value = float(getattr(pair, name)[0])
+        elif along in plane:
+            value = float(device.m_b * device.omega0**2 if name == "k" else getattr(device, name))
+        else:
+            raise ValueError(f"along must be in the plane of {' and '.join(plane)}; got branches along {along}")
+        if not low <= value <= high:
+            raise ValueError(f"within must hold the points; got {(low, high)} and {name} = {value:.6g}")
+        place.append(value)
+    return place[0], place[1]
+
+
+def logarithmic(plane: Plane) -> tuple[bool, ...]:
+    """Say which parameters count in their logarithms."""
+    return tuple(low > 0 and high > _DECADE * low for low, high in plane.values())
+
+
+def units(values: np.ndarray, plane: Plane) -> np.ndarray:
+    """Measure places in the plane in its sides, from its lower corner."""
+    values = np.asarray(values, float)
+    columns = []
+    for index, ((low, high), logarithm) in enumerate(zip(plane.values(), logarithmic(plane), strict=True)):
+        x = values[..., index]
+        columns.append(np.log(x / low) / np.log(high / low) if logarithm else (x - low) / (high - low))
+    return np.stack(columns, axis=-1)
