@@ -11,6 +11,7 @@ import argparse
 import sys
 import time
 import warnings
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ SAME = 1e-6  # two crossings nearer than this are one
 _FOLLOWED = ("fold", "flip", "pitchfork", "grazing flight", "grazing impact")
 
 
-def pitchfork(r: np.ndarray) -> np.ndarray:
+def pitchfork(r: Any) -> Any:
     """Give the gap at which the symmetric orbit of rigid walls breaks, level."""
     q = (1 + r) / (np.pi * (1 - r))
     return (1 - 4 / np.pi**2) * q / np.sqrt(1 + 4 * q * q)
@@ -61,10 +62,12 @@ def known() -> None:
     d, r = broken.values.T
     say("rigid 1:1, pitchfork: largest error of d", f"{np.abs(d - pitchfork(r)).max():.1e}")
     say("rigid 1:1, pitchfork: r from, to; ends", f"{r.min():.6f}, {r.max():.6f}; {broken.ends}")
-    (flip,) = (curve for curve in curves if curve.kind == "flip")
-    (graze,) = (curve for curve in curves if curve.kind == "grazing")
-    sides = [next(p.values for p in curve.points if p.kind == "flip-graze") for curve in (flip, graze)]
-    say("flip-graze from either side: largest difference", f"{np.abs(np.subtract(*sides)).max():.1e}")
+    sides = {
+        kind: [np.array(p.values) for c in curves if c.kind == kind for p in c.points if p.kind == "flip-graze"]
+        for kind in ("flip", "grazing")
+    }
+    apart = min(np.abs(one - other).max() for one in sides["flip"] for other in sides["grazing"])
+    say("flip-graze from either side: difference", f"{apart:.1e}")
     products("rigid", curves)
     soft = soft_curves()
     products("soft", soft)
@@ -179,7 +182,7 @@ def speed() -> None:
 
 def explained() -> None:
     """Count the borders between labels of periodic cells that lie within one cell of a curve, on two planes."""
-    planes = {
+    planes: dict[str, dict[str, Any]] = {
         "d x kappa, 256 x 256": {"d": np.linspace(0.05, 0.3, 256), "kappa": np.geomspace(3, 400, 256), "r": 0.5},
         "omega x omega0, 128 x 128": {
             "omega": np.linspace(3.0, 12.0, 128),

@@ -24,6 +24,7 @@ _EDGE: list[Any] = [Stroke(linewidth=2.6, foreground="white"), Normal()]
 _POINT: dict[str, Any] = {"marker": "o", "markersize": 4, "color": "white", "mec": "black", "linestyle": "none"}
 _MOST_LISTED = 24  # points beside a picture; all of them stand in the dataset
 _FAINT = 0.25
+_COLUMNS, _LINE_HEIGHT, _LIST_WIDTH = 3, 0.17, 2.2  # of the legend; inches
 
 
 @styled
@@ -55,11 +56,16 @@ def curves(
         figure = label_map(over) if ground == "label" else power_map(over)
     axes = figure.axes[0]
     kinds = _draw(axes, dataset, x, y, unstable)
-    lines = [Line2D([], [], color=_COLOURS[kind], label=kind) for kind in _COLOURS if kind in kinds]
-    figure.legend(handles=lines, loc="outside upper right", ncols=len(lines) or 1, frameon=False)
-    if listed := _number(axes, dataset, x, y):
-        handles = [Line2D([], [], **_POINT, label=text) for text in listed]
-        figure.legend(handles=handles, loc="outside right center", frameon=False, fontsize="x-small")
+    handles = [Line2D([], [], color=_COLOURS[kind], label=kind) for kind in _COLOURS if kind in kinds]
+    handles += [Line2D([], [], **_POINT, label=text) for text in _number(axes, dataset, x, y)]
+    # A map of labels has its legend beside it, one of P below.
+    beside = over is not None and ground == "P"
+    columns = 1 if beside else _COLUMNS
+    width, height = figure.get_size_inches()
+    more = _LINE_HEIGHT * -(-len(handles) // columns)
+    figure.set_size_inches((width + _LIST_WIDTH, max(height, more)) if beside else (width, height + more))
+    style: dict[str, Any] = {"ncols": columns, "frameon": False, "fontsize": "x-small"}
+    figure.legend(handles=handles, loc="outside right upper" if beside else "outside lower center", **style)
     return figure
 
 
