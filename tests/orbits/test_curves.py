@@ -26,7 +26,10 @@ def met():
 
 @pytest.fixture(scope="module")
 def found(met):
-    return {curve.kind: curve for curve in curves.follow_curves(met, "d", PLANE)}
+    listed = curves.follow_curves(met, "d", PLANE)
+    # Five points of three kinds: the two of a mirror pair lie on one curve.
+    assert len(listed) == 3
+    return {curve.kind: curve for curve in listed}
 
 
 def pitchfork(r):
@@ -36,7 +39,6 @@ def pitchfork(r):
 
 
 def test_every_curve_is_found_once(met, found):
-    # Five points of three kinds: the two of a mirror pair lie on one curve.
     assert sorted(point.kind for point in met) == ["flip"] * 2 + ["grazing flight"] * 2 + ["pitchfork"]
     assert sorted(found) == ["flip", "grazing", "pitchfork"]
 
