@@ -6,7 +6,7 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 import vijax
-from docs import generated
+from docs import docstrings, generated
 
 project = "vijax"
 version = release = vijax.__version__
@@ -43,3 +43,4 @@ html_show_sourcelink = False
 def setup(app: Sphinx) -> None:
     """Write what pages show of the program itself before they are read."""
     app.connect("builder-inited", lambda _: generated.write())
+    docstrings.setup(app)

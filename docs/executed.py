@@ -44,6 +44,11 @@ def pages() -> Iterator[Path]:
             yield path
 
 
+def changed() -> Iterator[Path]:
+    """List the pages whose code has changed since they were executed."""
+    return (path for path in pages() if kept(read_page(path)) is None)
+
+
 def read_page(path: Path) -> NotebookNode:
     """Read a page as a notebook without outputs."""
     return read_myst_markdown_notebook(path.read_text(encoding="utf-8"), add_source_map=True)

@@ -86,21 +86,23 @@ BAD = [
     (["--set", "V"], "NAME=VALUE"),
     (["--set", "m_b=-1"], "m_b must be positive"),
     (["--out", "nowhere/map.zarr"], "out must lie in a folder that exists"),
+    (["--out", "/dev/null/map.zarr"], "exists; got /dev/null/map.zarr; /dev/null is no folder, take another place"),
     (["--out", "map.nc"], "out must end in .zarr"),
     (["--plot", "map.doc"], "plot must end in"),
     (["--omega", "3:12:50"], "at most 36 panels; got 50 values of omega"),
-    (["--d", "0.1", "--kappa", "30"], "single cell"),
+    (["--d", "0.1", "--kappa", "30", "--plot", "map.png"], "single cell"),
     (["--tolerance", "0.05"], "tolerance must come with compare; got 0.05 alone"),
     (["--compare", "rigid", "--tolerance", "0"], "tolerance must be a positive number"),
     (["--compare", "rigid", "--tolerance=-0.1"], "tolerance must be a positive number"),
     (["--compare", "rigid", "--tolerance", "nan"], "tolerance must be a positive number"),
     (["--compare", "rigid", "--tolerance", "5 percent"], "tolerance must be a part such as 5% or 0.05"),
     (["--compare", "rigid", "--tolerance=-5%"], "tolerance must be a positive number"),
+    (["--compare", "rigid", "--tolerance", "5"], "tolerance must be a part such as 5% or 0.05; got '5'; write 5%"),
     (["--compare", "soft"], "compare must be"),
     (["--compare", "rigid", "--wall", "rigid"], "wall must not be chosen with compare"),
     (["--compare", "rigid", "--outputs", "P"], "outputs must not be chosen with compare"),
     (["--compare", "rigid", "--u0", "0.2", "--d", "0.1,0.2"], "u0 must lie in the gap"),
-    (["--compare", "rigid", "--d", "0.1", "--kappa", "30"], "single cell"),
+    (["--compare", "rigid", "--d", "0.1", "--kappa", "30", "--plot", "map.png"], "single cell"),
     (["--compare", "rigid", "--plot", "map.doc"], "plot must end in"),
     (["--refine", "0"], "refine must be a whole number of at least 1; got 0"),
     (["--refine", "9"], "refine must leave 4 steps .* at most 4 levels for 128 values; got 9"),
@@ -114,7 +116,7 @@ BAD = [
     (["--show", "power", "--compare", "rigid"], "show must be left out with compare"),
     (["--show", "power", "--outputs", "P"], "outputs must hold power for a picture"),
     (["--show", "status", "--kappa", "3"], "two axes of more than one value; got d alone"),
-    (["--show", "max_penetration", "--d", "0.1", "--kappa", "3"], "single cell"),
+    (["--show", "max_penetration", "--d", "0.1", "--kappa", "3", "--plot", "map.png"], "single cell"),
     (["--show", "label", "--kappa", "3"], "two axes of more than one value; got d alone"),
     (["--gravity", "1"], "No such option"),
     (["more"], "unexpected extra argument"),
@@ -240,8 +242,25 @@ def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
     assert script.main(["--refine", "3", "--plot", "map.png"]) == 0
     assert plans[0].refine == 3
     out = capsys.readouterr().out
-    assert out.startswith("1 cells in")
+    assert out.startswith("1 cell in")
     assert "cells computed: 1 of 2 shown, 50.0%; the others filled" in out
+
+
+@pytest.mark.parametrize(("admissible", "says"), [(True, "admissible\n"), (False, "inadmissible; see docs: model\n")])
+def test_one_cell_has_no_picture_unless_asked_for_and_its_energy_is_said(folder, capsys, monkeypatch, admissible, says):
+    ok = ("d", [0], {"flag_values": [0], "flag_meanings": "ok"})
+    found = xr.Dataset({"status": ok, "P": ("d", [2e-5]), "admissible": ("d", [admissible])})
+
+    def run(plan, tell, *_):
+        tell(0, 1)
+        tell(1, 1)
+        return found
+
+    monkeypatch.setattr(sweep, "run", run)
+    assert script.main(["--d", "0.1", "--kappa", "50"]) == 0
+    out = capsys.readouterr().out
+    assert f"P: 2e-05 J per half period, {says}" in out
+    assert "wrote power_map.zarr\n" in out
 
 
 def test_the_progress_bar_follows_a_total_that_grows(capsys):

@@ -6,12 +6,14 @@ In one file, as the programs compiled for the one serve the other.
 import dataclasses
 import json
 import math
+import re
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
 import vijax
 from scripts import design as script
@@ -20,7 +22,7 @@ from vijax.design import robustness as around
 from vijax.design.objective import Batch, Scene
 from vijax.design.report import describe
 from vijax.design.report_lines import lines, table
-from vijax.design.tolerance import Tolerance, nodes
+from vijax.design.tolerance import Spread, Tolerance, nodes
 from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.runtime.files import write_json
@@ -192,6 +194,32 @@ def test_optima_are_ranked_by_what_their_devices_give_whatever_their_motion(foun
     for order, ahead in ((ranking, False), (ranking[::-1], True)):
         told = describe(fast, tolerances=[Tolerance("omega0", 0.05)], spread=spread, ranking=order)
         assert ("another optimum gives more there" in "\n".join(lines(told))) == ahead
+
+
+def test_a_report_says_which_devices_count_in_mean_and_worst(found):
+    tolerance = [Tolerance("omega0", 0.02)]
+    said = []
+    for spread in (Spread(3e-5, 2e-5, 0.0, 0.0), Spread(2e-5, 3e-5, 0.0, 0.438), Spread(2e-5, 0.0, 0.1, 0.0)):
+        told = "\n".join(lines(describe(found[0], tolerances=tolerance, spread=spread)))
+        said.append([re.search(rf"{name} P .* of nominal(.*)", told)[1] for name in ("mean", "worst")])
+    assert said[0] == ["", ""]
+    assert said[1] == [", those that are inadmissible counting nothing", ", inadmissible ones counting what they give"]
+    assert said[2] == [", those that lose the motion counting nothing", ""]
+
+
+@pytest.mark.parametrize(
+    ("depth", "ratio", "says"),
+    [
+        (0.00593, 0.155, "beyond your penetration limit: P alone would choose s = 0.1 m"),
+        (0.00593, 1.5, "not physical: P alone"),
+        (0.007, 0.155, "not physical: P alone"),
+    ],
+)
+def test_what_only_your_limit_forbids_is_called_physical(found, depth, ratio, says):
+    one = {"P": 1.0, "max_penetration": depth, "energy_ratio": ratio, "admissible": False}
+    values = {name: (("direction", "s"), [[value]]) for name, value in one.items()}
+    diagram = xr.Dataset(values, {"s": [0.1]}, {"along": "s", "harvester_R0": 0.0063})
+    assert says in "\n".join(lines(describe(found[0], diagram=diagram)))
 
 
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):

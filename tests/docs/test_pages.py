@@ -141,6 +141,39 @@ def test_what_a_function_returns_is_not_read_as_a_type(built):
     assert not re.findall(r"Return type<|>Type<", text)
 
 
+def test_the_page_of_functions_is_in_public_names_says_nothing_twice_and_keeps_lines_of_examples(built):
+    text = (built / "reference/functions.html").read_text(encoding="utf-8")
+    assert "Alias for field" not in text
+    assert "Settings(first_step" not in text
+    plain = html.unescape(re.sub(r"<[^>]+>", "", text))
+    assert "optimise_all" not in plain
+    assert "As in follow_orbits; symmetric orbits" in plain
+    assert re.search(r"periods, until, transient, device, dtype, progress, axes.{,9}As in sweep", plain, re.S)
+    said = [line for line in plain.splitlines() if "symmetric orbits are closed half way" in line]
+    assert len(said) == 1
+    blocks = [html.unescape(re.sub(r"<[^>]+>", "", one)) for one in re.findall(r"<pre>(.*?)</pre>", text, re.S)]
+    (example,) = [one for one in blocks if one.startswith("sweep(d=np.linspace")]
+    assert len(example.splitlines()) == 3
+
+
+def test_execution_ends_in_a_sentence_on_what_changed_and_stops_without_a_traceback(monkeypatch, capsys, tmp_path):
+    found = {"start.md": [], "maps.md": ["kept:\n1\ncame:\n2"]}
+    pages = [executed.HERE / name for name in found]
+    monkeypatch.setattr(executed, "pages", lambda: iter(pages))
+    monkeypatch.setattr(executed, "stray", list)
+    monkeypatch.setattr(executed, "execute", lambda page: found[page.name])
+    monkeypatch.setattr("docs.__main__.build_main", lambda _: 0)
+    assert main(["--execute", "--into", str(tmp_path)]) == 1
+    assert capsys.readouterr().out.splitlines()[-1] == "executed 2 pages: other outputs than before on maps.md"
+
+    def stopped(page):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(executed, "execute", stopped)
+    assert main(["--execute", "--into", str(tmp_path)]) == 130
+    assert "stopped" in capsys.readouterr().out
+
+
 # --- as a browser shows them -----------------------------------------------------------------------------------------
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -138,3 +138,10 @@ def test_a_diagram_may_be_along_every_parameter():
 def test_the_table_is_had_without_jax():
     source = Path(quantities.__file__).read_text()
     assert not re.findall(r"^(?:import|from) (?:jax|numpy|vijax)", source, re.MULTILINE)
+
+
+def test_a_name_that_is_no_constant_is_refused_with_those_that_are():
+    with pytest.raises(TypeError, match=r"mass must be a constant of the device; known are m_b, .*limit$"):
+        Harvester(mass=1.0)
+    with pytest.raises(TypeError, match=r"a membrane of stiffness k has omega0 = sqrt\(k/m_b\)$"):
+        Harvester(k=3.0)

@@ -248,6 +248,21 @@ def test_one_axis_is_a_curve():
     assert isinstance(figure.legends[0], Legend)
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "marks"),
+    [(20, 200, ["20", "50", "100", "200"]), (30, 50, ["30", "35", "40", "45", "50"])],
+)
+def test_logarithmic_axes_of_few_decades_have_plain_labels_that_do_not_meet(low, high, marks):
+    figure = number_maps.power_map(drawn_map(omega0=np.geomspace(low, high, 12), d=D))
+    figure.draw_without_rendering()
+    axis = figure.axes[0].xaxis
+    first, last = axis.get_view_interval()
+    places = zip(axis.get_majorticklocs(), axis.get_majorticklabels(), strict=True)
+    shown = [text.get_text() for at, text in places if first <= at <= last]
+    assert shown == marks
+    assert not axis.get_minorticklocs().size
+
+
 def test_a_map_without_energy_is_drawn():
     found = drawn_map(d=D, kappa=KAPPA)
     found["P"][:] = 0.0

@@ -65,11 +65,15 @@ def about(option: str) -> Iterator[None]:
 
 
 def part(option: str, text: str) -> float:
-    """Read a part of a whole, written 5% or 0.05."""
+    """Read a part of a whole, written 5% or 0.05; what is more than the whole must be written in percent."""
+    percent = text.endswith("%")
     try:
-        return float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+        value = float(text.removesuffix("%")) / (100 if percent else 1)
     except ValueError:
         raise ValueError(f"{option} must be a part such as 5% or 0.05; got {text!r}") from None
+    if value > 1 and not percent:
+        raise ValueError(f"{option} must be a part such as 5% or 0.05; got {text!r}; write {text}% if that is meant")
+    return value
 
 
 def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft") -> "tuple[ImpactPair, Harvester]":

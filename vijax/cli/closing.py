@@ -45,7 +45,12 @@ def close(summary: str, *written: Path | None) -> None:
 def pace(count: int, seconds: float, unit: str = "cells") -> str:
     """Say how much was done in what time."""
     rate = count / seconds
-    return f"{count:,} {unit} in {seconds:.2f} s, {rate:{',.0f' if rate >= 100 else '.3g'}} {unit}/s"
+    return f"{how_many(count, unit)} in {seconds:.2f} s, {rate:{',.0f' if rate >= 100 else '.3g'}} {unit}/s"
+
+
+def how_many(count: int, unit: str) -> str:
+    """Write a number of things, of which one has no plural: 1 cell, 2,000 cells."""
+    return f"{count:,} {unit.removesuffix('s') if count == 1 else unit}"
 
 
 def flags(variable: "xr.DataArray") -> str:

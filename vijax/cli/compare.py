@@ -11,7 +11,7 @@ from vijax.cli.closing import finish, flags, statuses
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
 from vijax.cli.sweep import PLANE, plane_options, run_options
-from vijax.cli.targets import targets
+from vijax.cli.targets import drawn, targets
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,9 +24,11 @@ _FILES = ("comparison.zarr", "comparison.png")
 def difference_map(constants: tuple[str, ...], tolerance: str | None, overwrite: bool, yes: bool, **given: Any) -> None:
     """Map what rigid walls change: the energy and the attractor."""
     with process.door():
-        out, plot = targets(given.pop("out"), given.pop("plot"), _FILES, overwrite)
+        picture = given.pop("plot")
+        out, plot = targets(given.pop("out"), picture, _FILES, overwrite)
         axes, made = take_axes(given, PLANE), device(constants)
         planned = _plan(axes, made, tolerance, given)
+        plot = drawn(plot, picture, planned.soft.cells.sizes)
         _check(planned, plot)
         _agree(planned, yes)
     if plot is not None:

@@ -10,7 +10,7 @@ import click
 
 from vijax.cli import options, process
 from vijax.cli.arguments import about, at_one_point, device, part, take_axes
-from vijax.cli.closing import close
+from vijax.cli.closing import close, how_many
 from vijax.cli.kinds import Choice, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
@@ -136,7 +136,7 @@ def _run(asked: DesignRequest) -> "tuple[dict[str, Any], xr.Dataset | None, str]
         waiting("surroundings and tolerances")
         told = [report.describe(one, diagram=diagram, **_judged(one, asked, alone)) for one in found]
         show(stages, stages)
-    climbed = f"{sum(one.ascents for one in found):,} ascents in {seconds:.1f} s"
+    climbed = f"{how_many(sum(one.ascents for one in found), 'ascents')} in {seconds:.1f} s"
     if asked.over is None:
         return told[0], diagram, climbed
     return {"over": {"name": asked.over[0], "values": asked.over[1]}, "designs": told}, None, climbed

@@ -13,7 +13,7 @@ from vijax.cli.closing import finish, statuses, tally
 from vijax.cli.kinds import Choice, Real, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
-from vijax.cli.targets import targets
+from vijax.cli.targets import drawn, targets
 from vijax.model.choices import SolverName
 from vijax.runtime.pages import see
 
@@ -41,9 +41,11 @@ def power_map(
     with process.door():
         _check_show(show, given["until"])
         files = _FILES.get(show, (f"{show}_map.zarr", f"{show}_map.png"))
-        out, plot = targets(given.pop("out"), given.pop("plot"), files, overwrite, goes_on=True)
+        picture = given.pop("plot")
+        out, plot = targets(given.pop("out"), picture, files, overwrite, goes_on=True)
         axes, made = take_axes(given, PLANE), device(constants)
         planned = _plan(axes, made, _wanted(outputs, show), given)
+        plot = drawn(plot, picture, planned.cells.sizes)
         if plot is not None:
             _check_picture(plot, planned, show)
         crew = _crew(planned, workers, scheduler, out)
@@ -170,7 +172,9 @@ def _summary(dataset: "xr.Dataset") -> str:
             order=lambda period: period if period > 0 else math.inf,
         )
         lines.append(f"cells by period: {periods}")
-    if {"P", "admissible"} <= set(dataset):
+    if "P" in dataset and dataset["P"].size == 1:
+        lines.append(f"P: {_only(dataset)}")
+    elif {"P", "admissible"} <= set(dataset):
         peak = best(dataset)
         lines.append(f"largest admissible P: {see('model', 'none') if peak is None else _place(peak, dataset)}")
     return "\n".join(lines)
@@ -178,7 +182,15 @@ def _summary(dataset: "xr.Dataset") -> str:
 
 def _place(peak: "xr.DataArray", dataset: "xr.Dataset") -> str:
     where = ", ".join(f"{dim} = {float(peak[dim]):.6g}" for dim in dataset["P"].dims)
-    return f"{float(peak):.6g} J per half period at {where or 'the only cell'}"
+    return f"{float(peak):.6g} J per half period at {where}"
+
+
+def _only(dataset: "xr.Dataset") -> str:
+    """Say what the only cell of a map gives, and whether to believe it."""
+    said = f"{float(dataset['P'].squeeze()):.6g} J per half period"
+    if "admissible" not in dataset:
+        return said
+    return f"{said}, admissible" if bool(dataset["admissible"].squeeze()) else see("model", f"{said}, inadmissible")
 
 
 # --- the page --------------------------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """The store and the picture that a run will write, looked at before it begins."""
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 
 
@@ -20,6 +22,11 @@ def targets(
     store = None if out is None else _store(out, ending, overwrite, goes_on)
     again = goes_on and not overwrite and store is not None and store.exists()
     return store, None if plot is None else _picture(plot, overwrite, again)
+
+
+def drawn(plot: Path | None, given: str | None, sizes: Mapping[str, int]) -> Path | None:
+    """Leave out a picture that nobody asked for where there is but one cell, of which none can be drawn."""
+    return None if given is None and math.prod(sizes.values()) == 1 else plot
 
 
 def _store(out: str, ending: str, overwrite: bool, goes_on: bool) -> Path:

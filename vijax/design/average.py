@@ -138,6 +138,8 @@ def average(
 ) -> Average:
     """Average what a device with soft walls gives, with derivatives; under jit, vmap and grad (both modes, once).
 
+    ::
+
         found = average(device)
         found.P, found.P_stderr, found.by_device.omega0, found.by_device_stderr.omega0, found.smooth
         jax.grad(lambda device: average(device).P)(device)  # the same derivatives

@@ -47,7 +47,7 @@ class Design:
     One of them, the best, may be of a motion that is no orbit (`AperiodicOptimum`).
 
     Attributes:
-        optima: See there.
+        optima: The distinct ones that were found, the best first.
         tune, bounds: What was tuned, between which values.
         objective: Of `OBJECTIVES`.
         tolerances: Of the objective.
@@ -96,9 +96,23 @@ def optimise(
 
     Args:
         device: Where quantities that are not tuned are taken from; Tables I and II unless given.
-        tune, bounds, objective, motion, tolerances, reliability, samples: What is sought: as in
-            `vijax.design.optimise.optimise_all`, which takes many devices at once.
-        survey_points, starts, survey_periods, max_impacts, max_evaluations, settings: How far to look: likewise.
+        tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's.
+        bounds: Of tuned quantities, (low, high) by name. Unless given: kappa 2 to 400, omega0 and k as that gives them,
+            r 0.05 to 0.95, inclinations +-0.1 rad, all else half to twice what the device has.
+        objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P on
+            one orbit; "expected" P, over balls that start anywhere and over the tolerances, if there are any.
+        motion: "any" takes the best motion, chaos too, whose averages ensembles of balls climb; "periodic" the best
+            orbit. Over tolerances orbits alone are followed.
+        tolerances: How constants scatter, `Tolerance` records, for "mean", "worst" and "expected".
+        reliability: Share of the balls of "expected" that have to keep the limits in all that is flown.
+        samples: Random devices for "mean" and "worst", in place of a quadrature.
+        survey_points: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself,
+            where chaos promises more than the best orbit so far: there the best orbit may live in a narrow window.
+        starts: Of the ball, from which it looks at each of them; more meet attractors with small basins.
+        survey_periods: Forcing periods that each of them may take.
+        max_impacts: Of an orbit, 1 to 256: longer ones are not looked for. Fewer are compiled and climb faster.
+        max_evaluations: Of objective and gradient, in one ascent.
+        settings: Of survey, ascent and verification; see `DesignSettings`.
 
     Raises:
         ValueError: Which argument, what must hold, what came.
@@ -147,22 +161,8 @@ def optimise_all(
 
     Args:
         devices: Where quantities that are not tuned are taken from; scalars.
-        tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's.
-        bounds: Of tuned quantities; see `variables.limits` for the others.
-        objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P on
-            one orbit; "expected" P, over balls that start anywhere and over the tolerances, if there are any.
-        motion: "any" takes the best motion, chaos too, whose averages ensembles of balls climb (`aperiodic_search`);
-            "periodic" the best orbit. Over tolerances orbits alone are followed.
-        tolerances: How constants scatter, for "mean", "worst" and "expected".
-        reliability: Share of the balls of "expected" that have to keep the limits in all that is flown.
-        samples: Random devices for the first two, in place of a quadrature.
-        survey_points: Values of the first quantity at which a survey looks for attractors. It looks closer, by itself,
-            where chaos promises more than the best orbit so far: there the best orbit may live in a narrow window.
-        starts: Of the ball, from which it looks at each of them; more meet attractors with small basins.
-        survey_periods: Forcing periods that each of them may take.
-        max_impacts: Of an orbit: longer ones are not looked for. Fewer are compiled and climb faster.
-        max_evaluations: Of objective and gradient, in one ascent.
-        settings: Of survey, ascent and verification; see `DesignSettings`.
+        tune, bounds, objective, motion, tolerances, reliability, samples: What is sought, as in `optimise`.
+        survey_points, starts, survey_periods, max_impacts, max_evaluations, settings: How far to look, as there.
 
     Returns:
         One `Design` a device.
@@ -251,7 +251,7 @@ def under(optimum: Optimum | AperiodicOptimum, tolerances: Iterable[Tolerance], 
 
     Args:
         optimum: Of `optimise`.
-        tolerances: How they do.
+        tolerances: Which constants scatter, and by how much: `Tolerance` records.
         samples: Random devices, in place of a quadrature; of chaos 256 unless given.
 
     Raises:

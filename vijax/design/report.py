@@ -161,7 +161,10 @@ def _highest(diagram: "xr.Dataset") -> dict[str, Any]:
     along = str(diagram.attrs["along"])
     peak = diagram.isel({dim: int(i) for dim, i in diagram["P"].fillna(0.0).argmax(("direction", along)).items()})
     names = ("P", "max_penetration", "energy_ratio", "admissible")
-    return {"along": along, "value": float(peak[along])} | {name: peak[name].item() for name in names}
+    found = {name: peak[name].item() for name in names}
+    # The limit that a builder sets may be broken by a motion that a device can have.
+    unphysical = found["energy_ratio"] > 1 or found["max_penetration"] > diagram.attrs["harvester_R0"]
+    return {"along": along, "value": float(peak[along]), "unphysical": unphysical} | found
 
 
 def factors(name: str, tolerances: Sequence[dict[str, Any]]) -> tuple[float, float] | None:

@@ -205,11 +205,21 @@ def _off(report: dict[str, Any]) -> Iterator[str]:
     said = ", ".join(f"{one['name']} +-{100 * one['spread']:g} % {one['kind']}" for one in report["tolerances"])
     yield f"under tolerances ({said}):"
     nominal = report["best"]["P"]
+    counted = _counted(spread)
     for name in ("mean", "worst"):
-        yield f"  {name} P {amount(spread[name], 'J')}, {100 * spread[name] / nominal:.4g} % of nominal"
+        yield f"  {name} P {amount(spread[name], 'J')}, {100 * spread[name] / nominal:.4g} % of nominal{counted[name]}"
     shares = ", ".join(f"{100 * spread[name]:.3g} % {text}" for name, text in _LOSSES.items())
     yield f"  of the devices, {shares}"
     yield from _ahead(report)
+
+
+def _counted(spread: dict[str, Any]) -> dict[str, str]:
+    """Say how devices count that lose the motion or are inadmissible: by that the worst P may exceed the mean."""
+    lost = " or ".join(text for name, text in _LOSSES.items() if spread[name])
+    return {
+        "mean": f", those that {lost} counting nothing" if lost else "",
+        "worst": ", inadmissible ones counting what they give" if spread["inadmissible"] else "",
+    }
 
 
 def _ahead(report: dict[str, Any]) -> Iterator[str]:
@@ -231,8 +241,9 @@ def _unconstrained(report: dict[str, Any]) -> Iterator[str]:
     if peak is None or peak["admissible"] or (best is not None and peak["P"] <= best["P"]):
         return
     more = f"{peak['P'] / best['P']:.4g} times as much, " if best else ""
+    beyond = "not physical" if peak["unphysical"] else "beyond your penetration limit"
     yield (
-        f"not physical: P alone would choose {quantity(peak['along'], peak['value'])} with {amount(peak['P'], 'J')}, "
+        f"{beyond}: P alone would choose {quantity(peak['along'], peak['value'])} with {amount(peak['P'], 'J')}, "
         f"{more}{1e3 * peak['max_penetration']:.4g} mm deep, "
         f"{peak['energy_ratio']:.4g} times the energy that an impact gives"
     )

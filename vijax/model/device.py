@@ -20,7 +20,7 @@ class Harvester(eqx.Module):
     """The device in SI units; the defaults are Tables I and II of the paper.
 
     Every field is a number or an array, traced and never static; quantities of pint become plain numbers. The stiffness
-    k is derived from m_b and omega0; `with_constants(device, k=...)` sets omega0 by it.
+    k is m_b omega0^2, so a membrane of known k has omega0 = sqrt(k/m_b); `sweep` takes k as an axis, too.
 
     Attributes:
         m_b: Mass of the ball [kg].
@@ -40,6 +40,7 @@ class Harvester(eqx.Module):
         penetration_limit: Largest admissible penetration [m]; None for R0.
 
     Raises:
+        TypeError: A name that is no constant; it says which there are.
         ValueError: A constant that cannot be (traced values are not looked at).
     """
 
@@ -58,6 +59,15 @@ class Harvester(eqx.Module):
     V: Real = 2000.0
     r_b: Real = 0.0050
     penetration_limit: Real | None = None
+
+    def __new__(cls, *constants: Any, **named: Any):
+        """Refuse a name that is no constant, with the names that there are, which Python would not say."""
+        known = [field.name for field in dataclasses.fields(cls)]
+        for name in named:
+            if name not in known:
+                advice = "; a membrane of stiffness k has omega0 = sqrt(k/m_b)" if name == "k" else ""
+                raise TypeError(f"{name} must be a constant of the device; known are {', '.join(known)}{advice}")
+        return super().__new__(cls)
 
     def __post_init__(self):
         for field in dataclasses.fields(self):

@@ -67,6 +67,8 @@ def basins(
 ) -> "xr.Dataset":
     """Find which attractor each start of a (u0, v0) plane ends on, and make a table of the attractors.
 
+    ::
+
         found = basins(d=0.2, kappa=3.0, r=0.5, v0=np.linspace(-0.6, 0.6, 400))
         found.label.values, found.fraction.values  # the commonest first
 

@@ -77,6 +77,8 @@ def compare(
 ) -> "xr.Dataset":
     """Map how much a rigid wall changes the power and the label of every cell, `|P_rigid - P_soft|/P_soft`.
 
+    ::
+
         found = compare(d=np.linspace(0.05, 0.3, 96), kappa=np.geomspace(3, 4000, 96), tolerance=0.05)
         found.rigid_from  # kappa from which on the rigid wall keeps P within 5 %, over d
 

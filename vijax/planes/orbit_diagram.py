@@ -74,6 +74,8 @@ def orbit_diagram(
 ) -> "xr.Dataset":
     """Record attractors along an axis, impact by impact: every point starts where the last one ended.
 
+    ::
+
         orbit_diagram(along="d", values=np.linspace(0.3, 0.05, 126), kappa=[400, 40, 4], r=0.5, direction="both")
         orbit_diagram(along="omega", values=np.linspace(0.5, 15, 200), s=0.2, direction="up")  # one device
 

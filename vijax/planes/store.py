@@ -76,7 +76,9 @@ def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) ->
         overwrite: Replace a store that is there.
 
     Raises:
-        ValueError, FileExistsError, FileNotFoundError, PermissionError: As `check_store`.
+        ValueError: If the path has another ending.
+        FileExistsError: If the place is taken and may not be replaced: what vijax did not write never.
+        FileNotFoundError, PermissionError: If its folder is missing or closed.
     """
     checks.variables("dataset", dataset, (), "sweep")
     target = check_store("path", path, checks.flag("overwrite", overwrite))

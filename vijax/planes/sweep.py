@@ -59,7 +59,7 @@ def sweep(
 ) -> "xr.Dataset":
     """Map the energy harvested over a plane, or any product, of parameters, with all that tells whether to believe it.
 
-    Each axis is a number or a 1-D array, or such a quantity of pint; arrays become dimensions in the order given:
+    Each axis is a number or a 1-D array, or such a quantity of pint; arrays become dimensions in the order given::
 
         sweep(d=np.linspace(0.05, 0.3, 128), kappa=np.geomspace(3, 400, 128), r=0.5)  # the (d, kappa) plane
         sweep(omega=np.pi * np.linspace(1, 12, 64), omega0=np.linspace(20, 400, 64))  # one device, other frequencies
@@ -80,19 +80,19 @@ def sweep(
             where it finds nothing, averages leave out the first quarter of `periods`.
         wall: "soft" or "rigid".
         method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
-            paper's fixed steps without event location (`vijax.engine.rk4` says what it cannot know).
+            paper's fixed steps without event location.
         solver: Of "ode": Tsit5 unless given; Bosh3, Dopri5, Dopri8, Kvaerno3, Kvaerno4 or Kvaerno5.
         rtol, atol: Of "ode": tolerances of position and velocity step by step, 1e-8 and 1e-10 unless given.
         membrane: Of "ode" and "rk4": `HuntCrossley(chi)` for the linear membrane. It takes no r: the map's
             `restitution` is what came out.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
-        outputs: The variables wanted, of those in `vijax.planes.outputs.OUTPUTS`; all but `asymmetry` and `lyapunov`
+        outputs: The variables wanted, of those on the page of outputs; all but `asymmetry` and `lyapunov`
             unless given. What is not wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
         refine: Levels of refinement: every 2^refine-th cell along each axis is computed, then only those at borders
-            between kinds of motion or where P is not interpolated to 1 %, and the others are filled
-            (`vijax.planes.refine`). `computed` says which are which.
+            between kinds of motion or where P is not interpolated to 1 %, and the others are filled.
+            `computed` says which are which.
         progress: Called with (cells done, cells in all) from the calling thread, first before anything is run. While a
             plane is refined, all are those known to be needed, and grow.
         out: Zarr store, named `*.zarr`, to write tile by tile, so that memory is set by a tile. It opens at any time,

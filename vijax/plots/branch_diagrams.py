@@ -25,7 +25,7 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
     """Draw branches of orbits over their parameter: stable black, unstable red, with what they met on the way.
 
     Args:
-        dataset: What `vijax.orbits.branch_dataset.dataset` returned.
+        dataset: What `vijax.branch_dataset` returned.
         quantity: A variable over impacts, or over points.
 
     Raises:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vijax.plots.figure import label_logs
 from vijax.plots.style import axis_label, equations, layout
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple[
         panel = dataset.isel(dict(zip(outer, index, strict=True)))
         (across, xscale), (up, yscale) = (edges(panel[dim].values) for dim in dims[:2])
         axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], ylim=up[[0, -1]], facecolor=BARE["color"])
+        label_logs(axes)
         axes.set_title(equations(panel, dims[2:]), fontsize="medium")
         filled.append((axes, panel))
     for axes in grid[-1]:

@@ -10,7 +10,7 @@ from vijax.design.report import factors
 from vijax.design.report_lines import amount
 from vijax.design.variables import LINEAR, constant
 from vijax.model.units import UNITS
-from vijax.plots.figure import styled
+from vijax.plots.figure import label_logs, styled
 from vijax.plots.style import axis_label, symbol
 from vijax.runtime import checks
 
@@ -95,6 +95,7 @@ def _whole(axes: Axes, diagram: "xr.Dataset") -> None:
         axes.set_ylim(max(least / 2, most / 10**_DECADES), 3 * most)
     if x.min() > 0 and x.max() > _WIDE * x.min():
         axes.set_xscale("log")
+    label_logs(axes)
 
 
 def _ranges(x: np.ndarray, which: np.ndarray) -> list[tuple[float, float]]:
@@ -224,6 +225,7 @@ def design_map(report: dict[str, Any]) -> Figure:
         lower.plot([x for x, _ in found], worst, "_", color="black", label="worst within the tolerances")
     upper.set(yscale="linear" if tuned in LINEAR else "log", ylabel=f"best {_named(tuned)}")
     lower.set(yscale="log", ylabel="$P$ [J per half period]", xlabel=_named(over["name"]))
+    label_logs(upper)
     figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
     return figure
 

@@ -6,11 +6,17 @@ from pathlib import Path
 from typing import ParamSpec
 
 import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
 from vijax.plots.style import STYLE, save_figure
 
 P = ParamSpec("P")
+
+_FEW_DECADES = 1.6  # up to which 1, 2 and 5 of a decade are labelled, as its powers alone are too few
+_BARELY = 0.7  # decades; below, even 1, 2 and 5 are too few, and round numbers are labelled as on a linear axis
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
@@ -22,6 +28,16 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
             return draw(*args, **kwargs)
 
     return draws
+
+
+def label_logs(axes: Axes) -> None:
+    """Label logarithmic axes of few decades by plain numbers; matplotlib writes 2 x 10^1, 3 x 10^1 over each other."""
+    for axis in (axes.xaxis, axes.yaxis):
+        decades = float(np.ptp(np.log10(axis.get_view_interval()))) if axis.get_scale() == "log" else np.inf
+        if decades < _FEW_DECADES:
+            axis.set_major_locator(MaxNLocator(5) if decades < _BARELY else LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter(FormatStrFormatter("%g"))
+            axis.set_minor_locator(NullLocator())
 
 
 def save(figure: Figure, path: str | Path) -> None:

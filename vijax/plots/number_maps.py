@@ -17,7 +17,7 @@ from matplotlib.ticker import EngFormatter
 from vijax.planes.compare import Label, Model
 from vijax.planes.dataset import best
 from vijax.plots.cells import BARE, VEIL, borders, edges, marked_places, panels, runs, veil
-from vijax.plots.figure import styled
+from vijax.plots.figure import label_logs, styled
 from vijax.plots.kind_maps import coded, of_flags
 from vijax.plots.style import NEEDS, QUANTITIES, axis_label, is_kind, layout, title, units
 from vijax.runtime import checks
@@ -178,6 +178,7 @@ def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
     drawn = _drawn(values, norm) & np.isfinite(values)
     axes.plot(places, np.where(drawn, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
     axes.margins(y=0.05)
+    label_logs(axes)
     _mark_curve(axes, kind.marks(dataset), places, across, values)
     if peak is not None:
         axes.plot(peak[x], dataset[kind.coloured].sel({x: peak[x]}), **_STAR, zorder=5)

@@ -33,7 +33,7 @@ def orbit_diagram(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
     is another attractor.
 
     Args:
-        dataset: What `vijax.planes.orbit_diagram.orbit_diagram` returned, with at most one axis besides the one swept.
+        dataset: What `vijax.orbit_diagram` returned, with at most one axis besides the one swept.
         quantity: A variable over impacts, strobes or points.
 
     Raises:

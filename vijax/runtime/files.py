@@ -56,7 +56,9 @@ def check_folder(name: str, path: str | Path) -> Path:
     if not target.name:
         raise FileNotFoundError(f"{name} must name a file; got {str(path)!r}")
     if not folder.is_dir():
-        raise FileNotFoundError(f"{name} must lie in a folder that exists; got {path}; make {folder} first")
+        file = next((one for one in (folder, *folder.parents) if one.exists() and not one.is_dir()), None)
+        advice = f"make {folder} first" if file is None else f"{file} is no folder, take another place"
+        raise FileNotFoundError(f"{name} must lie in a folder that exists; got {path}; {advice}")
     try:
         # Leaves no name behind. To ask for permission is not enough: all is allowed to root, and nothing in /proc.
         tempfile.TemporaryFile(dir=folder).close()
