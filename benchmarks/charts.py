@@ -52,7 +52,7 @@ _OUTLINE: dict[str, Any] = {
 
 @_chart
 def stability_map(found: Any) -> Figure:
-    """Draw where an explicit method stays bounded over stiffness and steps per period, under the boundary of theory.
+    """Draw where an explicit method stays bounded over stiffness and steps per period, over the safe bound.
 
     Args:
         found: A record with `kappa` [K] and `steps` [S], both ascending, `stable` [S, K], and `least_steps` [K], the
@@ -66,7 +66,7 @@ def stability_map(found: Any) -> Figure:
     axes.set(xlim=found.kappa[[0, -1]], ylim=found.steps[[0, -1]])
     shades = (Patch(color=mpl.colormaps["Blues_r"](shade)) for shade in (0.8, 0.4))
     handles = [*shades, Line2D([], [], **_OUTLINE)]
-    texts = ["bounded", "blown up within 50 periods", "theory"]
+    texts = ["bounded", "blown up within 50 periods", "safe bound"]
     figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
     return figure
 
@@ -98,7 +98,6 @@ _COLUMNS = 3
 _ROUNDING = 1e-16  # an error below is drawn there
 _NOISE = 2.0  # standard errors that mean nothing
 _LEAST = 1.0  # fewer are drawn as so many: there is no better and worse among them
-_LABEL_GAP = 0.052  # between labels, of the height of a panel
 
 
 @_chart
@@ -113,7 +112,7 @@ def work_precision(rows: Iterable[Any]) -> Figure:
     scenes = _by(rows, "scene")
     columns = min(_COLUMNS, len(scenes))
     lines = math.ceil(len(scenes) / columns)
-    figure = Figure(figsize=(3.4 * columns, 3.0 * lines + 0.3), layout="constrained")
+    figure = Figure(figsize=(2.9 * columns, 2.6 * lines + 1.0), layout="constrained")
     grid = figure.subplots(lines, columns, squeeze=False)
     span = _decades([row.us for panel in scenes.values() for row in panel])
     for axes, panel in itertools.zip_longest(grid.flat, scenes.items()):
@@ -123,13 +122,16 @@ def work_precision(rows: Iterable[Any]) -> Figure:
             axes.set_xlim(span)
             _work_panel(axes, *panel)
     figure.suptitle(_HOW_TO_READ, fontsize="medium")
-    figure.supxlabel("microseconds per cell-period, warm", fontsize="medium")
+    grid[-1, columns // 2].set_xlabel("microseconds per cell-period, warm")  # a label below all would meet the legend
+    shown = [method for method in _METHODS if any(row.method == method for panel in scenes.values() for row in panel)]
+    handles = [Line2D([], [], color=_METHODS[one][0], linestyle=_METHODS[one][1], marker="o") for one in shown]
+    figure.legend(handles, shown, loc="outside lower center", ncols=min(2 * columns, 6), frameon=False, markerscale=0.5)
     return figure
 
 
 def _decades(values: list[float]) -> tuple[float, float]:
-    """Set limits of a logarithmic axis, with room for labels to the right."""
-    return min(values) / 2, max(values) * 20
+    """Set limits of a logarithmic axis."""
+    return min(values) / 2, max(values) * 2
 
 
 def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
@@ -147,7 +149,6 @@ def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
     points = [(row.us, error) for row, error in zip(rows, errors, strict=True) if math.isfinite(error)]
     across, up = _stairs(points, axes.get_xlim()[1], high)
     axes.plot(across, up, color="0.8", linewidth=4, solid_joinstyle="miter", zorder=1)
-    ends = []
     for method in dict.fromkeys(row.method for row in rows):
         colour, style = _METHODS[method]
         chosen = [(row.us, error) for row, error in zip(rows, errors, strict=True) if row.method == method]
@@ -162,10 +163,8 @@ def _work_panel(axes: Axes, title: str, rows: list[Any]) -> None:
                 "markersize": 2.5,
             }
             axes.plot(*zip(*good, strict=True), **line)
-            ends.append((*min(good, key=lambda point: point[1]), method, colour))
         if bad:  # a line without points and clipping would count as one at the picture's corner
             axes.plot(bad, [high] * len(bad), color=colour, marker="x", linestyle="none", clip_on=False)
-    _label_ends(axes, ends)
 
 
 def _stairs(points: list[tuple[float, float]], right: float, top: float) -> tuple[list[float], list[float]]:
@@ -177,28 +176,6 @@ def _stairs(points: list[tuple[float, float]], right: float, top: float) -> tupl
             up += [best_yet, y]
             best_yet = y
     return [*across, right], [*up, best_yet]
-
-
-def _label_ends(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
-    """Name each line at its most accurate point; names that would collide give way downwards or upwards."""
-    (left, right), (low, high) = np.log(axes.get_xlim()), np.log(axes.get_ylim())
-    taken: list[tuple[float, float, float]] = []
-    for x, y, method, colour in sorted(ends, key=lambda end: end[1]):
-        place, height = (np.log(x) - left) / (right - left), (np.log(y) - low) / (high - low)
-        width = 0.02 * len(method)
-        begin = place + 0.015 if place + width < 1 else place - width - 0.015
-        height -= 0.03
-        while any(
-            abs(height - other) < _LABEL_GAP and begin < end and start < begin + width for start, end, other in taken
-        ):
-            height += 0.01
-        taken.append((begin, begin + width, height))
-        style: Any = {
-            "fontsize": 7,
-            "in_layout": False,
-            "path_effects": [Stroke(linewidth=2, foreground="white"), Normal()],
-        }
-        axes.text(begin, max(height, 0.01), method, transform=axes.transAxes, color=colour, **style)
 
 
 _TAILS_COLUMNS = 4

@@ -1,6 +1,7 @@
 """Tables and charts of what benchmarks measured, made from the rows that they keep: no figure of them stands twice."""
 
 import math
+import re
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from benchmarks import charts, tables
 from docs.markdown import table
 
 TARGETS = (1e-3, 1e-6, 1e-9)
+_CHATTER = re.compile(r"impacts per period at kappa ([\d.]+), (\d+) steps")
 _CHARTS: dict[str, Callable[[Iterable[Any], Path], Any]] = {
     "tails": charts.tails,
     "labels": charts.labels,
@@ -27,6 +29,7 @@ def texts() -> dict[str, str]:
         "labels": labels(tables.read(tables.ROWS / "labels.csv")),
         "speed": speed(),
         "failures": failures(tables.read(tables.ROWS / "failures.csv")),
+        "chatter": chatter(tables.read(tables.ROWS / "failures.csv")),
         **{f"made_by_{path.stem}": _made_by(path) for path in sorted(tables.ROWS.glob("*.csv"))},
     }
 
@@ -136,9 +139,23 @@ def _typical(rows: Sequence[Any], what: str) -> float:
 
 
 def failures(rows: Sequence[Any]) -> str:
-    """Tabulate what the benchmark of failures keeps."""
-    lines = [[f"`{row.scene}`", row.what, _figure(row.usual), _figure(row.vijax)] for row in rows]
+    """Tabulate what the benchmark of failures keeps, but for the impacts of each stiffness."""
+    some = [row for row in rows if not _CHATTER.fullmatch(row.what)]
+    lines = [[f"`{row.scene}`", row.what, _figure(row.usual), _figure(row.vijax)] for row in some]
     return table(("scene", "figure", "usual method", "vijax"), lines)
+
+
+def chatter(rows: Sequence[Any]) -> str:
+    """Tabulate the impacts a period of every fifth stiffness and of the last, a column for each number of steps."""
+    found: dict[str, dict[str, str]] = {}
+    for row in rows:
+        if at := _CHATTER.fullmatch(row.what):
+            found.setdefault(at[1], {}).update({at[2]: f"{row.usual:.1f}", "exact": f"{row.vijax:.1f}"})
+    stiffnesses = list(found)
+    shown = [*stiffnesses[:-1:5], stiffnesses[-1]]
+    columns = list(found[shown[0]])
+    names = [f"rk4, {name} steps" if name != "exact" else f"`{name}`" for name in columns]
+    return table(("kappa", *names), [[kappa, *(found[kappa][name] for name in columns)] for kappa in shown])
 
 
 def _figure(value: float) -> str:
