@@ -124,7 +124,8 @@ def work_precision(rows: Iterable[Any]) -> Figure:
     figure.suptitle(_HOW_TO_READ, fontsize="medium")
     grid[-1, columns // 2].set_xlabel("microseconds per cell-period, warm")  # a label below all would meet the legend
     shown = [method for method in _METHODS if any(row.method == method for panel in scenes.values() for row in panel)]
-    handles = [Line2D([], [], color=_METHODS[one][0], linestyle=_METHODS[one][1], marker="o") for one in shown]
+    looks: list[dict[str, Any]] = [dict(zip(("color", "linestyle"), _METHODS[one], strict=True)) for one in shown]
+    handles = [Line2D([], [], marker="o", **look) for look in looks]
     figure.legend(handles, shown, loc="outside lower center", ncols=min(2 * columns, 6), frameon=False, markerscale=0.5)
     return figure
 
