@@ -252,7 +252,7 @@ def cost(asked: argparse.Namespace) -> None:
     nested(devices[0])
     # What nested sweeps cost depends on the device, from a fifth of the mean to four times: all are timed, or chance
     # decides. Of the first 60 every tenth takes 0.67 of the mean, every sixth 0.98.
-    sweeps = [partial(nested, of) for of in devices]
+    sweeps: list[Callable[[], Any]] = [partial(nested, of) for of in devices]
     took = [
         (_seconds([partial(optimise_all, devices, **SEARCH)]) / count, _seconds(sweeps) / count) for _ in range(_ROUNDS)
     ]
