@@ -56,7 +56,7 @@ def motions(vijax, np, jax):
 def orbits(vijax, np, jax):
     """A branch through a fold, a family, orbits from states, a steady state and its gradient."""
     found = vijax.find_orbits(vijax.impact_pair(0.19, None, 0.5), "RLL", guesses=32)
-    (one,) = vijax.follow_orbits(found[:1], "d", (0.18, 0.2), direction="up")
+    (one,) = vijax.follow_orbits(found[:1], "d", (0.18, 0.21), direction="up")
     vijax.branch_dataset([one])
     folds = [point for point in one.points if point.kind == "fold"]
     vijax.curve_dataset(vijax.follow_curves(folds, "d", {"d": (0.1, 0.3), "r": (0.4, 0.6)}, max_points=4))

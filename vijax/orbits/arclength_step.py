@@ -6,7 +6,7 @@ marks a bifurcation, are smooth functions along the curve: its test functions.
 
 from collections.abc import Iterable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -20,6 +20,7 @@ from vijax.orbits import grazing, shooting
 from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import linear_solve, tiles
+from vijax.runtime.arrays import AnyArray
 from vijax.runtime.programs import jitted
 
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
@@ -73,7 +74,7 @@ class Arc(eqx.Module):
         """Split a point of the branch, or many along leading axes, into knots and parameter."""
         return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (self.high - self.low)
 
-    def pair_and_knots(self, y) -> tuple[ImpactPair, shooting.Knots]:
+    def pair_and_knots(self, y) -> tuple[ImpactPair, Float[AnyArray, "*orbit impact 3"]]:
         """Give the orbits of points, many along a leading axis."""
         knots, x = self.unpack(y)
         return self.at(x), knots
@@ -105,6 +106,7 @@ class Arc(eqx.Module):
         )
 
 
+@runtime_checkable
 class Path(Protocol):
     """What a lane follows: a branch (`Arc`), or a curve of bifurcations in two parameters (`curve_equations`).
 
@@ -123,7 +125,7 @@ class Path(Protocol):
     def sequence(self) -> Sequence:
         """Walls of the orbits."""
 
-    def pair_and_knots(self, y) -> tuple[ImpactPair, shooting.Knots]:
+    def pair_and_knots(self, y) -> tuple[ImpactPair, Float[AnyArray, "*orbit impact 3"]]:
         """Give the orbits of points, many along a leading axis."""
 
     def equations(self, y) -> shooting.LinearisedEquations:

@@ -103,7 +103,7 @@ class CurvePath(eqx.Module):
         both = (x[..., 0], x[..., 1]), (start[..., 0], start[..., 1])
         return moved_together(self.pair, self.along, *both, self.steepest)
 
-    def pair_and_knots(self, y) -> tuple[ImpactPair, shooting.Knots]:
+    def pair_and_knots(self, y) -> tuple[ImpactPair, Float[AnyArray, "*orbit impact 3"]]:
         """Give the orbits of points, many along a leading axis."""
         return self.at(y[..., -2:]), self._knots(y)
 
