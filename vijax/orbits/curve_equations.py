@@ -28,9 +28,9 @@ class CurveTests(NamedTuple):
 
     turn: Float[Array, ""]  # how far a step goes on in the plane the way that it came: it turns back at a cusp
     cubic: Float[Array, ""]  # the cubic coefficient of a flip: on which side the doubled orbits lie
-    plus: Float[Array, ""]  # at a graze: a multiplier passes +1
-    minus: Float[Array, ""]  # at a graze: one passes -1
-    push: Float[Array, ""]  # at a graze: acceleration away from the wall
+    plus: Float[Array, ""]  # A multiplier of a grazing orbit passes +1 where it changes sign.
+    minus: Float[Array, ""]  # One passes -1 here.
+    push: Float[Array, ""]  # The acceleration away from the wall that is touched.
     speed: Float[Array, ""]  # the clearances of `Tests`, but for the graze itself
     flight: Float[Array, ""]
     contact: Float[Array, ""]

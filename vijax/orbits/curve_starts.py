@@ -79,7 +79,7 @@ def _without_impact(orbit: Orbit, place: tuple[float, float]) -> CurveStart | st
     if side * float(flow.acceleration(pair.gamma, t)) > 0:
         return "the forcing holds the ball on its wall"
     rest = np.delete(np.arange(len(knots)), index)
-    rest = np.append(rest, rest[-1:])  # as wide as before
+    rest = np.append(rest, rest[-1:])  # The row keeps its width: the last impact stands twice, as padding.
     walls = np.where(np.arange(len(knots)) < count - 1, sequence.side[rest], 0)
     # The impact before it; of the first one that is the last, a turn earlier.
     before, again = (index - 1, False) if index else (count - 2, True)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _SPREAD = 5  # so many cells a side are followed across the whole map at first
-_WHOLE_POINTS = 300  # of such a branch
+_WHOLE_POINTS = 300  # Most points of each such branch.
 _REACH = 3.0  # cells on either side of a border that is looked at
 _FIRST_STEP, _MAX_STEP = 0.02, 0.05  # across them, in units of all that way
 

@@ -24,7 +24,8 @@ _EDGE: list[Any] = [Stroke(linewidth=2.6, foreground="white"), Normal()]
 _POINT: dict[str, Any] = {"marker": "o", "markersize": 4, "color": "white", "mec": "black", "linestyle": "none"}
 _MOST_LISTED = 24  # points beside a picture; all of them stand in the dataset
 _FAINT = 0.25
-_COLUMNS, _LINE_HEIGHT, _LIST_WIDTH = 3, 0.17, 2.2  # of the legend; inches
+# Columns of the legend; the height of a line and the width of the list, in inches.
+_COLUMNS, _LINE_HEIGHT, _LIST_WIDTH = 3, 0.17, 2.2
 
 
 @styled
