@@ -3,7 +3,7 @@
 All lanes step together (`arclength_walk`); what happened on the way is located afterwards (`events`).
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -110,14 +110,27 @@ def set_out(
             f"orbit must be closed in full to be followed along {along}; got one closed half way; unfold it"
         )
     size, (low, high) = len(orbit), within
+    steepest, low_end, high_end = (np.full(size, float(number)) for number in (device.g / device.A, low, high))
+    return arcs_from(orbit, along, x, steepest, (low_end, high_end), settings)
+
+
+def arcs_from(
+    orbit: Orbit,
+    along: str,
+    x: np.ndarray,
+    steepest: np.ndarray,
+    within: tuple[np.ndarray, np.ndarray],
+    settings: ContinuationSettings,
+) -> tuple[Arc, np.ndarray]:
+    """Make arcs and unknowns of orbits to be followed, a row each: value of the parameter, g/A, bounds."""
     # By NumPy from here on: branches differ in length, and JAX would compile a program for each.
-    numbers: Any = (device.g / device.A, low, high)
-    start, steepest, low_end, high_end = tiles.arrays((x, *(np.full(size, float(number)) for number in numbers)))
+    low, high = within
+    start, gravity, low_end, high_end = tiles.arrays((x, steepest, low, high))
     arcs = Arc(
         pair=orbit.pair,
         sequence=orbit.sequence,
         start=start,
-        steepest=steepest,
+        steepest=gravity,
         low=low_end,
         high=high_end,
         along=along,
@@ -125,7 +138,7 @@ def set_out(
         max_corrections=settings.max_corrections,
     )
     arcs = jax.tree.map(np.asarray, arcs)
-    knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
+    knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(len(orbit), -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 

@@ -15,14 +15,12 @@ from vijax.orbits.periodic import Orbit, guessed, proven
 from vijax.orbits.shooting import Sequence
 from vijax.runtime.programs import jitted
 
-KINDS = ("fold", "flip", "pitchfork", "grazing")
-
 
 class CurveStart(NamedTuple):
     """A bifurcation from which a curve is to be followed.
 
     Attributes:
-        kind: One of `KINDS`.
+        kind: "fold", "flip", "pitchfork" or "grazing".
         orbit: The orbit there, alone: closed half way at a pitchfork; at a graze without the impact that fades.
         place: Both parameters of the plane.
         impact, wait, wall: At a graze, how long after the end of which contact the ball touches which wall; else of no

@@ -10,7 +10,7 @@ from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
 from vijax.orbits.arclength_step import FIRST_END, Arc, Tests, advance
 from vijax.orbits.arclength_walk import Walked, walk
-from vijax.orbits.continuation import heading
+from vijax.orbits.continuation import arcs_from, heading
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start
 from vijax.orbits.events import Point, changed, happenings, locate
@@ -107,21 +107,8 @@ def _met(
     values, size = plane.axes[way], len(orbit)
     place = cells[:, way]
     low, high = (np.interp(place + shift, np.arange(len(values)), values) for shift in (-reach, reach))
-    start, gravity, low_end, high_end = tiles.arrays((values[place], np.full(size, steepest), low, high))
-    arcs = Arc(
-        pair=orbit.pair,
-        sequence=orbit.sequence,
-        start=start,
-        steepest=gravity,
-        low=low_end,
-        high=high_end,
-        along=plane.along[way],
-        newton_tolerance=settings.newton_tolerance,
-        max_corrections=settings.max_corrections,
-    )
-    arcs = jax.tree.map(np.asarray, arcs)
-    knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
-    y = np.concatenate([knots, (values[place] / (high - low))[:, None]], axis=1)
+    gravity = np.full(size, steepest)
+    arcs, y = arcs_from(orbit, plane.along[way], values[place], gravity, (low, high), settings)
     ahead = np.zeros_like(y)
     ahead[:, -1] = 1.0
     first = advance(arcs, y, ahead, np.zeros(size))
