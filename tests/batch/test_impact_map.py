@@ -16,9 +16,7 @@ def test_it_agrees_with_the_careful_step(wall, gamma):
     d, kappa = rng.uniform(0.05, 0.3, TILE), np.exp(rng.uniform(1, 6, TILE))
     pair = pairs(d, kappa if wall == "soft" else None, 0.5, gamma)
     side, speed, t = rng.choice([-1.0, 1.0], TILE), rng.uniform(0.001, 0.6, TILE), rng.uniform(0, 2, TILE)
-    found = next_impacts(
-        pair, jnp.asarray(side), jnp.asarray(speed), jnp.asarray(t), ground=ground_of(gamma, deep=True)
-    )
+    found = next_impacts(pair, jnp.asarray(side), jnp.asarray(speed), jnp.asarray(t), ground=ground_of(gamma))
     out = march(pair, start(0.5 * side * d, -side * speed, t)).out
     impact = out.impact
     assert found.real.all()

@@ -41,7 +41,7 @@ def step_on_level_ground(pair, ball):
 
 @jax.jit
 def deep_step(pair, ball):
-    wall = quick_wall.prepare(pair, ground=Ground.GENTLE)
+    wall = quick_wall.prepare(pair, ground=Ground.STEEP)
     found = quick.quick_step(wall, pair.gamma, ball, deep=True)
     return found.impact, found.arrival, found.sure
 
@@ -258,19 +258,31 @@ def test_it_is_sure_of_nearly_every_step_on_planes(gamma):
     assert np.mean(shares[4:]) > SURE[gamma]
 
 
-def test_depth_and_work_come_with_the_contact():
-    pair, u, v, t = after_impacts(np.random.default_rng(6))
+def pressed(rng):
+    """Balls that fall slowly on a membrane and that gravity holds there, some for dozens of swings."""
+    kappa, r = np.exp(rng.uniform(np.log(5), np.log(300), COUNT)), rng.uniform(0.1, 0.95, COUNT)
+    pair = pairs(np.full(COUNT, 0.2), kappa, r, rng.uniform(0.2, 1.2, COUNT))
+    return pair, np.full(COUNT, -0.1), np.exp(rng.uniform(-7, 0, COUNT)) / np.sqrt(kappa), rng.uniform(0, 2, COUNT)
+
+
+@pytest.mark.parametrize(("kind", "least", "grain"), [(after_impacts, 0.45, 1e-6), (pressed, 0.25, 1e-3)])
+def test_depth_and_work_come_with_the_contact(kind, least, grain):
+    """Samples miss of depth and work what is between them, of dozens of swings more than of one."""
+    pair, u, v, t = kind(np.random.default_rng(6))
     hit, _, sure = fly(pair, u, v, t, deep_step)
-    assert sure.mean() > 0.45
-    few = np.flatnonzero(sure)[:64]
+    assert sure.mean() > least
+    if kind is pressed:
+        sure = sure & (hit.duration * pair.kappa > 9)
+        assert sure.mean() > 0.03
+    few = np.flatnonzero(sure)[: 64 if kind is after_impacts else 512]
     cell, hit = jax.tree.map(lambda x: x[few, None], (pair, hit))
     s = hit.duration * np.linspace(0, 1, 4001)
     state = (cell.kappa, cell.r, cell.gamma, hit.side, hit.onset_t, 0.0, hit.side * hit.v_in, s)
     w, rate = long_contact(*state)
-    assert np.max(np.abs(w.max(axis=1) / hit.depth[:, 0] - 1)) < 1e-6
+    assert np.max(np.abs(w.max(axis=1) / hit.depth[:, 0] - 1)) < grain
     mu = 2 * -np.log(cell.r) / np.hypot(np.pi, np.log(cell.r)) * cell.kappa
     loss = (mu * np.trapezoid(rate**2, s, axis=1)[:, None] / hit.work).astype(float)
-    assert np.max(np.abs(loss - 1)) < 1e-5
+    assert np.max(np.abs(loss - 1)) < 10 * grain
 
 
 def test_against_fifty_digits():
@@ -303,10 +315,9 @@ def test_rigid_walls_and_single_precision_agree():
 
 
 def test_ground_is_as_steep_as_the_steepest_cell():
-    assert ground_of([0.0, -0.0], deep=False) is Ground.LEVEL
-    assert ground_of([0.0, -1e-300], deep=False) is Ground.GENTLE
-    assert ground_of([0.0, -0.9], deep=False) is Ground.STEEP
-    assert ground_of([0.0, -0.9], deep=True) is Ground.GENTLE
+    assert ground_of([0.0, -0.0]) is Ground.LEVEL
+    assert ground_of([0.0, -1e-300]) is Ground.GENTLE
+    assert ground_of([0.0, -0.9]) is Ground.STEEP
 
 
 def test_a_plane_along_gamma_crosses_level_ground():

@@ -12,6 +12,7 @@ from vijax.batch.cell import Cell, Event, Lane, Mask, Plan, Settings
 from vijax.batch.cell_end import last_period
 from vijax.batch.tally import add_event
 from vijax.engine import exact, quick, sampled
+from vijax.engine.ground import Ground
 from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
@@ -71,9 +72,10 @@ def request(plan: Plan, settings: Settings, cell: Cell) -> Request:
 
 
 def sampled_answer(plan: Plan, request: Request) -> Answer:
-    """Answer by certified sampling."""
+    """Answer by certified sampling; on level ground the quick step is unsure of so few flights that none is sampled."""
+    unsure = plan.ground is not Ground.LEVEL
     impact, sure = sampled.sampled_step(
-        request.pair, request.ball, request.arrival, deep=plan.deep, tangent=plan.tangent
+        request.pair, request.ball, request.arrival, unsure=unsure, deep=plan.deep, tangent=plan.tangent
     )
     no = jnp.zeros_like(sure)
     sure = sure & (request.held == 0)

@@ -59,7 +59,7 @@ def averages(
     given = table, count, settings
     plans = [_plan(ground, length.size) for ground in (Ground.LEVEL, Ground.GENTLE)]
     if checks.is_concrete(given):
-        plan = _plan(ground_of(pair.gamma, deep=True), length.size)
+        plan = _plan(ground_of(pair.gamma), length.size)
         found = compiled(plan, width_of(table.shape[0]))(*given)
     else:
         # Rows of padding may hold anything.

@@ -210,7 +210,7 @@ def summarise(
     plan = Plan(
         until=until,
         rigid=pair.rigid,
-        ground=ground_of(pair.gamma, deep=bool(outputs & DEEP)),
+        ground=ground_of(pair.gamma),
         deep=bool(outputs & DEEP),
         energies=bool(outputs & ENERGY),
         asymmetry="asymmetry" in outputs,
@@ -279,7 +279,7 @@ def attractors(
 
 def _chained(pair: ImpactPair) -> Plan:
     """Make the plan of cells whose ends are wanted."""
-    return Plan(rigid=pair.rigid, ground=ground_of(pair.gamma, deep=True), deep=True, energies=True, chained=True)
+    return Plan(rigid=pair.rigid, ground=ground_of(pair.gamma), deep=True, energies=True, chained=True)
 
 
 def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, recorded_periods: int) -> Settings:

@@ -18,14 +18,9 @@ class Ground(enum.Enum):
     STEEP = "steep"
 
 
-def ground_of(gamma: Any, *, deep: bool) -> Ground:
-    """Choose the ground of cells with these gamma.
-
-    Args:
-        gamma: Of every cell.
-        deep: Whether greatest depths are wanted, which the quick step does not tell of a ball that gravity holds.
-    """
+def ground_of(gamma: Any) -> Ground:
+    """Choose the ground of cells with these gamma."""
     most = np.max(np.abs(np.asarray(gamma)), initial=0.0)
     if most == 0:
         return Ground.LEVEL
-    return Ground.STEEP if most >= _STEEP and not deep else Ground.GENTLE
+    return Ground.STEEP if most >= _STEEP else Ground.GENTLE

@@ -209,12 +209,14 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     stiffness = jnp.maximum(wall.omega1, jnp.abs(at.push / at.rate))
     # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
     converged = reached & (stiffness * jnp.abs(step) < converged_step(eps)) & (wall.omega1 * duration > 0.25)
-    crest, certain = _rough_crest(rough, begun, guess, single((duration, at.drive, at.force)))
+    crest = _rough_crest(rough, begun, guess, single((duration, at.drive, at.force)))
+    certain = crest.first & crest.only
     if long is not None:
-        certain = jnp.where(long, wall.kappa * jnp.abs(duration - when) < 0.5, certain)
+        ebbs = wall.kappa * jnp.abs(duration - when) < 0.5
+        certain = jnp.where(long, ebbs & crest.first & crest.highest if deep else ebbs, certain)
     depth = None
     if deep:
-        depth, exact = _deepest(wall, entry, crest)
+        depth, exact = _deepest(wall, entry, crest.s)
         certain = certain & exact
     sure = wall.usable & converged & (out > 0) & certain
     turn = wall.omega1 * step
@@ -261,10 +263,42 @@ def _snap(wall: SoftWall, at: ContactState) -> Lane:
     return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
 
 
+class _Crest(eqx.Module):
+    """Where w' is zero for the first time, and what is certain of it."""
+
+    s: Lane  # from the free contact's
+    first: Bool[Array, "lane"]  # It is found, and w rises until then.
+    only: Bool[Array, "lane"]  # w has no other extremum before the exit.
+    highest: Bool[Array, "lane"] | None  # None where gravity prolongs no contact: w does not come back to this height.
+
+
+def _stays_below(wall: SoftWall, at: ContactState) -> Bool[Array, "lane"]:
+    """Say whether w stays below its first crest as long as its steady response S ebbs, however often it swings.
+
+    Call w - S the swing, of the envelope a at the crest. S is positive, so concave, for half a free contact. If S falls
+    there, w is concave until the swing falls, too. If S rises, w' is at most S' at the crest less what the swing loses,
+    which is log-concave, and enough at the end of that time if tan of the swing's phase, S'/(kappa a) its sine, is at
+    most the root of r. From then on the swing is below a share of a, until it is negative; when it is positive again a
+    free contact has passed and the envelope has fallen to r a. S is at most its amplitude, or where it falls what it
+    was at the crest.
+    """
+    quadrature = -at.drive * (1 / PI)
+    steady = wall.gain_in * at.force + wall.gain_out * quadrature
+    across = wall.gain_out * at.force - wall.gain_in * quadrature
+    rate = PI * across
+    swing = at.w - steady
+    swing_across = (wall.zeta * swing - rate) / wall.omega1
+    envelope = jnp.sqrt(swing * swing + swing_across * swing_across)
+    climb = jnp.where(rate > 0, jnp.sqrt(steady * steady + across * across) - steady, 0.0)
+    later = steady * wall.cos_middle + across * wall.sin_middle
+    share_left = jnp.maximum(wall.r, wall.root_r * wall.zeta / wall.kappa)
+    rest = (1 + DOUBT) * (climb + share_left * envelope)
+    slow = (1 + DOUBT) * 2 * rate * rate < wall.r * (wall.kappa * envelope) ** 2
+    return (steady > 0) & (later > 0) & (swing > rest) & slow
+
+
 @shared
-def _rough_crest(
-    wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]
-) -> tuple[Lane, Bool[Array, "lane"]]:
+def _rough_crest(wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]) -> _Crest:
     """Find when w is largest, from the free contact's time, and whether it has no other extremum before the exit.
 
     In single precision, with what is close called uncertain. `end` holds the duration and f' and f at the exit.
@@ -317,8 +351,10 @@ def _rough_crest(
         # A forcing that is never positive allows no minimum.
         outwards = entry.pressure < -1
         first, only = first | outwards, only | outwards
-    inside = (wall.omega1 * when > DOUBT) & (wall.omega1 * way > DOUBT) & (way < (1 - DOUBT) * wall.span)
-    return jnp.where(reached, s, 0.0), converged & first & only & inside
+    inside = (wall.omega1 * way > DOUBT) & (way < (1 - DOUBT) * wall.span)
+    highest = None if wall.ebb is None else _stays_below(wall, at)
+    first = converged & first & (wall.omega1 * when > DOUBT)
+    return _Crest(jnp.where(reached, s, 0.0), first, only & inside, highest)
 
 
 def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:

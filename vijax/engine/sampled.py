@@ -23,7 +23,7 @@ from vijax.engine.roots import converged_step, householder
 from vijax.model import energy, flow
 from vijax.model.flow import PI, Force, Membrane
 from vijax.model.pair import ImpactPair
-from vijax.runtime.arrays import Lane, Mask
+from vijax.runtime.arrays import Lane, Mask, choose
 from vijax.runtime.xla import share, shared
 
 Samples = Float[Array, "sample lane"]
@@ -34,8 +34,9 @@ Powers = Float[Array, "sample *row lane"]
 _SAMPLES = 32  # A pass takes so many; a power of two, as `_powers` doubles them.
 _PASSES = 6  # After these a lane is declined, for the careful step to do: more keep the others waiting.
 _ZOOM = 1 / 16  # where a pass met a doubt, the next one samples so much more closely
-_FINEST = 1 / 16  # longest sampling step, in half periods of the forcing and of the membrane
+_FINEST = 1 / 8  # longest sampling step, in half periods of the forcing and of the membrane
 _NONE = float(_SAMPLES)
+_EBB = 0.9  # share of a way without crossings that is left out: at its end a contact may be as good as over
 
 
 class _Crest(NamedTuple):
@@ -44,7 +45,8 @@ class _Crest(NamedTuple):
     when: Lane  # when the highest sample was
     step: Lane
     height: Lane
-    rival: Lane  # how high another maximum could be
+    most: Lane  # how high the maximum beside it could be
+    rival: Lane  # and another one
 
 
 class _Pass(NamedTuple):
@@ -110,10 +112,10 @@ def _at(samples: Samples, index: Lane) -> Lane:
     return jnp.take_along_axis(samples, row[None], axis=0)[0]
 
 
-def _search(advance: Callable[[_Pass], _Pass], like: Lane) -> _Pass:
-    """Pass after pass until every lane has its crossing."""
-    zero, one = jnp.zeros_like(like), jnp.ones_like(like)
-    start = _Pass(zero, zero, one, zero, one, zero, _Crest(zero, zero, zero, zero))
+def _search(advance: Callable[[_Pass], _Pass], side: Lane) -> _Pass:
+    """Pass after pass until every lane has its crossing; one that begins with a `side` is not searched."""
+    zero, one = jnp.zeros_like(side), jnp.ones_like(side)
+    start = _Pass(zero, zero, one, side, one, zero, _Crest(zero, zero, zero, zero, zero))
 
     def searching(carry):
         at, passes = carry
@@ -138,7 +140,8 @@ def _chord(found: _Pass) -> Lane:
 
 
 @shared
-def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
+def _fly(pair: ImpactPair, lane: Ball, known: Arrival | None = None) -> Arrival:
+    """Find the end of every lane's flight; those that are known for sure cost no pass."""
     half, gamma = 0.5 * pair.d, pair.gamma
     eps = jnp.finfo(half.dtype).eps
     bend = 1 + jnp.abs(gamma)
@@ -166,7 +169,7 @@ def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
         crossing = _Crossing(jnp.minimum(up.closes, down.closes), jnp.minimum(up.doubt, down.doubt))
         return _next(at, s, h, crossing, jnp.where(rises, 1.0, -1.0), half - jnp.where(rises, u, -u), at.crest)
 
-    found = _search(advance, half)
+    found = _search(advance, jnp.zeros_like(half) if known is None else known.sure.astype(half.dtype))
     distance = half - found.side * lane.u
     at = _chord(found)
     for _ in range(2):
@@ -177,7 +180,8 @@ def _fly(pair: ImpactPair, lane: Ball) -> Arrival:
         at, step = share((at + step, step))
     speed = found.side * flow.flight(force, lane.v, at)[1]
     sure = (found.side != 0) & (jnp.abs(step) < converged_step(eps)) & (speed > 0) & (at > 0)
-    return Arrival(at, speed, found.side, sure)
+    new = Arrival(at, speed, found.side, sure)
+    return new if known is None else choose(known.sure, known, new)
 
 
 class _Contact(NamedTuple):
@@ -206,6 +210,24 @@ def _turned(c: _Contact, s: Rows) -> tuple[Rows, Rows, Force]:
     cosine, sine = share((decay * jnp.cos(turn), decay * jnp.sin(turn)))
     along, across = c.free_cos * cosine + c.free_sin * sine, c.free_sin * cosine - c.free_cos * sine
     return along, across, c.steady.later(s)
+
+
+def _ebbed(c: _Contact, at: _Pass, free_size: Lane, steady_size: Lane, deep: bool) -> _Pass:
+    """Go on to where a contact may end: while the swing is smaller than the steady response, w has no zero.
+
+    Gravity prolongs contacts for dozens of swings, too many to sample. Where the greatest depth is wanted the way is
+    taken only if nothing on it can be as deep as the crest so far.
+    """
+    steady, swing = c.steady.later(at.s), free_size * jnp.exp(-c.m.zeta * at.s)
+    level, rate = steady.c - steady.g, -PI * steady.q
+    ebbs = (at.side == 0) & (level > swing)
+    way = _EBB * _safe(jnp.maximum(level - swing, 0.0), rate, PI**2 * steady_size)
+    if not deep:
+        return at._replace(s=at.s + jnp.where(ebbs, way, 0.0))
+    most = steady_size - steady.g + swing
+    ebbs = ebbs & (most < at.crest.height)
+    crest = at.crest._replace(rival=jnp.where(ebbs, jnp.maximum(at.crest.rival, most), at.crest.rival))
+    return at._replace(s=at.s + jnp.where(ebbs, way, 0.0), crest=crest)
 
 
 @shared
@@ -254,6 +276,7 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
     order = jnp.arange(1, _SAMPLES + 1, dtype=speed.dtype)[:, None]
 
     def advance(at: _Pass) -> _Pass:
+        at = share(_ebbed(c, at, free_size, steady_size, deep))
         turned = _turned(c, at.s)
         along, across, steady = turned
         w, z = _state(c, turned)
@@ -276,7 +299,7 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
         crest = _higher(at, w, push, s, h, change, last) if deep else at.crest
         return _next(at, s, h, crossing, jnp.ones_like(h), w, crest)
 
-    found = _search(advance, speed)
+    found = _search(advance, jnp.zeros_like(speed))
     polished = share(_polish(c, jnp.stack([_chord(found), found.crest.when] if deep else [_chord(found)])))
     duration, step, (_, z, push, jerk, _) = jax.tree.map(lambda rows: rows[0], polished)
     out = -(z + step * (push + step * (0.5 * jerk)))
@@ -301,7 +324,8 @@ def _higher_of(one: tuple[Lane, Lane], other: tuple[Lane, Lane]) -> tuple[Lane, 
 def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: Lane, last: Lane) -> _Crest:
     """Find the highest sample so far.
 
-    Where w" < 0 the samples around the highest hold one maximum, its own. `change` bounds that of w" over a step.
+    Where w" < 0 the samples around the highest hold one maximum, its own. `change` bounds that of w" over a step. A
+    maximum is half a step from a sample at most, and a whole one before the first sample of a pass.
     """
     order = jnp.arange(_SAMPLES, dtype=w.dtype)[:, None]
     seen = share(jnp.where(order <= last, w, -jnp.inf))
@@ -309,28 +333,37 @@ def _higher(at: _Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: L
     former = at.crest
     better = share(top > former.height)
     when, height = share((jnp.where(better, when, former.when), jnp.where(better, top, former.height)))
-    around = (jnp.abs(s - when) < 2.5 * h) & (push + change < 0)
-    hidden = seen + 0.125 * h * h * (jnp.abs(push) + change)
+    hidden = share(seen + jnp.where(order == 0, 0.5, 0.125) * h * h * (jnp.abs(push) + change))
+    near = jnp.abs(s - when) < 2.5 * h
+    around = near & (push + change < 0)
     apart = -_least(share(jnp.where(around, jnp.inf, -hidden)))
-    beaten = jnp.where(better & (when - former.when > 2.5 * h), former.height + 0.125 * h * h * change, 0.0)
+    beaten = jnp.where(better & (when - former.when > 2.5 * h), former.most, 0.0)
     rival = jnp.maximum(former.rival, jnp.maximum(apart, beaten))
-    return _Crest(when, jnp.where(better, h, former.step), height, rival)
+    most = jnp.where(better, -_least(share(jnp.where(near, -hidden, jnp.inf))), former.most)
+    return _Crest(when, jnp.where(better, h, former.step), height, most, rival)
 
 
 def sampled_step(
-    pair: ImpactPair, lane: Ball, arrival: Arrival | None = None, *, deep: bool = False, tangent: bool = False
+    pair: ImpactPair,
+    lane: Ball,
+    arrival: Arrival | None = None,
+    *,
+    unsure: bool = False,
+    deep: bool = False,
+    tangent: bool = False,
 ) -> tuple[LaneImpact, Mask]:
     """Take every lane one impact on by certified sampling.
 
     Args:
         arrival: The end of the flight, where a cheaper way to it is known.
+        unsure: Look for the end of flights whose `arrival` is not sure; else such a lane is declined.
         deep: Also find the greatest depth and the work given to the membrane.
         tangent: Also give the tangent map of the step, flight and saltations included.
 
     Returns:
         The impact, and for which lanes it is certain.
     """
-    flight, speed, side, sure = arrival or _fly(pair, lane)
+    flight, speed, side, sure = arrival if arrival is not None and not unsure else _fly(pair, lane, arrival)
     side = jnp.where(side < 0, -1.0, 1.0).astype(flight.dtype)
     onset_t, passed = flow.wrap_phase(lane.t + flight)
     onset_n, v_in = lane.n + passed, side * speed

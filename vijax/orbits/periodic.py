@@ -124,7 +124,7 @@ def proven(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit i
 
 def judged(pair: ImpactPair, sequence: Sequence, claim: "Claim") -> Orbit:
     """Prove claims by the impact map, or say what they lack."""
-    return _by_tiles(partial(_prove, ground_of(pair.gamma, deep=True)), (pair, sequence, claim))
+    return _by_tiles(partial(_prove, ground_of(pair.gamma)), (pair, sequence, claim))
 
 
 @door
