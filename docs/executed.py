@@ -8,7 +8,7 @@ import hashlib
 import math
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import nbformat
@@ -32,6 +32,8 @@ get_ipython().run_line_magic("config", "InlineBackend.rc = {'figure.dpi': 80}")
 warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\\n"
 """
 _CELL_SECONDS = 300  # a cell that takes longer hangs
+# They take half a minute and more with nothing kept. What several pages need, the first of them compiles for all.
+_LONGEST = ("curves.md", "design.md", "failures.md", "derivatives.md", "stiffness.md", "power-drop.md")
 _NUMBER = re.compile(r"[-+]?(?:\d[\d,]*\.?\d*|\.\d+)(?:e[-+]?\d+)?")
 # Durations and rates depend on the hour, and so do spaces that align them.
 _TIMES = re.compile(r"[\d.,]+ ?(?:s|ms|us|min)\b|[\d.,]+k? ?\w+/s\b|\s+")
@@ -75,22 +77,32 @@ def kept(notebook: NotebookNode) -> Path | None:
     return next(OUTPUTS.glob(f"*-{_digest(notebook)}.ipynb"), None)
 
 
+def longest_first(paths: Iterable[Path]) -> list[Path]:
+    """Sort pages so that none of those that take long begins when the others are done."""
+    long = dict(zip(_LONGEST, range(len(_LONGEST)), strict=True))
+    return sorted(paths, key=lambda path: long.get(path.name, len(long)))
+
+
 def stray() -> list[Path]:
     """List the files of outputs that belong to no page as it is now."""
     return sorted(set(OUTPUTS.glob("*.ipynb")) - {kept(read_page(path)) for path in pages()})
 
 
-def execute(path: Path) -> list[str]:
+async def execute(path: Path) -> list[str]:
     """Execute the cells of a page, keep their outputs and say what differs from those that were kept.
 
     Pictures are kept anew, but not compared: pixels differ between versions of fonts.
+
+    Raises:
+        CellControlSignal: A cell raised, or took too long; the outputs that were kept are kept.
+        DeadKernelError: The kernel ended.
     """
     fresh = read_page(path)
     before = kept(fresh)
     fresh.cells.insert(0, nbformat.v4.new_code_cell(_SETUP))
     with tempfile.TemporaryDirectory() as folder:
         place = {"metadata": {"path": folder}}
-        NotebookClient(fresh, timeout=_CELL_SECONDS, kernel_name="python3", resources=place).execute()
+        await NotebookClient(fresh, timeout=_CELL_SECONDS, kernel_name="python3", resources=place).async_execute()
     del fresh.cells[0]
     for cell in _cells(fresh):
         cell.outputs = [_plain(output) for output in _joined(cell.outputs)]

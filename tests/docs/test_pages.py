@@ -1,15 +1,19 @@
 """The pages: they build without a warning, load nothing from elsewhere, and show what the program is now."""
 
+import asyncio
 import html
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from nbclient.exceptions import DeadKernelError
 
 import vijax
 from docs import executed
@@ -156,21 +160,64 @@ def test_the_page_of_functions_is_in_public_names_says_nothing_twice_and_keeps_l
     assert len(example.splitlines()) == 3
 
 
-def test_execution_ends_in_a_sentence_on_what_changed_and_stops_without_a_traceback(monkeypatch, capsys, tmp_path):
+@pytest.fixture
+def executing(monkeypatch, tmp_path):
+    """A build of pages by name, each executed by the function given, which nothing but the execution is left of."""
+
+    def build(names, execute) -> int:
+        monkeypatch.setattr(executed, "pages", lambda: (executed.HERE / name for name in names))
+        monkeypatch.setattr(executed, "stray", list)
+        monkeypatch.setattr(executed, "execute", execute)
+        monkeypatch.setattr("docs.__main__.build_main", lambda _: 0)
+        return main(["--execute", "--into", str(tmp_path)])
+
+    return build
+
+
+def test_execution_ends_in_a_sentence_on_what_changed(executing, capsys):
     found = {"start.md": [], "maps.md": ["kept:\n1\ncame:\n2"]}
-    pages = [executed.HERE / name for name in found]
-    monkeypatch.setattr(executed, "pages", lambda: iter(pages))
-    monkeypatch.setattr(executed, "stray", list)
-    monkeypatch.setattr(executed, "execute", lambda page: found[page.name])
-    monkeypatch.setattr("docs.__main__.build_main", lambda _: 0)
-    assert main(["--execute", "--into", str(tmp_path)]) == 1
+
+    async def execute(page):
+        return found[page.name]
+
+    assert executing(found, execute) == 1
     assert capsys.readouterr().out.splitlines()[-1] == "executed 2 pages: other outputs than before on maps.md"
 
-    def stopped(page):
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr(executed, "execute", stopped)
-    assert main(["--execute", "--into", str(tmp_path)]) == 130
+def test_a_page_that_fails_is_named_and_the_others_go_on(executing, capsys):
+    async def execute(page):
+        if page.name == "curves.md":
+            raise DeadKernelError("it died")
+        return []
+
+    assert executing(["start.md", "curves.md"], execute) == 1
+    lines = capsys.readouterr().out.splitlines()
+    # What takes longest begins first.
+    assert [line.partition(":")[0] for line in lines[::2]] == ["curves.md", "start.md"]
+    assert lines[1] == "failed: it died"
+    assert lines[-1] == "executed 2 pages: all outputs as before; failed: curves.md"
+
+
+def test_ctrl_c_stops_all_pages_without_a_traceback(executing, capsys, monkeypatch):
+    monkeypatch.setattr("docs.__main__.AT_ONCE", 2)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs behind a prompt ignores it
+    ended = []
+
+    async def execute(page):
+        try:
+            await asyncio.sleep(0.1)
+            if page.name == "maps.md":
+                os.kill(os.getpid(), signal.SIGINT)
+            await asyncio.sleep(10)
+            return []
+        finally:
+            ended.append(page.name)
+
+    try:
+        assert executing(["start.md", "maps.md", "data.md"], execute) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sorted(ended) == ["maps.md", "start.md"]
     assert "stopped" in capsys.readouterr().out
 
 

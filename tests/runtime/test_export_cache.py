@@ -1,6 +1,7 @@
 """A program is traced once: kept with what it depends on, read back bit for bit, traced anew where that fails."""
 
 import ast
+import pickle
 import re
 import shutil
 import sys
@@ -17,6 +18,7 @@ import pytest
 from jax import monitoring
 
 import vijax
+from vijax.batch.cell import Plan
 from vijax.model.records import State
 from vijax.runtime import cache_folder, export_cache, xla
 
@@ -52,6 +54,12 @@ def called(name="wave", x=X):
     np.testing.assert_array_equal(program(given), first)
     np.testing.assert_allclose(first, np.sin(np.asarray(x)) / 3.0, rtol=1e-6 if x.dtype == "float32" else 1e-15)
     return first, work.traced
+
+
+def test_what_a_worker_of_a_cluster_is_sent_names_the_same_program():
+    plan = Plan(until="window", deep=True)
+    assert str(pickle.loads(pickle.dumps(plan))) == str(plan) != str(Plan(deep=True))
+    assert str(pickle.loads(pickle.dumps(Plan()))) == str(Plan())
 
 
 def test_the_second_process_does_not_trace(folder):

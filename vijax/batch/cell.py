@@ -7,6 +7,7 @@ more sceptical. A cell that reaches its last period without an orbit reports ave
 transient.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -58,6 +59,13 @@ class Plan(eqx.Module):
     variants: int = eqx.field(static=True, default=1)
     chained: bool = eqx.field(static=True, default=False)
     devices: bool = eqx.field(static=True, default=False)
+
+    def __str__(self) -> str:
+        """Name every choice, as programs are kept by it.
+
+        Equinox leaves out what is a default, but tells that by identity: "attractor" of another process is none.
+        """
+        return str(dataclasses.asdict(self))
 
 
 class Settings(eqx.Module):

@@ -17,7 +17,8 @@ from vijax.orbits.shooting import Sequence
 from vijax.runtime import context
 from vijax.runtime.tiles import padded, workers
 
-_SMALLEST_TILE, _LARGEST_TILE = 512, 8192  # cells of a call
+_SMALLEST_TILE, _LARGEST_TILE = 1024, 8192  # cells of a compiled call
+_SHARE = 512  # cells for which a core is worth it
 _SAME = 1e-6  # relative difference within which attractors of one pair are the same; see `basins`
 
 
@@ -124,7 +125,8 @@ def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, pe
     cells = pair.d.size
     share = math.ceil(cells / workers())
     size = min(max(padded(share), _SMALLEST_TILE), _LARGEST_TILE)
-    number = math.ceil(cells / size)
+    # Padding costs nothing, as it is not run: one program serves a default survey and smaller ones.
+    number = max(math.ceil(cells / size), min(workers(), math.ceil(cells / _SHARE)))
     # Strided tiles cost the same.
     tiles = [np.arange(first, cells, number) for first in range(number)]
 
