@@ -36,9 +36,9 @@ class Branch(NamedTuple):
         values: Of the parameter, one an orbit.
         orbit: The orbits, with multipliers.
         points: What was met on the way, in order.
-        ends: Why it stops at its first and at its last orbit: "start", a kind of `Point` where no orbit goes on, "low"
-            or "high" (bound of the parameter), "closed" (back at its start), "points" (as many as asked for), "lost"
-            (no step was short enough).
+        ends: Why it stops at its first and at its last orbit: "start", a kind of `Point` where no orbit goes on, or
+            that is one graze more than asked for, "low" or "high" (bound of the parameter), "closed" (back at its
+            start, or at its first graze), "points" (as many as asked for), "lost" (no step was short enough).
     """
 
     along: str
@@ -64,7 +64,7 @@ def follow(
     points: int = 4000,
     settings: ContinuationSettings = DEFAULT,
 ) -> list[Branch]:
-    """Follow periodic orbits, stable or not, along one parameter, through folds.
+    """Follow periodic orbits, stable or not, along one parameter, through folds, and through grazes at soft walls.
 
     Args:
         orbit: Where to start, each a branch of its own; all at once.
@@ -78,7 +78,8 @@ def follow(
         settings: Of steps and events; see `ContinuationSettings`.
 
     Returns:
-        One branch an orbit. A branch ends where its orbits cease to be real (a grazing), at a bound, or says why else.
+        One branch an orbit. At a grazing its orbits cease to be real: at rigid walls it ends there, at soft ones it
+        goes on with those that have an impact more or fewer. It ends at a bound, or says why else.
 
     Raises:
         ValueError: An unknown parameter or direction, bounds in the wrong order or without the start, or an orbit that
