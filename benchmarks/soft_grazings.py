@@ -25,7 +25,7 @@ from vijax.orbits.continuation import Branch
 from vijax.orbits.events import Point
 from vijax.orbits.periodic import Orbit
 
-BOUNDS = {"d": (0.05, 0.3), "kappa": (8.0, 200.0), "r": (0.3, 0.9)}
+BOUNDS = {"d": (0.02, 0.3), "kappa": (3.0, 200.0), "r": (0.3, 0.9)}
 MOST_IMPACTS = 6  # of the orbit beyond a graze in full: random guesses find longer ones rarely
 GRAZINGS_EACH = 2  # that one orbit gives at most, each way
 BESIDE = 5  # orbits on either side whose residuals are told
@@ -94,7 +94,7 @@ def branches(draw: np.random.Generator, along: str) -> list[Branch]:
     kappa = float(np.exp(draw.uniform(*np.log(BOUNDS["kappa"]))))
     pair = vijax.impact_pair(d, kappa, r, float(draw.choice([0.0, 0.05])))
     period = int(draw.integers(1, 3))
-    orbit = vijax.orbits_from_states(pair, [0.0], [draw.uniform(-1, 1)], period=period, settle=200)
+    orbit = vijax.orbits_from_states(pair, 0.0, float(draw.uniform(-1, 1)), period=period, settle=200)
     if int(orbit.status[0]) != Status.OK or int(orbit.count[0]) > MOST_IMPACTS:
         return []
     if bool(symmetry.symmetric(orbit)[0]):

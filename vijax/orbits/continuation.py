@@ -1,6 +1,7 @@
 """Branches of periodic orbits along a parameter, by pseudo-arclength continuation through folds, many at once.
 
-All lanes step together (`arclength_walk`); what happened on the way is located afterwards (`events`).
+All lanes step together (`arclength_walk`), from graze to graze (`pieces`); what happened on the way is located
+afterwards (`events`).
 """
 
 from typing import Literal, NamedTuple
@@ -10,15 +11,14 @@ import numpy as np
 
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
-from vijax.orbits import periodic
 from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
-from vijax.orbits.arclength_walk import Walked, walk
+from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
-from vijax.orbits.events import Event, Point, events, happenings, kind_of, orbits_at
-from vijax.orbits.orbit_properties import marks
+from vijax.orbits.events import BranchEvent, Point, events, happenings, kind_of, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
 from vijax.orbits.periodic import Orbit, check_orbit
-from vijax.orbits.soft_graze import Passage, passage
+from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
+from vijax.orbits.soft_graze import Passage, branch_passage
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
@@ -78,8 +78,8 @@ def follow(
         settings: Of steps and events; see `ContinuationSettings`.
 
     Returns:
-        One branch an orbit. At a grazing its orbits cease to be real: at rigid walls it ends there, at soft ones it
-        goes on with those that have an impact more or fewer. It ends at a bound, or says why else.
+        One branch an orbit. At a grazing, where its orbits cease to be real, it ends at rigid walls; at soft ones it
+        goes on with those that have an impact more or fewer. Else it ends at a bound, or says why.
 
     Raises:
         ValueError: An unknown parameter or direction, bounds in the wrong order or without the start, or an orbit that
@@ -152,77 +152,29 @@ def heading(place: BranchPlace, sign: float) -> BranchPlace:
     return place._replace(tangent=sign * place.tangent, tests=tests)
 
 
-class _Piece(NamedTuple):
-    """A branch from graze to graze.
-
-    Attributes:
-        values, orbits: Of its points in order; orbits in batches, of several widths.
-        points: What was met, at last the graze.
-        end: Why it ends.
-        beyond: What is beyond the graze at which it ends, if it does and something is.
-    """
-
-    values: np.ndarray
-    orbits: list[Orbit]
-    points: list[Point]
-    end: str
-    beyond: Passage | None
-
-
 def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
     """Follow one way from every start, at soft walls through grazes, after which orbits have other impacts."""
-    ways: list[list[_Piece]] = [[] for _ in first.y]
-    going = [(lane, *jax.tree.map(lambda leaf, i=lane: leaf[i], (arcs, first))) for lane in range(len(ways))]
-    while going:
-        # Orbits of as many impacts are followed together.
-        widths = {place.y.size for _, _, place in going}
-        for batch in ([one for one in going if one[2].y.size == width] for width in sorted(widths)):
-            lanes, *rows = zip(*batch, strict=True)
-            paths, places = (jax.tree.map(lambda *leaves: np.stack(leaves), *row) for row in rows)
-            left = np.array([points - _size(ways[lane]) for lane in lanes])
-            walked = walk(paths, places, left, settings, happenings, FIRST_END)
-            for (lane, arc, _), one in zip(batch, walked, strict=True):
-                ways[lane].append(_piece(arc, one, settings, begun=not ways[lane]))
-        on = [(lane, ways[lane][-1].beyond) for lane, _, _ in going if _goes_on(ways[lane], points, settings)]
-        going = [(lane, to.arc, jax.tree.map(lambda leaf: leaf[0], to.place)) for lane, to in on if to]
-    return [_branch(along, way, settings) for way in ways]
+
+    def making(_: int, arc: Arc, walked: Walked, begun: bool) -> Piece:
+        return _piece(arc, walked, settings, begun)
+
+    followed = follow_pieces(arcs, first, making, points, settings, happenings, FIRST_END)
+    return [Branch(along, *one) for one in followed]
 
 
-def _size(way: list[_Piece]) -> int:
-    return sum(len(piece.values) for piece in way)
-
-
-def _goes_on(way: list[_Piece], points: int, settings: ContinuationSettings) -> bool:
-    """Say whether a branch is to be followed beyond the end of its last piece."""
-    some = len(way) <= settings.max_grazings and _size(way) + 1 < points
-    return way[-1].beyond is not None and some and not _came_round(way, settings)
-
-
-def _came_round(way: list[_Piece], settings: ContinuationSettings) -> bool:
-    """Say whether a branch has come by its first graze again, in the same direction."""
-    one, other = way[0].beyond, way[-1].beyond
-    if len(way) == 1 or one is None or other is None or (one.kind, one.gained) != (other.kind, other.gained):
-        return False
-    traits = [np.append(marks(to.orbit)[0], piece.points[-1].value) for piece, to in ((way[0], one), (way[-1], other))]
-    return np.allclose(*traits, rtol=0, atol=settings.asymmetry)
-
-
-def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool) -> _Piece:
-    """Make a piece of a lane's record: what was met between its points, and where it ends.
-
-    Args:
-        begun: Whether the branch begins with it; else its first point is the graze at which the one before ends.
-    """
+def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool) -> Piece:
+    """Make a piece of a lane's record: what was met between its points, and where it ends; see `pieces.Making`."""
     y, tangent, tests, lengths, end = walked
-    unit, last, met, beyond = float(arc.high - arc.low), len(y), [], None
+    unit, last, values = float(arc.high - arc.low), len(y), y[:, -1]
+    met: list[Point] = []
     ending: list[Orbit] = []
-    values = y[:, -1]
+    beyond = None
     for event in events(arc, y, tangent, tests, lengths, settings):
         kind, orbit = kind_of(arc, event, y[event.place : event.place + 2], settings), orbits_at(arc, event.y[None])
         ends = event.test in Tests._fields[FIRST_END:]
         if ends and kind not in ("low", "high"):
             beyond = _beyond(arc, event, y, tests)
-            kind, orbit = (kind, orbit) if beyond is None else (beyond.kind, beyond.orbit)
+            kind, orbit = (kind, orbit) if beyond is None else (f"grazing {beyond.touches}", beyond.orbit)
         if kind not in ("low", "high"):
             met.append(Point(kind, float(event.y[-1] * unit), orbit))
         if ends:
@@ -234,41 +186,17 @@ def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool
     # At a bound the last orbit is there; at a grazing rounding decides whether it is one.
     if orbits and int(orbits[-1].status[-1]) != Status.OK:
         values, orbits = values[:-1], [*orbits[:-1], orbits[-1][:-1]]
-    return _Piece(values[rows.start :] * unit, orbits, met, end, beyond)
+    return Piece(values[rows.start :] * unit, orbits, met, end, beyond)
 
 
-def _beyond(arc: Arc, event: Event, y: np.ndarray, tests: np.ndarray) -> Passage | None:
+def _beyond(arc: Arc, event: BranchEvent, y: np.ndarray, tests: np.ndarray) -> Passage | None:
     """Find what is beyond the graze at which a piece ends."""
     rises = tests[event.place, FOLD]
     if not np.abs(rises) > 0:  # unknown at the very beginning of a branch that was switched to
         rises = event.y[-1] - y[event.place, -1]
-    return passage(arc, event.y, event.test, float(np.sign(rises)))
-
-
-def _branch(along: str, way: list[_Piece], settings: ContinuationSettings) -> Branch:
-    """Make a branch of its pieces. One that has come round is told from its first graze to the same again."""
-    way = way if len(way[-1].values) or len(way) == 1 else way[:-1]  # No step led on from the last graze.
-    ends = "start", way[-1].end
-    if round_ := _came_round(way, settings):
-        way, ends = way[1:], ("closed", "closed")
-    met = []
-    for number, piece in enumerate(way):
-        met += piece.points
-        if piece.beyond is not None and (round_ or number < len(way) - 1):
-            met[-1] = met[-1]._replace(gained=piece.beyond.gained, wall=piece.beyond.wall)
-    orbits = [orbit for piece in way for orbit in piece.orbits]
-    width = max(orbit.knots.shape[1] for orbit in orbits)
-    orbit = periodic.concatenate([periodic.widened(one, width) for one in orbits])
-    return Branch(along, np.concatenate([piece.values for piece in way]), orbit, met, ends)
+    return branch_passage(arc, event.y, event.test, float(np.sign(rises)))
 
 
 def _joined(down: Branch, up: Branch) -> Branch:
-    """Join two ways from one start to one branch, from end to end; where it closes one way is all of it."""
-    if down.ends[1] == "closed":
-        return down
-    width = max(one.orbit.knots.shape[1] for one in (down, up))
-    back, on = (periodic.widened(one.orbit, width) for one in (down, up))
-    values = np.concatenate([down.values[::-1], up.values[1:]])
-    points = [point._replace(gained=-point.gained) for point in down.points[::-1]]
-    orbit = periodic.concatenate([back[::-1], on[1:]])
-    return Branch(down.along, values, orbit, points + up.points, (down.ends[1], up.ends[1]))
+    """Join two ways from one start to one branch."""
+    return Branch(down.along, *joined(Followed(*down[1:]), Followed(*up[1:])))

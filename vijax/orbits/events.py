@@ -40,10 +40,15 @@ class Point(NamedTuple):
     @property
     def onward(self) -> str:
         """Say how the branch goes on through a graze; nothing elsewhere."""
-        if not self.gained:
-            return ""
-        where = {-1: "the left wall", 0: "each wall", 1: "the right wall"}[self.wall]
-        return f"one impact {'more' if self.gained > 0 else 'fewer'} at {where}"
+        return onward(self.gained, self.wall)
+
+
+def onward(gained: int, wall: int) -> str:
+    """Say in words how a path goes on; see `Point`."""
+    if not gained:
+        return ""
+    where = {-1: "the left wall", 0: "each wall", 1: "the right wall"}[wall]
+    return f"one impact {'more' if gained > 0 else 'fewer'} at {where}"
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -58,7 +63,7 @@ def happenings(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return (passed.fold | passed.plus).astype(int) + passed.minus + ends
 
 
-class Event(NamedTuple):
+class BranchEvent(NamedTuple):
     """A sign change: the point before it, the arclength from there, of which test function, the point itself."""
 
     place: int
@@ -67,7 +72,7 @@ class Event(NamedTuple):
     y: np.ndarray
 
 
-def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings) -> list[Event]:
+def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings) -> list[BranchEvent]:
     """Find what happens between neighbours in order, up to the first thing that ends the branch."""
     index, test = np.nonzero(changed(tests[:-1], tests[1:]))
     if not index.size:
@@ -76,7 +81,7 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
     arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
     s, there, zero = locate(arcs, *before, test, tests[index, test], settings)
     found = [
-        Event(int(i), float(at), Tests._fields[t], y)
+        BranchEvent(int(i), float(at), Tests._fields[t], y)
         for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
         # A multiplier that passes +1 at a fold is no second event.
         if sure and not (t == PLUS and ((index == i) & (test == FOLD)).any())
@@ -126,7 +131,7 @@ def locate(
     return best, best_y, np.abs(best_f) <= settings.zero_share * scale
 
 
-def kind_of(arc: Arc, event: Event, neighbours: np.ndarray, settings: ContinuationSettings) -> str:
+def kind_of(arc: Arc, event: BranchEvent, neighbours: np.ndarray, settings: ContinuationSettings) -> str:
     """Say what a sign change means for this orbit."""
     test = event.test
     if test in _GRAZING:

@@ -9,23 +9,31 @@ With the new impact at v = 0 the equations of `shooting` hold at the graze and a
 v alone moves at first. So a branch of orbits with it begins at the graze, in that direction, and goes on.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 
 from vijax.model import flow
+from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing
-from vijax.orbits.arclength_step import FIRST_END, Arc, BranchPlace, Tests, advance
+from vijax.orbits.arclength_step import FIRST_END, Arc, BranchPlace, Path, Tests, advance
 from vijax.orbits.events import orbits_at
-from vijax.orbits.periodic import Orbit
+from vijax.orbits.orbit_properties import counts
+from vijax.orbits.periodic import SAME, Orbit
 from vijax.orbits.shooting import Sequence
+from vijax.orbits.symmetry import symmetric, unfolded
+from vijax.runtime import tiles
 from vijax.runtime.programs import jitted
 
-# Of two rooms, or speeds, that differ by less both vanish: at both walls of an orbit that is its own mirror image, but
-# not closed half way. They agree to 1e-13 then; two grazes that merely are close differ by far more.
-_ALIKE = 1e-10
+# Of two speeds, or rooms, that differ by less both vanish: at both walls of an orbit that is its own mirror image, but
+# not closed half way. They agree to 1e-14 then. A room is as small as the square of a speed.
+_SAME_SPEED, _SAME_ROOM = 1e-10, 1e-13
+# How far an orbit may move as its impact is left out or put in. It solves the equations already; where it moves a
+# bifurcation is so near that it is another orbit.
+_STAYS = 1e-9
+P = TypeVar("P", bound=Path)
 _CLEARANCES = slice(FIRST_END, Tests._fields.index("low"))
 
 
@@ -33,66 +41,36 @@ class Passage(NamedTuple):
     """A graze at a soft wall, and the path of the orbits beyond.
 
     Attributes:
-        kind: What touches, of the orbit with fewer impacts: "grazing flight" or "grazing contact".
+        touches: What touches a wall, of the orbit with fewer impacts: "flight" or "contact".
         orbit: That orbit, along a leading axis of one.
         gained: Impacts that the orbits beyond have more; negative where they have fewer.
         wall: -1 or +1; 0 for both.
-        arc, place: The path beyond, and where it begins.
+        path, place: Of the orbits beyond, and where it begins; neither has a leading axis.
     """
 
-    kind: str
+    touches: str
     orbit: Orbit
     gained: int
     wall: int
-    arc: Arc
+    path: Path
     place: BranchPlace
 
 
-def passage(arc: Arc, y: np.ndarray, test: str, sign: float) -> Passage | None:
-    """Find what is beyond a graze; None at a rigid wall, and where no impact would be left.
+class Touching(NamedTuple):
+    """An orbit that touches walls, without the impacts there.
 
-    Args:
-        arc, y: The path that has come to the graze, and its unknowns there.
-        test: The test function that vanishes.
-        sign: Whether the parameter rises along the path, which it goes on to do.
+    Attributes:
+        side, knots: Of its impacts.
+        splits: Whether contacts touch from inside; else flights do.
+        after: Of each touch, the impact in whose contact, or in the flight after which, it is.
+        wait: How long after the beginning of that contact or flight; of no meaning where an impact has faded.
+        wall: Which wall.
     """
-    if arc.pair.rigid:
-        return None
-    appears = test in ("flight", "contact")
-    found = _Touching(arc, y, *_touched(arc, y, test)) if appears else _without_impact(arc, y)
-    if found is None:
-        return None
-    # The orbit with fewer impacts is regular at the graze, and has the multipliers of both.
-    ahead = np.zeros((1, found.y.size))
-    ahead[0, -1] = 1.0
-    place = advance(_alone(found.arc), found.y[None], ahead, np.zeros(1))
-    tests = place.tests.copy()
-    tests[:, Tests._fields.index("fold")] *= sign
-    # Past the graze they are positive; here one of them is zero, or not defined.
-    tests[:, _CLEARANCES] = np.nan
-    place = place._replace(tangent=sign * place.tangent, tests=tests)
-    beyond = found.arc
-    if appears:
-        beyond, start, tangent = _with_impact(found)
-        place = place._replace(y=start[None], tangent=tangent[None])
-    walls = {int(wall) for wall in found.wall}
-    return Passage(
-        f"grazing {'contact' if found.splits else 'flight'}",
-        orbits_at(found.arc, found.y[None]),
-        len(found.wall) if appears else -len(found.wall),
-        walls.pop() if len(walls) == 1 and not arc.sequence.mirrored else 0,
-        beyond,
-        place,
-    )
 
-
-class _Touching(NamedTuple):
-    """An orbit that touches a wall, without the impact there: after which onsets or ends of contact, how long after."""
-
-    arc: Arc
-    y: np.ndarray
+    side: np.ndarray
+    knots: np.ndarray
     splits: bool
-    index: np.ndarray
+    after: np.ndarray
     wait: np.ndarray
     wall: np.ndarray
 
@@ -100,49 +78,33 @@ class _Touching(NamedTuple):
 _flights, _contacts = jitted(grazing.flight_turns), jitted(grazing.contact_turns)
 
 
-def _touched(arc: Arc, y: np.ndarray, test: str):
-    """Find where an orbit touches: in which flights or contacts, how long after their beginning, and which walls."""
-    pair, knots = arc.pair_and_knots(y)
-    splits = test == "contact"
-    turns = jax.tree.map(np.asarray, (_contacts if splits else _flights)(pair, arc.sequence, knots))
-    index = np.flatnonzero(turns.room <= turns.room.min() + _ALIKE)
-    return splits, index, turns.when[index], turns.wall[index]
+def touching(pair: ImpactPair, sequence: Sequence, knots: np.ndarray, test: str) -> Touching | None:
+    """Find what touches a wall at a graze; None where no impact would be left.
+
+    Args:
+        pair, sequence, knots: Of the orbit that has come to it, alone.
+        test: Which clearance is zero: of `flight` or `contact` where impacts begin, of `speed` (impact) or `exit` where
+            they end.
+    """
+    if test not in ("flight", "contact"):
+        return _without_impact(pair, sequence, knots)
+    splits, count = test == "contact", int(sequence.real.sum())
+    turns = jax.tree.map(np.asarray, (_contacts if splits else _flights)(pair, sequence, knots))
+    after = np.flatnonzero(turns.room <= turns.room.min() + _SAME_ROOM)
+    side = np.asarray(sequence.side)[:count]
+    return Touching(side, knots[:count], splits, after, turns.when[after], turns.wall[after])
 
 
-def _with_impact(found: _Touching) -> tuple[Arc, np.ndarray, np.ndarray]:
-    """Put an impact of speed 0 where an orbit touches; give the path, its unknowns and its tangent there."""
-    pair, knots = found.arc.pair_and_knots(found.y)
-    side, count = found.arc.sequence.side, int(found.arc.sequence.real.sum())
-    knots, side = knots[:count], side[:count]
-    along = np.zeros_like(knots)
-    # Backwards, so that the places of those before stay what they are.
-    for index, wait, wall in zip(found.index[::-1], found.wait[::-1], found.wall[::-1], strict=True):
-        onset = knots[index, 0] + wait + (0.0 if found.splits else knots[index, 2])
-        push = abs(float(flow.acceleration(pair.gamma, onset)))
-        if found.splits:
-            new, way = (onset, 0.0, knots[index, 2] - wait), (1 / push, 1.0, -1 / push)
-            knots[index, 2], along[index, 2] = wait, along[index, 2] - 1 / push
-        else:
-            new, way = (onset, 0.0, 0.0), (-1 / push, 1.0, 2 / push)
-        # Where several begin at once each is as deep as the others: its speed goes as the root of what pushes it back.
-        knots = np.insert(knots, index + 1, new, axis=0)
-        along = np.insert(along, index + 1, np.sqrt(push) * np.array(way), axis=0)
-        side = np.insert(side, index + 1, int(wall))
-    tangent = np.append(along.ravel(), 0.0)
-    return _among(found.arc, side), np.append(knots.ravel(), found.y[-1]), tangent / np.linalg.norm(tangent)
-
-
-def _without_impact(arc: Arc, y: np.ndarray) -> _Touching | None:
+def _without_impact(pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> Touching | None:
     """Leave out the impacts whose speed has come to zero; None where these are all.
 
     Where the acceleration is away from the wall the contact, too, has no length. Else it is the flight before it that
     has none, and the contact before goes on through it.
     """
-    pair, knots = arc.pair_and_knots(y)
-    sequence, count = arc.sequence, int(arc.sequence.real.sum())
-    knots, side = knots[:count].copy(), sequence.side[:count]
+    count = int(sequence.real.sum())
+    knots, side = knots[:count].copy(), np.asarray(sequence.side)[:count]
     speed = np.abs(knots[:, 1])
-    fading = np.flatnonzero(speed <= speed.min() + _ALIKE)
+    fading = np.flatnonzero(speed <= speed.min() + _SAME_SPEED)
     if fading.size == count:
         return None
     push = np.asarray(flow.acceleration(pair.gamma, knots[fading, 0]))
@@ -151,16 +113,107 @@ def _without_impact(arc: Arc, y: np.ndarray) -> _Touching | None:
         end = knots[index, 0] + knots[index, 2] + (0.0 if index else float(sequence.span))
         knots[index - 1, 2] = end - knots[index - 1, 0]
     kept = np.delete(np.arange(count), fading)
-    start = np.append(knots[kept].ravel(), y[-1])
-    return _Touching(_among(arc, side[kept]), start, splits, fading, np.zeros(fading.size), side[fading])
+    return Touching(side[kept], knots[kept], splits, fading - 1, np.zeros(fading.size), side[fading])
 
 
-def _among(arc: Arc, side: np.ndarray) -> Arc:
-    """Give the path of orbits that meet other walls."""
-    sequence = Sequence(side.astype(np.int32), arc.sequence.span, arc.sequence.mirrored)
-    return eqx.tree_at(lambda arc: arc.sequence, arc, sequence)
+class Begun(NamedTuple):
+    """An orbit with impacts of speed 0 where it touches walls, and how its knots move as their speed grows."""
+
+    side: np.ndarray
+    knots: np.ndarray
+    along: np.ndarray
 
 
-def _alone(arc: Arc) -> Arc:
-    """Give a path along a leading axis of one."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], arc)
+def with_impact(pair: ImpactPair, found: Touching) -> Begun:
+    """Put an impact of speed 0 wherever an orbit touches."""
+    knots, side = found.knots.copy(), found.side
+    along = np.zeros_like(knots)
+    # Backwards, so that the places of those before stay what they are.
+    for after, wait, wall in zip(found.after[::-1], found.wait[::-1], found.wall[::-1], strict=True):
+        onset = knots[after, 0] + wait + (0.0 if found.splits else knots[after, 2])
+        push = abs(float(flow.acceleration(pair.gamma, onset)))
+        if found.splits:
+            new, way = (onset, 0.0, knots[after, 2] - wait), (1 / push, 1.0, -1 / push)
+            knots[after, 2], along[after, 2] = wait, -np.sqrt(push) / push
+        else:
+            new, way = (onset, 0.0, 0.0), (-1 / push, 1.0, 2 / push)
+        # Where several begin at once each is as deep as the others: its speed goes as the root of what pushes it back.
+        knots = np.insert(knots, after + 1, new, axis=0)
+        along = np.insert(along, after + 1, np.sqrt(push) * np.array(way), axis=0)
+        side = np.insert(side, after + 1, int(wall))
+    return Begun(side, knots, along / np.linalg.norm(along))
+
+
+def among(path: P, side: np.ndarray) -> P:
+    """Give the path of orbits that meet other walls, padded so that few programs are compiled; see `unknowns`."""
+    wide = np.pad(side.astype(np.int32), (0, tiles.padded(len(side)) - len(side)))
+    return eqx.tree_at(lambda path: path.sequence.side, path, wide)
+
+
+def unknowns(knots: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Give the unknowns of such a path: knots and what follows them, along a leading axis of one."""
+    more = tiles.padded(len(knots)) - len(knots)
+    return np.append(np.pad(knots, ((0, more), (0, 0))).ravel(), others)[None]
+
+
+def beyond(found: Touching, appears: bool, orbit: Orbit, path: Path, place: BranchPlace) -> Passage | None:
+    """Make the record of a graze; None where impacts begin or end in some only of the equal parts of an orbit.
+
+    No orbit comes to a graze of such a one, at which all parts touch, but where they bifurcate: both are too near then
+    for rounding to tell them apart.
+
+    Args:
+        found: What touches.
+        appears: Whether impacts begin there; else they have ended.
+        orbit: The one with fewer.
+        path, place: Of the orbits beyond, along a leading axis of one.
+    """
+    walls, number = {int(wall) for wall in found.wall}, len(found.wall)
+    label = counts(orbit)
+    parts = int(unfolded(orbit).count[0]) // int(label.left[0] + label.right[0])
+    mirrored = bool(orbit.sequence.mirrored[0])
+    halves = 2 if not mirrored and bool(symmetric(orbit, SAME)[0]) else 1
+    if number % halves or (number * (1 + mirrored)) % parts:
+        return None
+    one = walls.pop() if len(walls) == 1 and not mirrored else 0
+    path, place = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (path, place))
+    return Passage("contact" if found.splits else "flight", orbit, number if appears else -number, one, path, place)
+
+
+def alone(path: P) -> P:
+    """Give a path a leading axis of one."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], path)
+
+
+def branch_passage(arc: Arc, y: np.ndarray, test: str, sign: float) -> Passage | None:
+    """Find what is beyond a graze of a branch.
+
+    None at a rigid wall, where no impact would be left, and where rounding does not tell it from what bifurcates there.
+
+    Args:
+        arc, y: The path that has come to the graze, and its unknowns there.
+        test: The test function that vanishes.
+        sign: Whether the parameter rises along the path, which it goes on to do.
+    """
+    pair, knots = arc.pair_and_knots(y)
+    if pair.rigid or (found := touching(pair, arc.sequence, np.asarray(knots), test)) is None:
+        return None
+    # The orbit with fewer impacts is regular at the graze, and has the multipliers of both.
+    fewer, start = alone(among(arc, found.side)), unknowns(found.knots, y[-1:])
+    ahead = np.zeros_like(start)
+    ahead[:, -1] = 1.0
+    place = advance(fewer, start, ahead, np.zeros(1))
+    if not np.abs(place.y - start).max() < _STAYS:
+        return None
+    tests = place.tests.copy()
+    tests[:, Tests._fields.index("fold")] *= sign
+    # Past the graze they are positive; here one of them is zero, or not defined.
+    tests[:, _CLEARANCES] = np.nan
+    orbit = orbits_at(jax.tree.map(lambda leaf: leaf[0], fewer), start)
+    appears = test in ("flight", "contact")
+    if not appears:
+        return beyond(found, appears, orbit, fewer, place._replace(tangent=sign * place.tangent, tests=tests))
+    begun = with_impact(pair, found)
+    start, tangent = unknowns(begun.knots, y[-1:]), unknowns(begun.along, np.zeros(1))
+    place = place._replace(y=start, tangent=tangent, tests=tests)
+    return beyond(found, appears, orbit, alone(among(arc, begun.side)), place)

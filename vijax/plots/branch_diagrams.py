@@ -49,9 +49,9 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
     axes.set_ylabel(QUANTITIES[quantity])
     axes.set_title(title(dataset), fontsize="medium")
     kinds = {str(kind).split()[0] for kind in dataset["event"].values.flat if kind}
-    lines = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
-    lines += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
-    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False)
+    legend = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
+    legend += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
+    figure.legend(handles=legend, loc="outside lower center", ncols=len(legend), frameon=False)
     return figure
 
 
