@@ -88,6 +88,12 @@ def test_a_branch_of_mirror_images_comes_round(loop):
     assert values[2] == values[3]
 
 
+def test_both_ways_are_told_in_one_order(orbits):
+    branch = followed(orbits[1], "both", max_grazings=1)
+    changes = np.diff(np.asarray(branch.orbit.count))
+    assert [point.gained for point in grazes(branch) if point.gained] == list(changes[changes != 0]) == [-1, 1]
+
+
 def test_no_graze_is_gone_through_where_none_is_asked_for(orbits):
     branch = followed(orbits[1], max_grazings=0)
     assert branch.ends == ("start", "grazing flight")
@@ -127,3 +133,30 @@ def test_the_dataset_says_how_a_branch_goes_on(loop, tmp_path):
         # Between grazes lines do not jump from one impact to another.
         steps = [np.abs(np.diff(line.get_ydata())) for line in axes.lines if line.get_linestyle() != "None"]
         assert np.nanmax(np.concatenate(steps)) < 0.05
+
+
+def test_a_fold_goes_on_through_its_graze():
+    found = vijax.find_orbits(vijax.impact_pair(0.2, 40.0, 0.5, 0.01), "RL", guesses=256)
+    plain = replace(PLAIN, max_grazings=0)
+    branches = vijax.follow_orbits(found, "d", (0.19, 0.25), settings=plain)
+    folds = [point for branch in branches for point in branch.points if point.kind == "fold"]
+    (curve,) = vijax.follow_curves(folds, "d", {"d": (0.14, 0.25), "gamma": (0.0, 0.2)})
+    (graze,) = [point for point in curve.points if point.gained]
+    assert (graze.kind, graze.test, abs(graze.gained)) == ("fold-graze", "flight", 1)
+    count = np.asarray(curve.orbit.count)
+    assert set(count) == {2, 3}
+    assert (np.asarray(curve.orbit.status) == Status.OK).all()
+    assert np.asarray(curve.orbit.residual).max() < 1e-13
+    assert np.abs(np.asarray(curve.orbit.multipliers) - 1).min(axis=1).max() < 1e-11
+    # An orbit found by itself with one impact more folds there too.
+    place = np.flatnonzero(count == 3)[len(count[count == 3]) // 2]
+    d, gamma = curve.values[place]
+    side = np.asarray(curve.orbit.sequence.side)[place]
+    walls = "".join("R" if wall > 0 else "L" for wall in side if wall)
+    met = []
+    for shift in (-0.002, 0.002):
+        other = vijax.find_orbits(vijax.impact_pair(d + shift, 40.0, 0.5, gamma), walls, guesses=256)
+        if len(other):
+            near = vijax.follow_orbits(other, "d", (d - 0.01, d + 0.01), settings=plain)
+            met += [point.value for one in near for point in one.points if point.kind == "fold"]
+    assert np.abs(np.array(met) - d).min() < 1e-10

@@ -48,7 +48,8 @@ def onward(gained: int, wall: int) -> str:
     if not gained:
         return ""
     where = {-1: "the left wall", 0: "each wall", 1: "the right wall"}[wall]
-    return f"one impact {'more' if gained > 0 else 'fewer'} at {where}"
+    number = abs(gained) if wall else max(abs(gained) // 2, 1)
+    return f"{'one impact' if number == 1 else f'{number} impacts'} {'more' if gained > 0 else 'fewer'} at {where}"
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from vijax.model.records import Status
 from vijax.orbits import periodic
 from vijax.orbits.arclength_step import BranchPlace, Path
 from vijax.orbits.arclength_walk import Walked, walk
@@ -112,12 +113,24 @@ def _whole(way: list[Piece], settings: ContinuationSettings) -> Followed:
     if closed := _came_round(way, settings):
         way, ends = way[1:], ("closed", "closed")
     points: list[Any] = []
+    parts = []
     for number, piece in enumerate(way):
+        parts.append(_trimmed(piece, number == 0, number == len(way) - 1))
         points += piece.points
         if piece.beyond is not None and (closed or number < len(way) - 1):
             points[-1] = points[-1]._replace(gained=piece.beyond.gained, wall=piece.beyond.wall)
-    values = np.concatenate([piece.values for piece in way])
-    return Followed(values, _in_one([orbit for piece in way for orbit in piece.orbits]), points, ends)
+    values, orbits = zip(*parts, strict=True)
+    return Followed(np.concatenate(values), _in_one(list(orbits)), points, ends)
+
+
+def _trimmed(piece: Piece, first: bool, last: bool) -> tuple[np.ndarray, Orbit]:
+    """Leave out orbits next to a graze between pieces of which rounding hides an impact from the impact map."""
+    orbit = _in_one(piece.orbits)
+    good = np.flatnonzero(np.asarray(orbit.status) == Status.OK)
+    begin = 0 if first else int(good.min(initial=len(orbit)))
+    end = len(orbit) if last else int(good.max(initial=-1)) + 1
+    rows = slice(begin, max(begin, end))
+    return piece.values[rows], orbit[rows]
 
 
 def joined(back: Followed, on: Followed) -> Followed:

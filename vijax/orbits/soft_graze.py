@@ -89,7 +89,7 @@ def touching(pair: ImpactPair, sequence: Sequence, knots: np.ndarray, test: str)
     if test not in ("flight", "contact"):
         return _without_impact(pair, sequence, knots)
     splits, count = test == "contact", int(sequence.real.sum())
-    turns = jax.tree.map(np.asarray, (_contacts if splits else _flights)(pair, sequence, knots))
+    turns = jax.tree.map(np.asarray, (_contacts if splits else _flights)(pair, sequence, tiles.arrays(knots)))
     after = np.flatnonzero(turns.room <= turns.room.min() + _SAME_ROOM)
     side = np.asarray(sequence.side)[:count]
     return Touching(side, knots[:count], splits, after, turns.when[after], turns.wall[after])
@@ -116,7 +116,7 @@ def _without_impact(pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> 
     return Touching(side[kept], knots[kept], splits, fading - 1, np.zeros(fading.size), side[fading])
 
 
-class Begun(NamedTuple):
+class Insertion(NamedTuple):
     """An orbit with impacts of speed 0 where it touches walls, and how its knots move as their speed grows."""
 
     side: np.ndarray
@@ -124,7 +124,7 @@ class Begun(NamedTuple):
     along: np.ndarray
 
 
-def with_impact(pair: ImpactPair, found: Touching) -> Begun:
+def with_impact(pair: ImpactPair, found: Touching) -> Insertion:
     """Put an impact of speed 0 wherever an orbit touches."""
     knots, side = found.knots.copy(), found.side
     along = np.zeros_like(knots)
@@ -141,7 +141,7 @@ def with_impact(pair: ImpactPair, found: Touching) -> Begun:
         knots = np.insert(knots, after + 1, new, axis=0)
         along = np.insert(along, after + 1, np.sqrt(push) * np.array(way), axis=0)
         side = np.insert(side, after + 1, int(wall))
-    return Begun(side, knots, along / np.linalg.norm(along))
+    return Insertion(side, knots, along / np.linalg.norm(along))
 
 
 def among(path: P, side: np.ndarray) -> P:
