@@ -11,6 +11,7 @@ from scripts.paper.captions import GAP_IN_METRES, Run
 from vijax.model.device import Harvester
 from vijax.model.pair import impact_pair
 from vijax.orbits import continuation, orbit_search, periodic
+from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.planes.orbit_diagram import orbit_diagram
 
 if TYPE_CHECKING:
@@ -44,12 +45,13 @@ def orbits(walls: str, d: float, kappa: float | None, r: float = 0.5, period: in
 def branches(
     walls: str, along: str, within: tuple[float, float], d: float, kappa: float | None, r: float = 0.5, period: int = 1
 ) -> list[continuation.Branch]:
-    """Follow all orbits with these walls; along omega those of the device of Figs. 12-16."""
+    """Follow all orbits with these walls and no others; along omega those of the device of Figs. 12-16."""
     found = orbits(walls, d, kappa, r, period)
     if not len(found):
         return []
     device = Harvester(s=GAP_IN_METRES) if along == "omega" else None
-    return continuation.follow(_padded(found), along, within, device=device)
+    settings = ContinuationSettings(max_grazings=0)
+    return continuation.follow(_padded(found), along, within, device=device, settings=settings)
 
 
 def _padded(found: periodic.Orbit) -> periodic.Orbit:

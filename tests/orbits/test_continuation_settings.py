@@ -26,15 +26,21 @@ CHANGED: dict[str, tuple[float, dict[str, float]]] = {
     "zero_share": (1e-30, {}),
     "asymmetry": (1e-13, {}),
     "closing_steps": (1, {}),
+    "max_grazings": (0, {}),
 }
 
 
 @pytest.fixture(scope="module")
 def starts():
-    """One orbit whose branch folds and grazes, and one whose mirror image it meets at a pitchfork."""
+    """Orbits whose branch folds and grazes, meets its mirror image at a pitchfork, goes through a graze.
+
+    Each with the name of the setting that it is for; the first one is for all others.
+    """
     folding = orbit_search.search(vijax.impact_pair(0.19, None, 0.5), "RLL", guesses=32)[:1]
     two = orbit_search.search(vijax.impact_pair(0.19, None, 0.5), "RL", guesses=64)
-    return folding, two[np.flatnonzero(~np.asarray(symmetry.symmetric(two)))][:1]
+    soft = orbit_search.search(vijax.impact_pair(0.2, 40.0, 0.5), "RL", guesses=64)
+    mirrored, through = (one[np.flatnonzero(~np.asarray(symmetry.symmetric(one)))[:1]] for one in (two, soft))
+    return {"": folding, "asymmetry": mirrored, "max_grazings": through}
 
 
 def told(start, **settings):
@@ -52,12 +58,12 @@ def test_every_setting_has_a_sentence_and_is_changed_here():
 @pytest.mark.parametrize("name", CHANGED)
 def test_every_setting_is_read(starts, name):
     value, others = CHANGED[name]
-    start = starts[name == "asymmetry"]
+    start = starts.get(name, starts[""])
     assert told(start, **others) != told(start, **others, **{name: value})
 
 
 def test_what_some_settings_change_is_what_they_say(starts):
-    folding, mirrored = starts
+    folding, mirrored = starts[""], starts["asymmetry"]
     assert told(folding)[1][0][0] == "fold"
     assert told(folding, min_step=9e-4)[2] == ("start", "lost")
     assert told(folding, closing_steps=1)[2] == ("start", "closed")
@@ -71,7 +77,7 @@ def test_what_some_settings_change_is_what_they_say(starts):
 
 def test_those_that_begin_on_a_branch_are_followed_alike(starts):
     plain, longer = (
-        switching.family(starts[1], "d", SPAN, settings=settings)
+        switching.family(starts["asymmetry"], "d", SPAN, settings=settings)
         for settings in (ContinuationSettings(), ContinuationSettings(first_step=1e-4, max_step=0.005))
     )
     assert [one.ends for one in plain] == [one.ends for one in longer]
@@ -86,6 +92,7 @@ def test_those_that_begin_on_a_branch_are_followed_alike(starts):
         ({"growth": 1.0}, "growth must be a finite number above 1; got 1.0"),
         ({"min_cosine": 1.5}, "min_cosine must be a number between 0 and 1; got 1.5"),
         ({"max_corrections": 2.5}, "max_corrections must be a whole number of at least 1; got 2.5"),
+        ({"max_grazings": -1}, "max_grazings must be a whole number of at least 0; got -1"),
         ({"closing_steps": 0}, "closing_steps must be a whole number of at least 1; got 0"),
         ({"asymmetry": float("nan")}, "asymmetry must be a positive finite number; got nan"),
         ({"first_step": 0.1}, "first_step must lie between min_step and max_step; got 0.1 with 1e-09 and 0.01"),
@@ -106,4 +113,4 @@ def test_every_value_is_checked():
 def test_what_is_no_record_of_settings_is_refused(starts, settings):
     for door in (continuation.follow, switching.family):
         with pytest.raises(ValueError, match="settings must be of the kind ContinuationSettings"):
-            door(starts[0], "d", SPAN, settings=settings)
+            door(starts[""], "d", SPAN, settings=settings)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from vijax.model.device import Harvester
     from vijax.model.pair import ImpactPair
     from vijax.orbits.continuation import Branch
+    from vijax.orbits.events import Point
     from vijax.orbits.periodic import Orbit
 
 _FILES = ("branch.zarr", "branch.png")
@@ -159,19 +160,25 @@ def _found(asked: BranchRequest) -> "Orbit":
 
 
 def _summary(followed: "list[Branch]", seconds: float) -> str:
-    """Say of each branch in a line: its label, its range, how much of it is stable, what it met, how it ends."""
-    from vijax.model.label import label
+    """Say of each branch in a line: its labels, its range, how much of it is stable, what it met, how it ends."""
     from vijax.orbits import orbit_properties
 
     lines = [pace(sum(len(one.values) for one in followed), seconds, "orbits")]
     for one in followed:
-        counts = orbit_properties.counts(one.orbit)
-        name = Counter(label(counts.period, counts.left, counts.right).tolist()).most_common(1)[0][0]
-        met = ", ".join(f"{point.kind} {point.value:.8g}" for point in one.points) or "nothing"
+        # A single orbit of another label is one at a bifurcation, where the branch begins.
+        often = [
+            name for name, count in Counter(orbit_properties.labels(one.orbit).tolist()).most_common() if count > 1
+        ]
+        name = ", ".join(often) or orbit_properties.labels(one.orbit)[0]
+        met = ", ".join(map(_told, one.points)) or "nothing"
         span = f"{one.along} {one.values.min():.6g} to {one.values.max():.6g}"
         lines.append(f"{name}: {span}, {100 * one.stable.mean():.0f} % of its orbits stable; met {met}")
         lines.append(f"    ends: {one.ends[0]}; {one.ends[1]}")
     return "\n".join(lines)
+
+
+def _told(point: "Point") -> str:
+    return f"{point.kind} {point.value:.8g}" + (f" (on with {point.onward})" if point.onward else "")
 
 
 # --- the page --------------------------------------------------------------------------------------------------------

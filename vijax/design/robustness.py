@@ -15,6 +15,7 @@ from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.orbits import continuation, orbit_properties, periodic
 from vijax.orbits.continuation import Direction
+from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.periodic import Orbit
 from vijax.planes.basins import MOST_STARTS, basin_fractions
 from vijax.runtime import checks
@@ -112,7 +113,9 @@ def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
     # Of all that the motion depends on, omega0 changes kappa alone.
     kappa = float(device.omega0) * math.pi / float(device.omega)
     within = ((1 - reach) * kappa, (1 + reach) * kappa)
-    (followed,) = continuation.follow(optimum.orbit, "kappa", within, direction=way)
+    # What comes first is all that is asked, a graze too.
+    settings = ContinuationSettings(max_grazings=0)
+    (followed,) = continuation.follow(optimum.orbit, "kappa", within, direction=way, settings=settings)
     if followed.points:
         kind, at = followed.points[0][:2]
     elif followed.ends[1] in ("low", "high"):

@@ -29,7 +29,7 @@ _BATCHES = (8, 64, 512)  # lanes of one compiled call
 class Tests(NamedTuple):
     """Functions whose sign changes mark what happens on a branch; those from `speed` on are positive on real orbits."""
 
-    fold: Float[Array, ""]  # the parameter's share of the tangent
+    fold: Float[Array, ""]  # the parameter's share of the tangent; at soft walls over the least speed
     plus: Float[Array, ""]  # det(M - 1): a multiplier passes +1
     minus: Float[Array, ""]  # det(M + 1): a multiplier passes -1
     speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
@@ -93,8 +93,10 @@ class Arc(eqx.Module):
         trace = around[0, 0] + around[1, 1]
         determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
         room = grazing.between(pair, self.sequence, knots).clearance
+        # At a soft wall the parameter goes as the square of the speed of an impact that fades: at that graze its share
+        # of the tangent vanishes without a fold. Over the speed it does not, and has the same sign on real orbits.
         return Tests(
-            fold=tangent[-1],
+            fold=tangent[-1] if pair.rigid else tangent[-1] / room.speed,
             plus=1 - trace + determinant,
             minus=1 + trace + determinant,
             speed=room.speed,

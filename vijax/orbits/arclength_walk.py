@@ -26,7 +26,7 @@ class Walked(NamedTuple):
 def walk(
     paths: Path,
     first: BranchPlace,
-    points: int,
+    points: int | np.ndarray,
     settings: ContinuationSettings,
     happenings: Callable[[np.ndarray, np.ndarray], np.ndarray],
     first_end: int,
@@ -35,7 +35,7 @@ def walk(
 
     Args:
         paths, first: What is followed, a lane a row, and where from.
-        points: Most points of a path.
+        points: Most points of a path, or of each.
         settings: Of the steps.
         happenings: Counts what happens between two rows of test functions.
         first_end: The column from which on test functions are positive on real orbits.
@@ -51,7 +51,10 @@ def walk(
         near = np.linalg.norm(there.y - y, axis=1) < 2 * length
         # Of two things within a step one may hide the other's change of sign, so that each gets a step of its own.
         single = (happenings(tests, there.tests) <= 1) | (length < settings.crowded_step)
-        good = going & (there.size <= settings.newton_tolerance) & (straight > settings.min_cosine) & near & single
+        # A path that sets out from a graze does not know yet what is clear: all must be after the first step.
+        clear = ~(np.isnan(tests) & (there.tests <= 0))[:, first_end:].any(axis=1)
+        good = going & (there.size <= settings.newton_tolerance) & (straight > settings.min_cosine)
+        good &= near & single & clear
         for lane in np.flatnonzero(good):
             passed[lane].append((there.y[lane], there.tangent[lane], there.tests[lane], length[lane]))
         easy = (there.corrections <= settings.easy_corrections) & (straight > 1 - settings.easy_bend * bend)
@@ -61,14 +64,15 @@ def walk(
         length = np.where(good, longer, 0.5 * length)
         # Past a grazing or a bound there is no orbit. The first such point is kept: between it and the last is the end.
         real = (tests[:, first_end:] > 0).all(axis=1) | ~good
-        short = np.array([len(lane) < points for lane in passed])
+        short = np.array([len(lane) for lane in passed]) < points
         # A closed path comes by its start again, in the same direction.
         back = np.linalg.norm(y - first.y, axis=1) < settings.max_step
         along_start = (tangent * first.tangent).sum(axis=1) > settings.min_cosine
         home = back & along_start & np.array([len(lane) > settings.closing_steps for lane in passed])
         closed |= going & home
         going = going & (length > settings.min_step) & real & short & ~home
-    ends = np.where(closed, "closed", np.where([len(rows) >= points for rows in passed], "points", "lost"))
+    full = np.array([len(rows) for rows in passed]) >= points
+    ends = np.where(closed, "closed", np.where(full, "points", "lost"))
     walked = []
     for rows, end in zip(passed, ends, strict=True):
         ys, tangents, values, lengths = (np.array(column) for column in zip(*rows, strict=True))

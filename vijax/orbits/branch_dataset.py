@@ -26,10 +26,10 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
         device: Gives A, omega (unless one is the parameter) and the electrical constants; Tables I and II by default.
 
     Returns:
-        Over (branch, point) the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the label's `period`,
-        `impacts_left`, `impacts_right`, `status`; over (branch, point, impact) `v_in`, `side`, `phase`, `duration`,
-        `depth` [m]; over (branch, event_number) `event`, its `event_value`, and
-        `event_point`, the point nearest to it; over branch `end_first`, `end_last`.
+        Over (branch, point) the parameter, `multiplier` (largest modulus), `stable`, `P` [J], the `label` and its
+        `period`, `impacts_left`, `impacts_right`, `status`; over (branch, point, impact) `v_in`, `side`, `phase`,
+        `duration`, `depth` [m]; over (branch, event_number) `event`, its `event_value`, `event_point`, the point
+        nearest to it, and `event_onward`, how the branch goes on through a graze; over branch `end_first`, `end_last`.
     """
     import xarray as xr  # here, as importing vijax must not load it
 
@@ -42,16 +42,17 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
     dims = ("branch", "point", "impact")
     variables = {name: (dims[: values.ndim], values, _ABOUT[name]) for name, values in found.items() if name != along}
     events = [[point.kind for point in branch.points] for branch in branches]
-    text = np.dtypes.StringDType()
-    most = max(map(len, events), default=0)
-    kinds = np.array([names + [""] * (most - len(names)) for names in events], dtype=text).reshape(len(branches), most)
+    onward = [[point.onward for point in branch.points] for branch in branches]
+    labels = [list(map(str, orbit_properties.labels(branch.orbit))) for branch in branches]
     values = padded([np.array([point.value for point in branch.points]) for branch in branches])
     places = padded([_places(branch) for branch in branches])
     return xr.Dataset(
         variables
-        | {"event": (("branch", "event_number"), kinds), "event_value": (("branch", "event_number"), values)}
+        | {"label": (dims[:2], words(labels), {"long_name": "left:right impacts per forcing periods"})}
+        | {"event": (("branch", "event_number"), words(events)), "event_value": (("branch", "event_number"), values)}
         | {"event_point": (("branch", "event_number"), places)}
-        | {f"end_{name}": ("branch", np.array([b.ends[i] for b in branches], dtype=text)) for i, name in _ENDS},
+        | {"event_onward": (("branch", "event_number"), words(onward))}
+        | {f"end_{name}": ("branch", words([[b.ends[i]] for b in branches])[:, 0]) for i, name in _ENDS},
         coords={along: (("branch", "point"), found[along], AXES[along].attributes)} | _constants(branches[0]),
         attrs={
             "title": "Branches of periodic orbits of a vibro-impact pair",
@@ -108,6 +109,13 @@ def _places(branch: Branch) -> np.ndarray:
     passed = np.column_stack([np.asarray(orbit_properties.marks(branch.orbit)), branch.values])
     met = [np.append(np.asarray(orbit_properties.marks(point.orbit))[0], point.value) for point in branch.points]
     return np.array([np.abs(passed - traits).sum(axis=1).argmin() for traits in met], dtype=float)
+
+
+def words(rows: list[list[str]]) -> np.ndarray:
+    """Make a table of words of rows of several lengths, "" beyond each."""
+    most = max(map(len, rows))
+    table = [row + [""] * (most - len(row)) for row in rows]
+    return np.array(table, dtype=np.dtypes.StringDType()).reshape(len(rows), most)
 
 
 def padded(rows: list[np.ndarray]) -> np.ndarray:

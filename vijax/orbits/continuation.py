@@ -1,6 +1,7 @@
 """Branches of periodic orbits along a parameter, by pseudo-arclength continuation through folds, many at once.
 
-All lanes step together (`arclength_walk`); what happened on the way is located afterwards (`events`).
+All lanes step together (`arclength_walk`), from graze to graze (`pieces`); what happened on the way is located
+afterwards (`events`).
 """
 
 from typing import Literal, NamedTuple
@@ -10,13 +11,14 @@ import numpy as np
 
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
-from vijax.orbits import periodic
 from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
-from vijax.orbits.arclength_walk import Walked, walk
+from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
-from vijax.orbits.events import Point, events, happenings, kind_of, orbits_at
+from vijax.orbits.events import BranchEvent, Point, events, happenings, kind_of, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
 from vijax.orbits.periodic import Orbit, check_orbit
+from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
+from vijax.orbits.soft_graze import Passage, branch_passage
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
@@ -34,9 +36,9 @@ class Branch(NamedTuple):
         values: Of the parameter, one an orbit.
         orbit: The orbits, with multipliers.
         points: What was met on the way, in order.
-        ends: Why it stops at its first and at its last orbit: "start", a kind of `Point` where no orbit goes on, "low"
-            or "high" (bound of the parameter), "closed" (back at its start), "points" (as many as asked for), "lost"
-            (no step was short enough).
+        ends: Why it stops at its first and at its last orbit: "start", a kind of `Point` where no orbit goes on, or
+            that is one graze more than asked for, "low" or "high" (bound of the parameter), "closed" (back at its
+            start, or at its first graze), "points" (as many as asked for), "lost" (no step was short enough).
     """
 
     along: str
@@ -62,7 +64,7 @@ def follow(
     points: int = 4000,
     settings: ContinuationSettings = DEFAULT,
 ) -> list[Branch]:
-    """Follow periodic orbits, stable or not, along one parameter, through folds.
+    """Follow periodic orbits, stable or not, along one parameter, through folds, and through grazes at soft walls.
 
     Args:
         orbit: Where to start, each a branch of its own; all at once.
@@ -76,7 +78,8 @@ def follow(
         settings: Of steps and events; see `ContinuationSettings`.
 
     Returns:
-        One branch an orbit. A branch ends where its orbits cease to be real (a grazing), at a bound, or says why else.
+        One branch an orbit. At a grazing, where its orbits cease to be real, it ends at rigid walls; at soft ones it
+        goes on with those that have an impact more or fewer. Else it ends at a bound, or says why.
 
     Raises:
         ValueError: An unknown parameter or direction, bounds in the wrong order or without the start, or an orbit that
@@ -150,34 +153,50 @@ def heading(place: BranchPlace, sign: float) -> BranchPlace:
 
 
 def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
-    """Follow one way from every start."""
-    walked = walk(arcs, first, points, settings, happenings, FIRST_END)
-    lanes_of = [jax.tree.map(lambda x, i=i: x[i], arcs) for i in range(len(walked))]
-    return [_branch(arc, one, along, settings) for arc, one in zip(lanes_of, walked, strict=True)]
+    """Follow one way from every start, at soft walls through grazes, after which orbits have other impacts."""
+
+    def making(_: int, arc: Arc, walked: Walked, begun: bool) -> Piece:
+        return _piece(arc, walked, settings, begun)
+
+    followed = follow_pieces(arcs, first, making, points, settings, happenings, FIRST_END)
+    return [Branch(along, *one) for one in followed]
 
 
-def _branch(arc: Arc, walked: Walked, along: str, settings: ContinuationSettings) -> Branch:
-    """Make a branch of a lane's record: what was met between its points, and where it ends."""
+def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool) -> Piece:
+    """Make a piece of a lane's record: what was met between its points, and where it ends; see `pieces.Making`."""
     y, tangent, tests, lengths, end = walked
-    last, met, ys = len(y), [], y
-    found = events(arc, y, tangent, tests, lengths, settings)
-    for event in sorted(found, key=lambda event: (event.place, event.s)):
-        kind = kind_of(arc, event, y[event.place : event.place + 2], settings)
-        if event.test in Tests._fields[FIRST_END:]:
-            end, last = kind, event.place + 1
-            ys = np.concatenate([y[:last], event.y[None]])
+    unit, last, values = float(arc.high - arc.low), len(y), y[:, -1]
+    met: list[Point] = []
+    ending: list[Orbit] = []
+    beyond = None
+    for event in events(arc, y, tangent, tests, lengths, settings):
+        kind, orbit = kind_of(arc, event, y[event.place : event.place + 2], settings), orbits_at(arc, event.y[None])
+        ends = event.test in Tests._fields[FIRST_END:]
+        if ends and kind not in ("low", "high"):
+            beyond = _beyond(arc, event, y, tests)
+            kind, orbit = (kind, orbit) if beyond is None else (f"grazing {beyond.touches}", beyond.orbit)
         if kind not in ("low", "high"):
-            met.append(Point(kind, float(event.y[-1] * (arc.high - arc.low)), orbits_at(arc, event.y[None])))
-    orbit = orbits_at(arc, ys)
+            met.append(Point(kind, float(event.y[-1] * unit), orbit))
+        if ends:
+            end, last, ending = kind, event.place + 1, [orbit]
+            values = np.append(y[:last, -1], event.y[-1])
+            break
+    rows = slice(0 if begun else 1, last)
+    orbits = ([orbits_at(arc, y[rows])] if last > rows.start else []) + ending
     # At a bound the last orbit is there; at a grazing rounding decides whether it is one.
-    count = len(ys) if np.asarray(orbit.status)[-1] == Status.OK else last
-    return Branch(along, ys[:count, -1] * float(arc.high - arc.low), orbit[:count], met, ("start", end))
+    if orbits and int(orbits[-1].status[-1]) != Status.OK:
+        values, orbits = values[:-1], [*orbits[:-1], orbits[-1][:-1]]
+    return Piece(values[rows.start :] * unit, orbits, met, end, beyond)
+
+
+def _beyond(arc: Arc, event: BranchEvent, y: np.ndarray, tests: np.ndarray) -> Passage | None:
+    """Find what is beyond the graze at which a piece ends."""
+    rises = tests[event.place, FOLD]
+    if not np.abs(rises) > 0:  # unknown at the very beginning of a branch that was switched to
+        rises = event.y[-1] - y[event.place, -1]
+    return branch_passage(arc, event.y, event.test, float(np.sign(rises)))
 
 
 def _joined(down: Branch, up: Branch) -> Branch:
-    """Join two ways from one start to one branch, from end to end; where it closes one way is all of it."""
-    if down.ends[1] == "closed":
-        return down
-    orbit = periodic.concatenate([down.orbit[::-1], up.orbit[1:]])
-    values = np.concatenate([down.values[::-1], up.values[1:]])
-    return Branch(down.along, values, orbit, down.points[::-1] + up.points, (down.ends[1], up.ends[1]))
+    """Join two ways from one start to one branch."""
+    return Branch(down.along, *joined(Followed(*down[1:]), Followed(*up[1:])))

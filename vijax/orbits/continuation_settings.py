@@ -59,6 +59,8 @@ class ContinuationSettings:
             between pitchfork and fold. Of events of two branches that differ by less, one is not told from the other.
         closing_steps: Steps before a branch can have closed, 20. Too few of them, or too short ones beside `max_step`,
             and it closes before it has left its start.
+        max_grazings: Grazes at soft walls that a branch goes through each way, 16. With 0 it ends at the first, as it
+            does at rigid walls. Near chaos orbits graze again and again; a larger number follows them to any length.
 
     Raises:
         ValueError: A value that cannot be, or steps of which the first is not between the shortest and the longest.
@@ -78,10 +80,13 @@ class ContinuationSettings:
     zero_share: float = 1e-3
     asymmetry: float = 1e-4
     closing_steps: int = 20
+    max_grazings: int = 16
 
     def __post_init__(self) -> None:
         for name, (must, holds) in _NUMBERS.items():
             object.__setattr__(self, name, checks.real(name, getattr(self, name), must, holds))
+        most = checks.whole("max_grazings", self.max_grazings, 0, _MOST_COUNT)
+        object.__setattr__(self, "max_grazings", most)
         for name in _COUNTS:
             object.__setattr__(self, name, checks.whole(name, getattr(self, name), 1, _MOST_COUNT))
         if not self.min_step <= self.first_step <= self.max_step:

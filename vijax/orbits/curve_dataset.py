@@ -34,8 +34,8 @@ def curve_dataset(curves: list[BifurcationCurve]) -> "xr.Dataset":
     Returns:
         Over (curve, point) both parameters, `multiplier` (largest modulus), `multiplier_product`, `residual`, `status`,
         `stable`; over curve `kind`, the `label` of its orbits, `end_first`, `end_last`; over (curve, event) what of
-        codimension 2 was met: `event`, the grazing that ends the curve there as `event_test`, both parameters as
-        `event_` and their name.
+        codimension 2 was met: `event`, what grazes besides as `event_test`, how the curve goes on then as
+        `event_onward`, both parameters as `event_` and their name.
     """
     import xarray as xr  # here, as importing vijax must not load it
 
@@ -51,6 +51,7 @@ def curve_dataset(curves: list[BifurcationCurve]) -> "xr.Dataset":
     most = max(len(curve.points) for curve in listed)
     events = [[point.kind for point in curve.points] for curve in listed]
     tests = [[point.test for point in curve.points] for curve in listed]
+    onward = [[point.onward for point in curve.points] for curve in listed]
     places = padded([np.array([point.values for point in curve.points]).reshape(-1, 2) for curve in listed])
     return xr.Dataset(
         {name: (dims, found[name], about) for name, about in _ABOUT.items()}
@@ -61,6 +62,7 @@ def curve_dataset(curves: list[BifurcationCurve]) -> "xr.Dataset":
             "end_last": ("curve", _texts([curve.ends[1] for curve in listed])),
             "event": (("curve", "event_number"), _table(events, most)),
             "event_test": (("curve", "event_number"), _table(tests, most)),
+            "event_onward": (("curve", "event_number"), _table(onward, most)),
         }
         | {
             f"event_{name}": (("curve", "event_number"), places[..., index], AXES[name].attributes)

@@ -15,7 +15,7 @@ from vijax.orbits.arclength_step import advance
 from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_equations import CUBIC, TURN, CurvePath, CurveTests, passed
-from vijax.orbits.events import locate, orbits_at
+from vijax.orbits.events import locate, onward, orbits_at
 from vijax.orbits.periodic import Orbit
 
 # Part of a tangent that lies in the plane at which a curve stands still there: beside a cusp it is the distance from
@@ -30,15 +30,25 @@ class CurvePoint(NamedTuple):
     Attributes:
         kind: "cusp", "generalised flip", "degenerate pitchfork", "fold-graze", "flip-graze", "pitchfork-graze", "double
             graze", "degenerate graze" (no acceleration where the ball touches).
-        test: What grazes besides, where the curve ends: flight, impact, contact or exit; else "".
+        test: What grazes besides, where orbits cease to be real: flight, impact, contact or exit; else "". At soft
+            walls it has the name that fits the orbit with fewer impacts, as with a branch's `Point`.
         values: Of both parameters.
         orbit: The orbit there, alone.
+        gained: Impacts with which the curve goes on; more where positive, fewer where negative; 0 where it does not.
+        wall: Where those are, -1 or +1; 0 at both.
     """
 
     kind: str
     test: str
     values: tuple[float, float]
     orbit: Orbit
+    gained: int = 0
+    wall: int = 0
+
+    @property
+    def onward(self) -> str:
+        """Say how the curve goes on through a graze; nothing elsewhere."""
+        return onward(self.gained, self.wall)
 
 
 class CurveEvent(NamedTuple):

@@ -16,7 +16,7 @@ from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.arclength_step import BranchPlace, advance
-from vijax.orbits.arclength_walk import Walked, walk
+from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation import MOST_POINTS
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.curve_equations import (
@@ -27,11 +27,13 @@ from vijax.orbits.curve_equations import (
     happenings_on_curves,
 )
 from vijax.orbits.curve_events import CurvePoint, curve_events
+from vijax.orbits.curve_graze import curve_passage
 from vijax.orbits.curve_plane import Plane, check_plane, logarithmic, place_of, units
 from vijax.orbits.curve_starts import CurveStart, curve_start, with_touch
 from vijax.orbits.events import Point, orbits_at
 from vijax.orbits.parameter import MOVED
 from vijax.orbits.periodic import Orbit
+from vijax.orbits.pieces import Piece, follow_pieces, joined
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
@@ -49,8 +51,8 @@ class BifurcationCurve(NamedTuple):
         values: Of both, a row an orbit.
         orbit: The orbits, with multipliers; those of a graze without the impact that begins there.
         points: What of codimension 2 was met on the way, in order.
-        ends: Why it stops at its first and at its last orbit: the bound ("d low"), a kind of `CurvePoint`, "closed",
-            "points" (as many as asked for), "lost" (no step was short enough).
+        ends: Why it stops at its first and at its last orbit: the bound ("d low"), a kind of `CurvePoint` that it did
+            not get past, "closed", "points" (as many as asked for), "lost" (no step was short enough).
     """
 
     kind: str
@@ -147,7 +149,7 @@ def curves_from(
             batches.setdefault((lane.path.condition, lane.first.y.size), []).append(lane)
         new: list[BifurcationCurve] = []
         for batch in batches.values():
-            new += _followed(batch, plane, max_points, settings)
+            new += _followed(batch, plane, max_points, settings, new)
         taken = {id(lane) for batch in batches.values() for lane in batch}
         left = unmet([lane for lane in left if id(lane) not in taken], new, plane)
         found += new
@@ -283,48 +285,50 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
 
 
 def _followed(
-    batch: list[_Lane], plane: Plane, max_points: int, settings: ContinuationSettings
+    batch: list[_Lane], plane: Plane, max_points: int, settings: ContinuationSettings, known: list[BifurcationCurve]
 ) -> list[BifurcationCurve]:
-    """Follow some starts both ways, all at once; of several on one curve one is kept."""
+    """Follow some starts both ways, all at once; of several on one curve, or on one that is known, one is kept."""
     twice = [*batch, *batch]
     paths = jax.tree.map(lambda *leaves: np.stack(leaves), *(lane.path for lane in twice))
     first = jax.tree.map(lambda *leaves: np.stack(leaves), *(lane.first for lane in twice))
     sign = np.repeat([-1.0, 1.0], len(batch))[:, None]
     first = first._replace(tangent=sign * first.tangent)
-    walked = walk(paths, first, max_points, settings, happenings_on_curves, FIRST_CURVE_END)
+
+    def making(lane: int, path: CurvePath, walked: Walked, begun: bool) -> Piece:
+        return _piece(path, walked, twice[lane].start.kind, settings, begun)
+
+    ways = follow_pieces(paths, first, making, max_points, settings, happenings_on_curves, FIRST_CURVE_END)
     found: list[BifurcationCurve] = []
     for number, lane in enumerate(batch):
-        if unmet([lane], found, plane):
-            kind = lane.start.kind
-            ways = [_one_way(lane.path, walked[number + shift], kind, settings) for shift in (0, len(batch))]
-            found.append(_joined(lane.path, kind, ways))
+        if unmet([lane], [*known, *found], plane):
+            both = joined(ways[number], ways[number + len(batch)])
+            closed = both.ends[1] == "closed"
+            ends = ("closed", "closed") if closed else both.ends
+            found.append(BifurcationCurve(lane.start.kind, lane.path.along, *both._replace(ends=ends)))
     return found
 
 
-class _HalfCurve(NamedTuple):
-    """A curve one way from its start: its points, what it met, why it ends."""
-
-    y: np.ndarray
-    points: list[CurvePoint]
-    end: str
-
-
-def _one_way(path: CurvePath, walked: Walked, kind: str, settings: ContinuationSettings) -> _HalfCurve:
-    """Put what happened between the points of a path among them, and end it where it ends."""
+def _piece(path: CurvePath, walked: Walked, kind: str, settings: ContinuationSettings, begun: bool) -> Piece:
+    """Put what happened between the points of a path among them, and end it where it ends; see `pieces.Making`."""
     rows, points, end, begin = [], [], walked.end, 0
-    last = len(walked.y)
+    last, beyond = len(walked.y), None
     for event in curve_events(path, walked, kind, settings):
         rows += [walked.y[begin : event.place + 1], event.y[None]]
         begin = event.place + 1
+        test, orbit = event.test, orbits_of(path, event.y[None])
         if event.ends:
             end, last = event.kind, begin
+            beyond = curve_passage(path, event.y, test) if test else None
+            test, orbit = (test, orbit) if beyond is None else (beyond.touches, beyond.orbit)
         if not event.kind.endswith((" low", " high")):
             values = path.places(event.y)
-            place = float(values[0]), float(values[1])
-            points.append(CurvePoint(event.kind, event.test, place, orbits_of(path, event.y[None])))
-    beyond = last == len(walked.y) and not (walked.tests[-1, FIRST_CURVE_END:] > 0).all()
-    rows.append(walked.y[begin : last - beyond])
-    return _HalfCurve(np.concatenate(rows), points, end)
+            points.append(CurvePoint(event.kind, test, (float(values[0]), float(values[1])), orbit))
+    unreal = last == len(walked.y) and not (walked.tests[-1, FIRST_CURVE_END:] > 0).all()
+    y = np.concatenate([*rows, walked.y[begin : last - unreal]])[not begun :]
+    # At a graze the orbit with fewer impacts is there in either case.
+    own = y if beyond is None else y[:-1]
+    orbits = ([orbits_of(path, own)] if len(own) else []) + ([] if beyond is None else [beyond.orbit])
+    return Piece(path.places(y), orbits, points, end, beyond)
 
 
 def orbits_of(path: CurvePath, ys: np.ndarray) -> Orbit:
@@ -342,14 +346,3 @@ def orbits_of(path: CurvePath, ys: np.ndarray) -> Orbit:
     real = np.asarray(touching.status) == Status.OK
     status = np.where(real, Status.OK, found.status).astype(np.int32)
     return eqx.tree_at(lambda orbit: orbit.status, found, tiles.arrays(status))
-
-
-def _joined(path: CurvePath, kind: str, ways: list[_HalfCurve]) -> BifurcationCurve:
-    """Join both ways from a start to one curve; where it closes one way is all of it."""
-    back, ahead = ways
-    if back.end == "closed":
-        y, points, ends = back.y, back.points, ("closed", "closed")
-    else:
-        y = np.concatenate([back.y[::-1], ahead.y[1:]])
-        points, ends = back.points[::-1] + ahead.points, (back.end, ahead.end)
-    return BifurcationCurve(kind, path.along, path.places(y), orbits_of(path, y), points, ends)

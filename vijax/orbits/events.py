@@ -22,13 +22,34 @@ class Point(NamedTuple):
     Attributes:
         kind: "fold", "flip" (a multiplier is -1), "pitchfork" (mirror symmetry breaks), "grazing flight" (an impact
             appears), "grazing impact" (one vanishes), "grazing contact" (one splits), "grazing exit" (the ball stays).
+            A graze at a soft wall has the name that fits the orbit with fewer impacts, from whichever side it is met:
+            "grazing flight" or "grazing contact", unless none would be left.
         value: Of the parameter.
         orbit: The orbit there, along a leading axis of one.
+        gained: Impacts with which the branch goes on through a graze: more where positive, fewer where negative; 0
+            where it does not.
+        wall: Where those are, -1 or +1; 0 at both.
     """
 
     kind: str
     value: float
     orbit: Orbit
+    gained: int = 0
+    wall: int = 0
+
+    @property
+    def onward(self) -> str:
+        """Say how the branch goes on through a graze; nothing elsewhere."""
+        return onward(self.gained, self.wall)
+
+
+def onward(gained: int, wall: int) -> str:
+    """Say in words how a path goes on; see `Point`."""
+    if not gained:
+        return ""
+    where = {-1: "the left wall", 0: "each wall", 1: "the right wall"}[wall]
+    number = abs(gained) if wall else max(abs(gained) // 2, 1)
+    return f"{'one impact' if number == 1 else f'{number} impacts'} {'more' if gained > 0 else 'fewer'} at {where}"
 
 
 def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -43,7 +64,7 @@ def happenings(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return (passed.fold | passed.plus).astype(int) + passed.minus + ends
 
 
-class _Event(NamedTuple):
+class BranchEvent(NamedTuple):
     """A sign change: the point before it, the arclength from there, of which test function, the point itself."""
 
     place: int
@@ -52,8 +73,8 @@ class _Event(NamedTuple):
     y: np.ndarray
 
 
-def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings) -> list[_Event]:
-    """Find what happens between neighbours, up to the first thing that ends the branch."""
+def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings) -> list[BranchEvent]:
+    """Find what happens between neighbours in order, up to the first thing that ends the branch."""
     index, test = np.nonzero(changed(tests[:-1], tests[1:]))
     if not index.size:
         return []
@@ -61,13 +82,14 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
     arcs = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), arc)
     s, there, zero = locate(arcs, *before, test, tests[index, test], settings)
     found = [
-        _Event(int(i), float(at), Tests._fields[t], y)
+        BranchEvent(int(i), float(at), Tests._fields[t], y)
         for i, at, t, y, sure in zip(index, s, test, there, zero, strict=True)
         # A multiplier that passes +1 at a fold is no second event.
         if sure and not (t == PLUS and ((index == i) & (test == FOLD)).any())
     ]
     ends = [event.s for event in found if event.place == len(y) - 2 and event.test in Tests._fields[FIRST_END:]]
-    return [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
+    kept = [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
+    return sorted(kept, key=lambda event: (event.place, event.s))
 
 
 # `scipy.optimize.elementwise.find_root` locates a fold, a flip or a grazing to the same digit in two thirds of the
@@ -110,7 +132,7 @@ def locate(
     return best, best_y, np.abs(best_f) <= settings.zero_share * scale
 
 
-def kind_of(arc: Arc, event: _Event, neighbours: np.ndarray, settings: ContinuationSettings) -> str:
+def kind_of(arc: Arc, event: BranchEvent, neighbours: np.ndarray, settings: ContinuationSettings) -> str:
     """Say what a sign change means for this orbit."""
     test = event.test
     if test in _GRAZING:

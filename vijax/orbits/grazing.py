@@ -67,15 +67,20 @@ class Between(NamedTuple):
     deepest: Float[Array, "impact"]
 
 
-def _contact(pair: ImpactPair, side, knot, real):
-    """Find when a contact is deepest, and its least penetration at a minimum inside where there is one."""
+def _contact(pair: ImpactPair, side, knot, real) -> contact_search.Turns:
+    """Find when a contact is deepest, and where it is shallowest between."""
     t, speed, stay = knot
     zero, wanted = jnp.zeros_like(t), real & (stay > 0)
     force = flow.contact_force(pair.gamma, side, t)
-    turns = contact_search.turning_points(flow.membrane(pair, rolled=True), force, zero, speed, wanted, length=stay)
+    return contact_search.turning_points(flow.membrane(pair, rolled=True), force, zero, speed, wanted, length=stay)
+
+
+def _contacts(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real):
+    """Find when each contact is deepest, and its least penetration at a minimum inside where there is one, and when."""
+    turns = jax.vmap(_contact, in_axes=(None, 0, 0, 0))(pair, departure.side, knots, real)
     deepest = jnp.where(turns.lost | (turns.crest == 0), jnp.nan, turns.crest)
     shallow = jnp.where(jnp.isfinite(turns.lowest), turns.lowest, _NOTHING)
-    return deepest, jnp.where(turns.lost, jnp.nan, shallow)
+    return deepest, jnp.where(turns.lost, jnp.nan, shallow), turns.trough
 
 
 def between(pair: ImpactPair, sequence: Sequence, knots: Knots, touch: Float[Array, "impact"] | None = None) -> Between:
@@ -102,7 +107,7 @@ def between(pair: ImpactPair, sequence: Sequence, knots: Knots, touch: Float[Arr
         deepest = jnp.full_like(departure.side, jnp.nan)
         contact = leaves = jnp.full_like(pair.d, _NOTHING)
     else:
-        deepest, shallow = jax.vmap(_contact, in_axes=(None, 0, 0, 0))(pair, departure.side, knots, real)
+        deepest, shallow, _ = _contacts(pair, departure, knots, real)
         contact, leaves = least(shallow), least(departure.speed / knots[:, 1])
     return Between(Clearance(least(knots[:, 1]), least(flight), contact, leaves), deepest)
 
@@ -113,14 +118,40 @@ def _flights(pair: ImpactPair, departure: shooting.Departure, real, touch):
     return each(pair, departure.side, departure.speed, departure.t, departure.next_t - departure.t, real, touch)
 
 
+class NearTurns(NamedTuple):
+    """How near each flight, or contact, comes to grazing: the least room, how long after it began, and at which wall.
+
+    The room is inf where there is no impact.
+    """
+
+    room: Float[Array, "impact"]
+    when: Float[Array, "impact"]
+    wall: Float[Array, "impact"]
+
+
+def flight_turns(pair: ImpactPair, sequence: Sequence, knots: Knots) -> NearTurns:
+    """Find where each flight turns closest to a wall."""
+    real = sequence.real
+    departure = shooting.departures(pair, sequence, jnp.where(real[:, None], knots, 1.0))
+    room, when = _flights(pair, departure, real, jnp.full_like(departure.t, jnp.nan))
+    force = flow.flight_force(pair.gamma, departure.t)
+    rise, _ = flow.flight(force, -departure.side * departure.speed, when)
+    return NearTurns(jnp.where(real, room, jnp.inf), when, jnp.sign(0.5 * departure.side * pair.d + rise))
+
+
+def contact_turns(pair: ImpactPair, sequence: Sequence, knots: Knots) -> NearTurns:
+    """Find where each contact with a soft wall is shallowest at a minimum inside."""
+    real = sequence.real
+    knots = jnp.where(real[:, None], knots, 1.0)
+    departure = shooting.departures(pair, sequence, knots)
+    _, shallow, when = _contacts(pair, departure, knots, real)
+    return NearTurns(jnp.where(real, shallow, jnp.inf), when, departure.side)
+
+
 def closest_turn(
     pair: ImpactPair, sequence: Sequence, knots: Knots
 ) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Find where the ball turns closest to a wall in flight: after which impact, how long after it, and which wall."""
-    real = sequence.real
-    departure = shooting.departures(pair, sequence, jnp.where(real[:, None], knots, 1.0))
-    room, when = _flights(pair, departure, real, jnp.full_like(departure.t, jnp.nan))
-    index = jnp.where(real, room, jnp.inf).argmin().astype(jnp.int32)
-    one = jax.tree.map(lambda leaf: leaf[index], departure)
-    rise, _ = flow.flight(flow.flight_force(pair.gamma, one.t), -one.side * one.speed, when[index])
-    return index, when[index], jnp.sign(0.5 * one.side * pair.d + rise)
+    turns = flight_turns(pair, sequence, knots)
+    index = turns.room.argmin().astype(jnp.int32)
+    return index, turns.when[index], turns.wall[index]

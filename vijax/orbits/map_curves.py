@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from vijax.model.device import Harvester, one_device
-from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
+from vijax.orbits.continuation_settings import ContinuationSettings, check_settings
 from vijax.orbits.curve_starts import CurveStart
 from vijax.orbits.curves import BifurcationCurve, curves_from
 from vijax.orbits.map_borders import Borders, LabelledPlane, borders, labelled_plane, near
@@ -22,6 +22,8 @@ _SPREAD = 5  # so many cells a side are followed across the whole map at first
 _WHOLE_POINTS = 300  # Most points of each such branch.
 _REACH = 3.0  # cells on either side of a border that is looked at
 _FIRST_STEP, _MAX_STEP = 0.02, 0.05  # across them, in units of all that way
+
+_SETTINGS = ContinuationSettings(max_grazings=0)
 
 
 class MapCurves(NamedTuple):
@@ -46,7 +48,7 @@ def bifurcation_curves(
     max_rounds: int = 8,
     round_borders: int = 48,
     max_points: int = 2000,
-    settings: ContinuationSettings = DEFAULT,
+    settings: ContinuationSettings = _SETTINGS,
 ) -> MapCurves:
     """Find the curves of bifurcations that explain a map of labels over two parameters.
 
@@ -59,7 +61,7 @@ def bifurcation_curves(
         max_rounds: Rounds, after the first look, at most; it ends sooner where one finds nothing.
         round_borders: Borders that are looked at in a round, drawn from all that are left.
         max_points: Most points of a curve each way.
-        settings: Of steps and events.
+        settings: Of steps and events. By default curves end at grazes: beyond, other cells of the map begin others.
 
     Returns:
         The curves, and how many borders of the map they explain. Others may be those of basins, not of bifurcations.

@@ -1,6 +1,7 @@
 """Periodic orbits, stable and unstable: the record, Newton from guesses, and the proof by the impact map."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -131,6 +132,19 @@ def judged(pair: ImpactPair, sequence: Sequence, claim: "Claim") -> Orbit:
 def concatenate(found: list[T]) -> T:
     """Join orbits of one number of impacts, or claims to be some, to one batch."""
     return tiles.arrays(jax.tree.map(lambda *leaves: np.concatenate(leaves), *found))
+
+
+def widened(orbit: Orbit, width: int) -> Orbit:
+    """Pad orbits to so many impacts at least."""
+    host = jax.tree.map(np.asarray, orbit)
+    more = ((0, 0), (0, max(width - host.knots.shape[1], 0)))
+
+    def wide(leaf: Any) -> Any:
+        return np.pad(leaf, more + ((0, 0),) * (leaf.ndim - 2), constant_values=np.nan if leaf.dtype.kind == "f" else 0)
+
+    names = ("knots", "depth", "work")
+    sequence = replace(host.sequence, side=wide(host.sequence.side))
+    return tiles.arrays(replace(host, sequence=sequence, **{name: wide(getattr(host, name)) for name in names}))
 
 
 def _by_tiles(work: Callable[[Any], T], rows: Any) -> T:

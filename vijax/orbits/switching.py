@@ -114,7 +114,9 @@ def family(
         where = [point for branch in youngest for point in branch.points if _begins(point) and _real(point)]
         youngest = []
         for point in where:
-            youngest += _new(switch(point, along, within, **told), grown + youngest, settings)
+            begun = switch(point, along, within, **told)
+            # Where a graze is too near for a step there is nothing to tell but that something begins.
+            youngest += _new([one for one in begun if len(one.values) > 1], grown + youngest, settings)
         grown = grown + youngest
     return grown
 

@@ -32,7 +32,7 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
         ValueError: A quantity that is none.
     """
     check_branch_quantity(quantity)
-    checks.variables("dataset", dataset, (quantity, "stable", "event"), "vijax.orbits.branch_dataset.dataset")
+    checks.variables("dataset", dataset, (quantity, "stable", "event", "side"), "vijax.orbits.branch_dataset.dataset")
     along = dataset[dataset.attrs["along"]]
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.subplots()
@@ -41,16 +41,26 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
         for colour, width, kept in ((_UNSTABLE, 0.8, 0.0), (_STABLE, 1.4, 1.0)):
             # A segment belongs to the point it leads to, so that the two colours join.
             shown = (one["stable"] == kept) | (one["stable"].shift(point=-1) == kept)
-            axes.plot(one[along.name], one[quantity].where(shown), color=colour, linewidth=width)
+            for piece in _pieces(one, quantity):
+                lines = one[quantity].where(shown).isel(point=piece)
+                axes.plot(one[along.name].isel(point=piece), lines, color=colour, linewidth=width)
         _mark_events(axes, one, quantity)
     axes.set_xlabel(axis_label(along))
     axes.set_ylabel(QUANTITIES[quantity])
     axes.set_title(title(dataset), fontsize="medium")
     kinds = {str(kind).split()[0] for kind in dataset["event"].values.flat if kind}
-    lines = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
-    lines += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
-    figure.legend(handles=lines, loc="outside lower center", ncols=len(lines), frameon=False)
+    legend = [Line2D([], [], color=_STABLE, label="stable"), Line2D([], [], color=_UNSTABLE, label="unstable")]
+    legend += [_mark(kind, label=kind) for kind in _MARKS if kind in kinds]
+    figure.legend(handles=legend, loc="outside lower center", ncols=len(legend), frameon=False)
     return figure
+
+
+def _pieces(one: "xr.Dataset", quantity: str) -> "list[np.ndarray]":
+    """Part the points of a branch at grazes, where an impact more or fewer moves the others to other columns."""
+    if "impact" not in one[quantity].dims:
+        return [np.arange(one.sizes["point"])]
+    count = (np.abs(one["side"].values) == 1).sum(axis=1)
+    return np.split(np.arange(count.size), np.flatnonzero(np.diff(count)) + 1)
 
 
 def check_branch_quantity(quantity: str) -> None:
