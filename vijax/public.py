@@ -24,6 +24,7 @@ from vijax.orbits.continuation import Branch
 from vijax.orbits.continuation import follow as follow_orbits
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_dataset import curve_dataset
+from vijax.orbits.curve_rows import curve_rows
 from vijax.orbits.curves import BifurcationCurve, follow_curves
 from vijax.orbits.map_curves import MapCurves, bifurcation_curves
 from vijax.orbits.orbit_properties import impacts as orbit_impacts
@@ -75,6 +76,7 @@ __all__ = [
     "cheapest_model",
     "compare",
     "curve_dataset",
+    "curve_rows",
     "design_arrival",
     "design_extents",
     "find_orbits",

@@ -182,8 +182,10 @@ def made_map(label=lambda d, r: d < pitchfork(r)):
     below = label(d[:, None], r[None])
     one = np.ones(below.shape, int)
     variables = {"period": one, "impacts_left": one, "impacts_right": one + below, "status": 0 * one}
-    still = {"gamma": 0.0, "v0": -0.3, "u0": 0.05}
-    return xr.Dataset({name: (("d", "r"), x) for name, x in variables.items()}, coords={"d": d, "r": r, **still})
+    # A map of rigid walls has a kappa too, for its energies.
+    still = {"gamma": 0.0, "v0": -0.3, "u0": 0.05, "kappa": 400.0}
+    found = {name: (("d", "r"), x) for name, x in variables.items()}
+    return xr.Dataset(found, coords={"d": d, "r": r, **still}, attrs={"wall": "rigid"})
 
 
 def test_a_map_is_explained_by_the_curve_on_its_border():

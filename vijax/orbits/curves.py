@@ -5,7 +5,7 @@ located afterwards (`curve_events`).
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,7 +28,7 @@ from vijax.orbits.curve_equations import (
 )
 from vijax.orbits.curve_events import CurvePoint, curve_events
 from vijax.orbits.curve_plane import Plane, check_plane, logarithmic, place_of, units
-from vijax.orbits.curve_starts import CurveStart, curve_start, with_touch
+from vijax.orbits.curve_starts import CurveStart, check_points, curve_start, with_touch
 from vijax.orbits.events import Point, orbits_at
 from vijax.orbits.parameter import MOVED
 from vijax.orbits.periodic import Orbit
@@ -99,10 +99,8 @@ def follow_curves(
     Raises:
         ValueError: Not two parameters, two names of one, bounds in the wrong order, or a point outside.
     """
-    listed = checks.sequence("points", points, Point, "points of branches, such as branch.points")
+    listed = check_points(points)
     max_points, settings = checks.whole("max_points", max_points, 2, MOST_POINTS), check_settings(settings)
-    if not listed:
-        raise ValueError("points must hold at least one to begin at; got none; branches meet them")
     device = one_device(device)
     plane = check_plane(listed[0].orbit.pair, within)
     checks.choice("along", along, MOVED)
@@ -116,7 +114,7 @@ def follow_curves(
             starts.append(start)
     if refused:
         warnings.warn(f"{len(refused)} of {len(listed)} points begin no curve: {refused[0]}", stacklevel=2)
-    return curves_from(starts, plane, device, max_points, settings)
+    return [one for some in curves_from(starts, plane, device, max_points, settings) for one in some]
 
 
 def curves_from(
@@ -126,8 +124,10 @@ def curves_from(
     max_points: int,
     settings: ContinuationSettings,
     known: list[BifurcationCurve] | None = None,
-) -> list[BifurcationCurve]:
+) -> Iterator[list[BifurcationCurve]]:
     """Follow every start that lies on no curve yet: one of each family at a time, all these together.
+
+    They come batch by batch, so that whoever stops in between has those before.
 
     Args:
         starts: All of one kind of wall, in the plane.
@@ -135,7 +135,6 @@ def curves_from(
         known: Curves that are there already.
     """
     left = unmet(_lanes(starts, plane, device, settings), known or [], plane)
-    found: list[BifurcationCurve] = []
     while left:
         chosen: dict[tuple, list[_Lane]] = {}
         for lane in left:
@@ -147,11 +146,11 @@ def curves_from(
             batches.setdefault((lane.path.condition, lane.first.y.size), []).append(lane)
         new: list[BifurcationCurve] = []
         for batch in batches.values():
-            new += _followed(batch, plane, max_points, settings)
+            some = _followed(batch, plane, max_points, settings)
+            new += some
+            yield some
         taken = {id(lane) for batch in batches.values() for lane in batch}
         left = unmet([lane for lane in left if id(lane) not in taken], new, plane)
-        found += new
-    return found
 
 
 Traits = np.ndarray

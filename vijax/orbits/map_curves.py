@@ -1,16 +1,18 @@
 """The curves that explain a map: begun where orbits of its cells bifurcate, until its borders lie at curves."""
 
 import dataclasses
+import math
+import time
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from vijax.model.device import Harvester, one_device
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
-from vijax.orbits.curve_starts import CurveStart
 from vijax.orbits.curves import BifurcationCurve, curves_from
-from vijax.orbits.map_borders import Borders, LabelledPlane, borders, labelled_plane, near
+from vijax.orbits.map_borders import Borders, LabelledPlane, borders, device_of, labelled_plane, largest_piece, near
 from vijax.orbits.map_seeds import seeds
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -23,19 +25,30 @@ _WHOLE_POINTS = 300  # Most points of each such branch.
 _REACH = 3.0  # cells on either side of a border that is looked at
 _FIRST_STEP, _MAX_STEP = 0.02, 0.05  # across them, in units of all that way
 
+Ended = Literal["explained", "tried", "rounds", "seconds", "stopped"]
+
 
 class MapCurves(NamedTuple):
     """Curves of bifurcations over a map.
 
     Attributes:
+        along: The map's two parameters, in the order of its axes.
         curves: Each once.
         borders: How many pairs of neighbouring periodic cells of the map differ in their label.
         explained: How many of these lie within one cell of a curve.
+        unexplained: Where the others are, by both parameters, a row a border.
+        largest: Those of them that are the longest chain of neighbours.
+        ended: Why the search for more came to its end: all borders are "explained", each of the others was "tried",
+            "rounds" or "seconds" were spent, or it was "stopped" by Ctrl-C.
     """
 
+    along: tuple[str, str]
     curves: list[BifurcationCurve]
     borders: int
     explained: int
+    unexplained: np.ndarray
+    largest: np.ndarray
+    ended: Ended
 
 
 @door
@@ -44,9 +57,11 @@ def bifurcation_curves(
     *,
     device: Harvester | None = None,
     max_rounds: int = 8,
+    max_seconds: float = math.inf,
     round_borders: int = 48,
     max_points: int = 2000,
     settings: ContinuationSettings = DEFAULT,
+    progress: Callable[[int, int], None] | None = None,
 ) -> MapCurves:
     """Find the curves of bifurcations that explain a map of labels over two parameters.
 
@@ -55,52 +70,99 @@ def bifurcation_curves(
 
     Args:
         dataset: What `vijax.sweep` returned, over two parameters, with period, impacts and status.
-        device: Of the map, where one is not Tables I and II: along "beta" g/A is read.
+        device: Of the map, unless it says so itself: along "beta" g/A is read.
         max_rounds: Rounds, after the first look, at most; it ends sooner where one finds nothing.
+        max_seconds: After these nothing more is begun: neither a round nor another batch of curves.
         round_borders: Borders that are looked at in a round, drawn from all that are left.
         max_points: Most points of a curve each way.
         settings: Of steps and events.
+        progress: Called with (borders explained, borders in all), first before anything is followed.
 
     Returns:
-        The curves, and how many borders of the map they explain. Others may be those of basins, not of bifurcations.
+        The curves, and which borders of the map they explain. Others may be those of basins, not of bifurcations.
+        Where Ctrl-C stops the search, the curves that were found until then.
 
     Raises:
-        ValueError: No map of labels over two parameters, or one without periodic cells.
+        ValueError: No map of labels over two parameters that its orbits depend on, or one without periodic cells.
     """
     max_rounds = checks.whole("max_rounds", max_rounds, 0, 1000)
+    max_seconds = checks.real("max_seconds", max_seconds, "a positive number", lambda x: x > 0)
     round_borders = checks.whole("round_borders", round_borders, 1, 10_000)
     max_points, settings = checks.whole("max_points", max_points, 2, 10**6), check_settings(settings)
-    device = one_device(device)
     plane = labelled_plane(dataset)
-    steepest = float(device.g / device.A)
-    left, draw = borders(plane), np.random.default_rng(0)
-    total, found = len(left), list[BifurcationCurve]()
+    device = device_of(dataset) if device is None else one_device(device)
+    search = _Search(plane, device, max_points, settings, checks.function("progress", progress))
+    try:
+        ended = search.run(max_rounds, round_borders, time.monotonic() + max_seconds)
+    except KeyboardInterrupt:
+        ended = "stopped"
+    left = search.left
+    where = plane.places(left), plane.places(largest_piece(left))
+    return MapCurves(plane.along, search.found, search.borders, search.borders - len(left), *where, ended)
 
-    def go_on(starts: list[CurveStart]) -> None:
-        nonlocal left
+
+class _Search:
+    """A search for the curves over a map: what it has found so far, and the borders that are left."""
+
+    def __init__(
+        self,
+        plane: LabelledPlane,
+        device: Harvester,
+        max_points: int,
+        settings: ContinuationSettings,
+        progress: Callable[[int, int], None] | None,
+    ) -> None:
+        self.left, self.found = borders(plane), list[BifurcationCurve]()
+        self.borders = len(self.left)
+        self._plane, self._device, self._max_points, self._settings = plane, device, max_points, settings
+        self._progress = progress
+
+    def run(self, max_rounds: int, round_borders: int, deadline: float) -> Ended:
+        """Look all over the map, then at borders that are left, in rounds; say why no further."""
+        self._tell()
+        cells = _spread(self._plane)
+        ways = np.repeat([0, 1], len(cells))
+        whole = self._look(np.tile(cells, (2, 1)), ways, np.inf, self._settings, deadline)
+        draw, untried = np.random.default_rng(0), self.left
+        short = dataclasses.replace(self._settings, first_step=_FIRST_STEP, max_step=_MAX_STEP)
+        for _ in range(max_rounds):
+            chosen = draw.permutation(len(untried))[:round_borders]
+            if not chosen.size or not whole:
+                break
+            some = untried[chosen]
+            across = some.cell + np.eye(2, dtype=int)[some.axis]
+            both = np.concatenate([some.cell, across]), np.tile(some.axis, 2)
+            whole = self._look(*both, _REACH, short, deadline)
+            # Those of which nothing came are left, and not tried again.
+            untried = untried[_isin(untried, self.left) & ~_isin(untried, some)]
+        if not len(self.left):
+            return "explained"
+        return "seconds" if not whole else "rounds" if len(untried) else "tried"
+
+    def _look(
+        self, cells: np.ndarray, ways: np.ndarray, reach: float, steps: ContinuationSettings, deadline: float
+    ) -> bool:
+        """Follow orbits of cells along an axis each, and curves from what they meet; say whether time did for all."""
+        plane, steepest = self._plane, float(self._device.g / self._device.A)
+        if time.monotonic() > deadline:
+            return False
+        starts = seeds(plane, cells, ways, reach, steepest, _WHOLE_POINTS, steps)
         with warnings.catch_warnings():
             # Many are tried, and some lie where a ball just no longer flies.
             warnings.filterwarnings("ignore", message=".* begin no curve")
-            new = curves_from(starts, plane.bounds, device, max_points, settings, found)
-        found.extend(new)
-        for curve in new:
-            left = left[~near(left, curve.values, plane)]
+            known = [*self.found]
+            for some in curves_from(starts, plane.bounds, self._device, self._max_points, self._settings, known):
+                self.found += some
+                for curve in some:
+                    self.left = self.left[~near(self.left, curve.values, plane)]
+                self._tell()
+                if time.monotonic() > deadline:
+                    return False
+        return True
 
-    cells = _spread(plane)
-    both = np.repeat([0, 1], len(cells))
-    go_on(seeds(plane, np.tile(cells, (2, 1)), both, np.inf, steepest, _WHOLE_POINTS, settings))
-    short = dataclasses.replace(settings, first_step=_FIRST_STEP, max_step=_MAX_STEP)
-    untried = left
-    for _ in range(max_rounds):
-        chosen = draw.permutation(len(untried))[:round_borders]
-        if not chosen.size:
-            break
-        some = untried[chosen]
-        across = some.cell + np.eye(2, dtype=int)[some.axis]
-        cells, ways = np.concatenate([some.cell, across]), np.tile(some.axis, 2)
-        go_on(seeds(plane, cells, ways, _REACH, steepest, _WHOLE_POINTS, short))
-        untried = _without(left, some)
-    return MapCurves(found, total, total - len(left))
+    def _tell(self) -> None:
+        if self._progress is not None:
+            self._progress(self.borders - len(self.left), self.borders)
 
 
 def _spread(plane: LabelledPlane) -> np.ndarray:
@@ -112,11 +174,11 @@ def _spread(plane: LabelledPlane) -> np.ndarray:
     return periodic[np.unique(away)]
 
 
-def _without(left: Borders, tried: Borders) -> Borders:
-    """Keep the borders that were not tried."""
+def _isin(some: Borders, others: Borders) -> np.ndarray:
+    """Say which borders are among others."""
 
     def keys(of: Borders) -> list[tuple[int, ...]]:
         return [(*map(int, cell), int(axis)) for cell, axis in zip(of.cell, of.axis, strict=True)]
 
-    known = set(keys(tried))
-    return left[np.array([key not in known for key in keys(left)], bool)]
+    known = set(keys(others))
+    return np.array([key in known for key in keys(some)], bool)
