@@ -26,6 +26,7 @@ from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_dataset import curve_dataset
 from vijax.orbits.curve_rows import curve_rows
 from vijax.orbits.curves import BifurcationCurve, follow_curves
+from vijax.orbits.limits import limit_points
 from vijax.orbits.map_curves import MapCurves, bifurcation_curves
 from vijax.orbits.orbit_properties import impacts as orbit_impacts
 from vijax.orbits.orbit_properties import labels as orbit_labels
@@ -85,6 +86,7 @@ __all__ = [
     "follow_orbits",
     "harvested_energy",
     "impact_pair",
+    "limit_points",
     "load",
     "lyapunov",
     "optimise",

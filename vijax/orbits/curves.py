@@ -4,6 +4,7 @@ They begin where branches met something (`curve_starts`); all lanes step togethe
 located afterwards (`curve_events`).
 """
 
+import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.continuation import MOST_POINTS
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.curve_equations import (
+    CONDITIONS,
     FIRST_CURVE_END,
     Condition,
     CurvePath,
@@ -30,6 +32,7 @@ from vijax.orbits.curve_events import CurvePoint, curve_events
 from vijax.orbits.curve_plane import Plane, check_plane, logarithmic, place_of, units
 from vijax.orbits.curve_starts import CurveStart, check_points, curve_start, with_touch
 from vijax.orbits.events import Point, orbits_at
+from vijax.orbits.limits import LIMITS, limit_start
 from vijax.orbits.parameter import MOVED
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks, tiles
@@ -38,13 +41,16 @@ from vijax.runtime.context import door
 _AT_ONCE = 4  # starts of one family that are followed at once, though they may turn out to lie on one curve
 # Two starts on one curve differ from it by less than a step's bend; other curves of the same label are farther apart.
 _ON_CURVE = 5e-4
+# How far from a limit an orbit may be from which Newton is to find it: about a cell of a coarse map.
+_BESIDE = 0.1
 
 
 class BifurcationCurve(NamedTuple):
     """A curve of one bifurcation in a plane, in the order in which it was followed.
 
     Attributes:
-        kind: "fold", "flip", "pitchfork" or "grazing" (the ball touches a wall in flight).
+        kind: "fold", "flip", "pitchfork", "grazing" (the ball touches a wall in flight), "penetration limit" or "energy
+            limit" (an impact is as deep, or harvests as much of what it gives to the membrane, as is admissible).
         along: Both parameters of the plane.
         values: Of both, a row an orbit.
         orbit: The orbits, with multipliers; those of a graze without the impact that begins there.
@@ -65,10 +71,10 @@ class BifurcationCurve(NamedTuple):
         """Say whether stable orbits border on each point.
 
         Always at folds, flips and pitchforks: the other multiplier is smaller than 1, as the product of both is. A
-        graze may be one of an unstable orbit.
+        graze or a limit may be one of an unstable orbit.
         """
         largest = np.abs(np.asarray(self.orbit.multipliers)).max(axis=1)
-        return largest < 1 if self.kind == "grazing" else np.full(len(largest), True)
+        return largest < 1 if self.kind in CONDITIONS else np.full(len(largest), True)
 
 
 @door
@@ -85,11 +91,11 @@ def follow_curves(
 
     Args:
         points: What branches met. From folds, flips, pitchforks and grazings of flights and impacts curves are
-            followed; of others a warning says so.
+            followed, and from where limits are met (`limit_points`); of others a warning says so.
         along: The parameter of these branches.
         within: The two parameters of the plane with their bounds, as in {"d": (0.05, 0.3), "kappa": (3, 400)}. Bounds
             more than a decade apart are gone through in logarithms.
-        device: For quantities of the device: its other constants, as branches were told.
+        device: For quantities of the device: its other constants, as branches were told; for limits, whose they are.
         max_points: Most points of a curve each way.
         settings: Of steps and events; arclengths are in units of the plane's sides and of knots.
 
@@ -107,7 +113,11 @@ def follow_curves(
     starts: list[CurveStart] = []
     refused: list[str] = []
     for point in listed:
-        start = curve_start(point, place_of(point, along, plane, device), settings.asymmetry)
+        place = place_of(point, along, plane, device)
+        if point.kind in LIMITS:
+            start = limit_start(point, place, tuple(plane), device, settings.asymmetry)
+        else:
+            start = curve_start(point, place, settings.asymmetry)
         if isinstance(start, str):
             refused.append(start)
         else:
@@ -170,7 +180,7 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
     """Bring starts onto their curves; those are left out, with a warning, at which no real orbit is."""
     batches: dict[tuple, list[CurveStart]] = {}
     for start in starts:
-        batches.setdefault((start.kind == "grazing", start.orbit.knots.shape[1]), []).append(start)
+        batches.setdefault((CONDITIONS.get(start.kind), start.orbit.knots.shape[1]), []).append(start)
     lanes, lost = [], []
     for batch in batches.values():
         paths, y = _set_out(batch, plane, device, settings)
@@ -178,12 +188,14 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
         across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
         across = np.broadcast_to(across / np.linalg.norm(across), y.shape)
         first = advance(paths, y, across, np.zeros(len(y)))
-        near = np.abs(first.y - y).max(axis=1) < settings.max_step
+        limit = paths.device is not None
+        near = np.abs(first.y - y).max(axis=1) < (_BESIDE if limit else settings.max_step)
         real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
         for index, good in enumerate(real & (first.size <= settings.newton_tolerance)):
             path, place = jax.tree.map(lambda leaf, i=index: leaf[i], (paths, first))
             if good:
-                lanes.append(_Lane(batch[index], _traits(batch[index].orbit, images=True), path, place))
+                start = _moved(batch[index], path, place.y) if limit else batch[index]
+                lanes.append(_Lane(start, _traits(start.orbit, images=True), path, place))
             else:
                 lost.append(batch[index])
     if lost:
@@ -193,6 +205,12 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
             stacklevel=2,
         )
     return lanes
+
+
+def _moved(start: CurveStart, path: CurvePath, y: np.ndarray) -> CurveStart:
+    """Move a start that lay beside its curve onto it."""
+    x, other = map(float, path.places(y))
+    return start._replace(place=(x, other), orbit=orbits_at(path, y[None]))
 
 
 def unmet(lanes: list[_Lane], curves: list[BifurcationCurve], plane: Plane) -> list[_Lane]:
@@ -249,7 +267,7 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
     orbit = periodic.concatenate([start.orbit for start in starts])
     size, (one, other), logarithms = len(starts), plane, logarithmic(plane)
     place = np.array([start.place for start in starts], float)
-    touches = starts[0].kind == "grazing"
+    condition: Condition = CONDITIONS.get(starts[0].kind, "multiplier")
     rows = tiles.arrays(
         {
             "start": place,
@@ -259,7 +277,6 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
             "multiplier": np.array([1.0 if start.kind == "fold" else -1.0 for start in starts]),
         }
     )
-    condition: Condition = "touch" if touches else "multiplier"
     paths = CurvePath(
         pair=orbit.pair,
         sequence=orbit.sequence,
@@ -268,6 +285,7 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
                 (np.array([start.impact for start in starts], np.int32), np.array([start.wall for start in starts]))
             )
         ),
+        device=_broadcast(device, size) if condition in ("depth", "energy") else None,
         along=(one, other),
         logarithmic=(logarithms[0], logarithms[1]),
         condition=condition,
@@ -277,8 +295,14 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
     )
     paths = jax.tree.map(np.asarray, paths)
     knots = np.where(paths.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
-    waits = np.array([[start.wait] for start in starts])[:, : int(touches)]
+    waits = np.array([[start.wait] for start in starts])[:, : int(condition == "touch")]
     return paths, np.concatenate([knots, waits, units(place, plane)], axis=1)
+
+
+def _broadcast(device: Harvester, size: int) -> Harvester:
+    """Give every lane the constants of the device, its penetration limit among them."""
+    whole = dataclasses.replace(device, penetration_limit=device.depth_limit)
+    return jax.tree.map(lambda x: np.full(size, float(x)), whole)
 
 
 def _followed(
@@ -333,7 +357,7 @@ def orbits_of(path: CurvePath, ys: np.ndarray) -> Orbit:
     real as it is, or with an impact of speed 0 there.
     """
     found = orbits_at(path, ys)
-    if path.condition == "multiplier" or (np.asarray(found.status) == Status.OK).all():
+    if path.condition != "touch" or (np.asarray(found.status) == Status.OK).all():
         return found
     wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), path)
     pair, knots = wide.pair_and_knots(ys)

@@ -34,6 +34,7 @@ class LabelledPlane:
         names: Label of each cell; "" where the motion is not periodic, or has no impacts. Mirror images have one.
         period: Forcing periods of each cell's motion.
         cells: d, kappa (None at rigid walls), r, gamma, u0 and v0 of each cell.
+        admissible: Whether each cell is, where the map tells.
     """
 
     along: tuple[str, str]
@@ -41,6 +42,7 @@ class LabelledPlane:
     names: np.ndarray
     period: np.ndarray
     cells: dict[str, Any]
+    admissible: np.ndarray | None
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
@@ -81,7 +83,9 @@ def labelled_plane(dataset: "xr.Dataset") -> LabelledPlane:
     if not (names != "").any():
         raise ValueError("dataset must have periodic cells with impacts, whose orbits curves begin at; got none")
     axes = tuple(np.asarray(ordered[name].values, float) for name in along)
-    return LabelledPlane(along, (axes[0], axes[1]), names, like["period"], cells)
+    kept = ordered.get("admissible")
+    kept = None if kept is None or set(kept.dims) != set(along) else kept.transpose(*along).values.astype(bool)
+    return LabelledPlane(along, (axes[0], axes[1]), names, like["period"], cells, kept)
 
 
 def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
@@ -145,12 +149,30 @@ class Borders:
 
 
 def borders(plane: LabelledPlane) -> Borders:
-    """Find every border between periodic cells."""
-    cells, axes = [], []
+    """Find every border between periodic cells with different labels."""
+    return _parted(plane, plane.names)
+
+
+def limit_borders(plane: LabelledPlane) -> Borders:
+    """Find every border between periodic cells of which one is admissible and the other is not.
+
+    Raises:
+        ValueError: The map does not tell.
+    """
+    if plane.admissible is None:
+        raise ValueError("limits must be those of a map with admissible, over its two axes alone; got one without it")
+    return _parted(plane, plane.admissible)
+
+
+def _parted(plane: LabelledPlane, by: np.ndarray) -> Borders:
+    """Find the pairs of neighbouring periodic cells in which something differs."""
+    cells, axes, periodic = [], [], plane.names != ""
     for axis in (0, 1):
         last = plane.names.shape[axis] - 1
-        here, there = (plane.names.take(np.arange(last) + shift, axis=axis) for shift in (0, 1))
-        found = np.argwhere((here != there) & (here != "") & (there != ""))
+        (here, there), both = (
+            [values.take(np.arange(last) + shift, axis=axis) for shift in (0, 1)] for values in (by, periodic)
+        )
+        found = np.argwhere((here != there) & both[0] & both[1])
         cells.append(found)
         axes.append(np.full(len(found), axis))
     return Borders(np.concatenate(cells), np.concatenate(axes))

@@ -12,8 +12,17 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.curves import BifurcationCurve, curves_from
-from vijax.orbits.map_borders import Borders, LabelledPlane, borders, device_of, labelled_plane, largest_piece, near
-from vijax.orbits.map_seeds import seeds
+from vijax.orbits.map_borders import (
+    Borders,
+    LabelledPlane,
+    borders,
+    device_of,
+    labelled_plane,
+    largest_piece,
+    limit_borders,
+    near,
+)
+from vijax.orbits.map_seeds import limit_seeds, seeds
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -60,6 +69,7 @@ def bifurcation_curves(
     max_seconds: float = math.inf,
     round_borders: int = 48,
     max_points: int = 2000,
+    limits: bool = False,
     settings: ContinuationSettings = DEFAULT,
     progress: Callable[[int, int], None] | None = None,
 ) -> MapCurves:
@@ -75,6 +85,8 @@ def bifurcation_curves(
         max_seconds: After these nothing more is begun: neither a round nor another batch of curves.
         round_borders: Borders that are looked at in a round, drawn from all that are left.
         max_points: Most points of a curve each way.
+        limits: Whether to follow also where orbits meet the penetration limit and the energy limit of the device,
+            between cells that are admissible and cells that are not; the map must hold `admissible`.
         settings: Of steps and events.
         progress: Called with (borders explained, borders in all), first before anything is followed.
 
@@ -91,9 +103,10 @@ def bifurcation_curves(
     max_points, settings = checks.whole("max_points", max_points, 2, 10**6), check_settings(settings)
     plane = labelled_plane(dataset)
     device = device_of(dataset) if device is None else one_device(device)
+    beside = limit_borders(plane) if checks.flag("limits", limits) else borders(plane)[:0]
     search = _Search(plane, device, max_points, settings, checks.function("progress", progress))
     try:
-        ended = search.run(max_rounds, round_borders, time.monotonic() + max_seconds)
+        ended = search.run(max_rounds, round_borders, beside, time.monotonic() + max_seconds)
     except KeyboardInterrupt:
         ended = "stopped"
     left = search.left
@@ -117,13 +130,15 @@ class _Search:
         self._plane, self._device, self._max_points, self._settings = plane, device, max_points, settings
         self._progress = progress
 
-    def run(self, max_rounds: int, round_borders: int, deadline: float) -> Ended:
-        """Look all over the map, then at borders that are left, in rounds; say why no further."""
+    def run(self, max_rounds: int, round_borders: int, beside: Borders, deadline: float) -> Ended:
+        """Look all over the map and beside limits, then at borders that are left, in rounds; say why no further."""
         self._tell()
         cells = _spread(self._plane)
         ways = np.repeat([0, 1], len(cells))
         whole = self._look(np.tile(cells, (2, 1)), ways, np.inf, self._settings, deadline)
-        draw, untried = np.random.default_rng(0), self.left
+        draw = np.random.default_rng(0)
+        whole = whole and self._look_at_limits(draw.permutation(len(beside)), beside, round_borders, deadline)
+        untried = self.left
         short = dataclasses.replace(self._settings, first_step=_FIRST_STEP, max_step=_MAX_STEP)
         for _ in range(max_rounds):
             chosen = draw.permutation(len(untried))[:round_borders]
@@ -146,7 +161,23 @@ class _Search:
         plane, steepest = self._plane, float(self._device.g / self._device.A)
         if time.monotonic() > deadline:
             return False
-        starts = seeds(plane, cells, ways, reach, steepest, _WHOLE_POINTS, steps)
+        return self._follow(seeds(plane, cells, ways, reach, steepest, _WHOLE_POINTS, steps), deadline)
+
+    def _look_at_limits(self, order: np.ndarray, beside: Borders, round_borders: int, deadline: float) -> bool:
+        """Follow limits from cells beside them until a curve lies at each; say whether time did for all."""
+        left = beside[order]
+        while len(left) and time.monotonic() < deadline:
+            some, left = left[np.arange(len(left)) < round_borders], left[np.arange(len(left)) >= round_borders]
+            known = len(self.found)
+            if not self._follow(limit_seeds(self._plane, some.cell, self._device), deadline):
+                return False
+            for curve in self.found[known:]:
+                left = left[~near(left, curve.values, self._plane)]
+        return not len(left)
+
+    def _follow(self, starts: list[CurveStart], deadline: float) -> bool:
+        """Follow curves from starts that lie on none yet; say whether time did for all."""
+        plane = self._plane
         with warnings.catch_warnings():
             # Many are tried, and some lie where a ball just no longer flies.
             warnings.filterwarnings("ignore", message=".* begin no curve")
