@@ -84,7 +84,7 @@ def _asked(overwrite: bool, given: dict[str, Any]) -> CurvesRequest:
     if picture is not None:
         check_format(picture)
     shown = {name: given.pop(name) for name in ("ground", "unstable")}
-    budget = {name: given.pop(name) for name in ("max_rounds", "max_seconds")}
+    budget = {name: given.pop(name) for name in ("max_rounds", "max_seconds", "limits")}
     budget = {name: value for name, value in budget.items() if value is not None}
     labelled, planned = (None, _planned(given)) if source is None else (_loaded(source, given), None)
     grounds = ["label", *([*planned.outputs] if planned else map(str, labelled or ()))]
@@ -173,6 +173,7 @@ def _budget_options() -> list[click.Parameter]:
 def _sections() -> Sections:
     store, out, plot, overwrite = "store of the map, in place of a plane", *options.file_options()
     ground = "what the map below the curves shows: label, P or another variable"
+    limits = "follow also where orbits meet the penetration limit and the energy limit"
     faint = "draw grazings and limits of unstable orbits too, faintly"
     return {
         "Map": [
@@ -181,7 +182,7 @@ def _sections() -> Sections:
             options.setting("periods", "forcing periods to run, at most", Whole(1)),
             options.wall_option(),
         ],
-        "Search": _budget_options(),
+        "Search": [*_budget_options(), click.Option(["--limits"], is_flag=True, help=limits)],
         "Picture": [
             click.Option(
                 ["--ground"],

@@ -63,7 +63,7 @@ def limit_points(branches: list[Branch], *, device: Harvester | None = None) -> 
 
 def _crossings(branch: Branch, device: Harvester) -> list[Point]:
     found = []
-    for kind, load in loads(branch.orbit, _device_at(device, branch.along, branch.values[:, None])).items():
+    for kind, load in loads(branch.orbit, device_at(device, branch.along, branch.values[:, None])).items():
         over = load.max(axis=1) - 1
         for index in np.flatnonzero(over[:-1] * over[1:] < 0):
             nearer = int(index) + int(abs(over[index + 1]) < abs(over[index]))
@@ -71,7 +71,7 @@ def _crossings(branch: Branch, device: Harvester) -> list[Point]:
     return found
 
 
-def _device_at(device: Harvester, along: str, values: Any) -> Harvester:
+def device_at(device: Harvester, along: str, values: Any) -> Harvester:
     """Give the device where a parameter has other values, if it is the device's."""
     if along in ImpactPair.__dataclass_fields__:
         return device
@@ -96,7 +96,7 @@ def limit_start(
         # Both of an impact and its mirror image are at the limit: half way there is one.
         orbit = symmetry.halved(orbit, asymmetry)
     for name, value in zip(plane, place, strict=True):
-        device = _device_at(device, name, value)
+        device = device_at(device, name, value)
     return CurveStart(point.kind, orbit, place, int(loads(orbit, device)[point.kind][0].argmax()))
 
 
@@ -113,7 +113,7 @@ def near_limits(
         within: How near, in parts of the limit.
     """
     for index, name in enumerate(plane):
-        device = _device_at(device, name, places[:, index, None])
+        device = device_at(device, name, places[:, index, None])
     found = []
     for kind, load in loads(orbit, device).items():
         for row in np.flatnonzero(np.abs(load.max(axis=1) - 1) < within):

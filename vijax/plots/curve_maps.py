@@ -1,5 +1,6 @@
 """Pictures of curves of bifurcations in their plane, alone or over a map."""
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,8 +68,8 @@ def curves(
     else:
         figure, x, y = _ground(over, names, ground)
     axes = figure.axes[0]
-    kinds = _draw(axes, dataset, x, y, unstable)
-    handles = [Line2D([], [], label=kind, **style) for kind, style in _KINDS.items() if kind in kinds]
+    kinds = draw_curves(axes, dataset, x, y, unstable)
+    handles = kind_handles(kinds)
     listed = _number(axes, dataset, x, y)
     handles += [Line2D([], [], label=text, **_listed(number)) for number, text in listed[:_MOST_LISTED]]
     if len(listed) > _MOST_LISTED:
@@ -111,7 +112,12 @@ def _bare(dataset: "xr.Dataset", names: list[str]) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> set[str]:
+def kind_handles(kinds: Collection[str]) -> list[Line2D]:
+    """Give the entries of a legend for kinds of curves."""
+    return [Line2D([], [], label=kind, **style) for kind, style in _KINDS.items() if kind in kinds]
+
+
+def draw_curves(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> set[str]:
     """Draw every curve, and say which kinds there are."""
     drawn = set()
     for index in range(dataset.sizes["curve"]):
