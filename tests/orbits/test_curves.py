@@ -1,5 +1,6 @@
 """Curves of bifurcations: at their known places, with the multipliers that make them, ended where orbits end."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,7 @@ import vijax
 from vijax.model.device import Harvester
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
-from vijax.orbits import curves, orbit_search, periodic, shooting, switching
+from vijax.orbits import curve_rows, curves, limits, orbit_search, periodic, shooting, switching
 from vijax.orbits.shooting import Sequence
 
 PLANE = {"d": (0.05, 0.35), "r": (0.02, 0.98)}
@@ -198,12 +199,133 @@ def test_a_map_is_explained_by_the_curve_on_its_border():
     np.testing.assert_allclose(np.sort(curve.values[[0, -1], 1]), [0.3, 0.6], rtol=1e-12)
 
 
+def test_a_search_without_time_says_what_is_left():
+    dataset, told = made_map(), []
+    found = vijax.bifurcation_curves(dataset, max_seconds=1e-9, progress=lambda *step: told.append(step))
+    assert (found.curves, found.explained, found.ended) == ([], 0, "seconds")
+    assert told == [(0, found.borders)]
+    assert found.unexplained.shape == (found.borders, 2)
+    # They lie half way between cells of the pitchfork's two sides, all in one piece.
+    away = found.unexplained[:, 0] - pitchfork(found.unexplained[:, 1])
+    assert np.abs(away).max() < 0.0125
+    assert len(found.largest) == found.borders
+
+
+def test_ctrl_c_keeps_the_curves_found_until_then():
+    def stop(explained, borders):
+        if explained:
+            raise KeyboardInterrupt
+
+    found = vijax.bifurcation_curves(made_map(), progress=stop)
+    assert found.ended == "stopped"
+    assert found.curves
+    assert 0 < found.explained <= found.borders
+    table = vijax.curve_dataset(found)
+    assert (table.attrs["ended"], table.sizes["border"]) == ("stopped", len(found.unexplained))
+
+
+def test_rows_have_every_point_and_what_was_met(found, tmp_path):
+    listed = list(found.values())
+    table = vijax.curve_dataset(listed)
+    rows = vijax.curve_rows(table)
+    assert len(rows) == sum(len(curve.values) for curve in listed)
+    np.testing.assert_array_equal(rows[["d", "r"]], np.concatenate([curve.values for curve in listed]))
+    met = rows[rows["event"] != ""]
+    assert sorted(met["event"]) == sorted(point.kind for curve in listed for point in curve.points)
+    places = {point.kind: point.values for curve in listed for point in curve.points}
+    for row in met.itertuples():
+        np.testing.assert_allclose((row.d, row.r), places[row.event], rtol=0, atol=1e-8)
+    # The flip's end and the point of the graze there are one point.
+    numbered = curve_rows.numbered_points(table)
+    assert [one.number for one in numbered] == list(range(1, len(numbered) + 1))
+    assert sorted(one.kind for one in numbered) == ["double graze", "flip-graze", "pitchfork-graze"]
+    curve_rows.write_rows(table.assign_coords(d=table["d"].assign_attrs(units="m")), tmp_path / "curves.csv")
+    assert (tmp_path / "curves.csv").read_text().startswith("curve,point,kind,label,d [m],r,multiplier,")
+
+
+# --- limits ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_limit_of_penetration_is_where_the_impact_map_is_as_deep(met):
+    """The symmetric orbit's impacts are alike, and its speed is known: both sides of the limit are seen."""
+    device = Harvester(penetration_limit=8e-4)
+    half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
+    start = periodic.solve(impact_pair([0.2], None, 0.5), half, jnp.array([[[0.15, 0.5, 0.0]]]))
+    branches = switching.family(start, "d", (0.1, 0.3), max_switches=0)
+    points = vijax.limit_points(branches, device=device)
+    assert {point.kind for point in points} <= set(limits.LIMITS)
+    listed = curves.follow_curves(points, "d", {"d": (0.15, 0.35), "r": (0.3, 0.7)}, device=device)
+    (curve,) = (one for one in listed if one.kind == "penetration limit")
+    load = limits.loads(curve.orbit, device)["penetration limit"].max(axis=1)
+    flown = np.asarray(curve.orbit.status) == Status.OK
+    assert flown[1:-1].all()
+    np.testing.assert_allclose(load[flown], 1, rtol=0, atol=1e-12)
+    assert (np.asarray(curve.orbit.residual) < 1e-12).all()
+
+
+def test_limits_of_the_energy_on_soft_walls_hold_and_end_at_bounds():
+    device = Harvester(s=0.2)
+    orbit = orbit_search.search(device.pair(), "RL", guesses=64)
+    branches = switching.family(orbit[:1], "omega", (2.5, 6.0), device=device, max_switches=0)
+    points = vijax.limit_points(branches, device=device)
+    for curve in curves.follow_curves(points, "omega", {"omega": (2.5, 6.0), "omega0": (20.0, 400.0)}, device=device):
+        for index, name in enumerate(curve.along):
+            device = limits.device_at(device, name, curve.values[:, index, None])
+        load = limits.loads(curve.orbit, device)[curve.kind].max(axis=1)
+        np.testing.assert_allclose(load[np.asarray(curve.orbit.status) == Status.OK], 1, rtol=0, atol=1e-12)
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("plane", "message"),
+    [
+        ({"d": (0.1, 0.3)}, "within must give two parameters their bounds"),
+        ({"d": (0.1, 0.3), "s": (0.1, 0.3)}, "within must name two parameters; got d and s, which say the same"),
+        ({"gamma": (-0.1, 0.1), "beta": (-0.1, 0.1)}, "got gamma and beta, which say the same"),
+        ({"d": (0.3, 0.1), "r": (0.2, 0.8)}, "within must be two finite bounds, the lower first"),
+        ({"d": (0.1, 0.3), "r": (0.2, np.nan)}, "within must be two finite bounds"),
+        ({"d": (0.1, 0.3), "r": (0.2, 1.5)}, "within must lie in"),
+        ({"d": (0.1, 0.3), "kappa": (3, 40)}, "a rigid wall has no kappa"),
+        ({"d": (0.1, 0.3), "A": (1, 2)}, "got A, which changes none of d, kappa, r and gamma where d is given"),
+        ({"d": (0.3, 0.4), "r": (0.2, 0.8)}, "within must hold the points"),
+    ],
+)
+def test_a_plane_that_cannot_be_is_told(met, plane, message):
+    with pytest.raises(ValueError, match=message):
+        curves.follow_curves(met, "d", plane)
+
+
+def test_malformed_starts_are_told(met):
+    (fold,) = met[:1]
+    soft = fold._replace(orbit=eqx.tree_at(lambda o: o.pair, fold.orbit, impact_pair([0.2], [40.0], [0.5])))
+    two = fold._replace(orbit=periodic.concatenate([fold.orbit, fold.orbit]))
+    for points, message in (
+        ([], "points must hold at least one"),
+        (3, "points must be"),
+        ([*met, "fold"], "points must be"),
+        ([fold, soft], "points must be of one kind of wall"),
+        ([two], "points must have one orbit each; got 2 at index 0"),
+        ([fold._replace(value=np.nan)], "within must hold the points"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            curves.follow_curves(points, "d", PLANE)
+
+
+def energy_only(dataset):
+    """A map over d and A, where the motion depends on d alone."""
+    return dataset.isel(r=0, drop=True).assign(P=(("d", "A"), np.ones((9, 2)))).assign_coords(A=[1.0, 2.0])
+
+
 @pytest.mark.parametrize(
     ("dataset", "message"),
     [
         (made_map().drop_vars("period"), "dataset must hold period"),
         (made_map().isel(d=0), "dataset must be a map over two parameters; got one over r"),
         (made_map().isel(d=[0]), "dataset must have at least two values along each axis; got 1 and 7"),
+        (energy_only(made_map()), "got one over d; its motion does not depend on A"),
+        (made_map().assign_attrs(membrane="hunt-crossley"), "dataset must be of linear membranes"),
         (made_map().assign(period=0 * made_map()["period"]), "dataset must have periodic cells with impacts"),
         (5, "dataset must be a dataset"),
     ],
@@ -211,3 +333,17 @@ def test_a_map_is_explained_by_the_curve_on_its_border():
 def test_a_map_without_labels_is_told(dataset, message):
     with pytest.raises(ValueError, match=message):
         vijax.bifurcation_curves(dataset)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("max_seconds", 0.0), ("max_seconds", np.nan), ("max_rounds", -1), ("max_points", 1), ("progress", 3)],
+)
+def test_a_budget_that_cannot_be_is_told(argument, value):
+    with pytest.raises(ValueError, match=f"{argument} must be"):
+        vijax.bifurcation_curves(made_map(), **{argument: value})
+
+
+def test_limits_want_a_map_that_tells_what_is_admissible():
+    with pytest.raises(ValueError, match="limits must be those of a map with admissible"):
+        vijax.bifurcation_curves(made_map(), limits=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from vijax.model.device import Harvester, one_device
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
+from vijax.orbits.curve_starts import CurveStart
 from vijax.orbits.curves import BifurcationCurve, curves_from
 from vijax.orbits.map_borders import (
     Borders,
