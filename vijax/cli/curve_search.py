@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from vijax.cli import process
 from vijax.cli.closing import how_many, pace
 from vijax.cli.progress import progress, waiting
+from vijax.model.quantities import PARAMETERS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -76,5 +77,10 @@ def check_map(planned: "SweepPlan") -> None:
     from vijax.orbits import map_borders
     from vijax.planes.dataset import asked, coordinates
 
+    if len(planned.cells.dynamic) != 2:
+        got = ", ".join(planned.cells.dynamic) or "none"
+        raise ValueError(
+            f"two of {', '.join(PARAMETERS)} that the motion depends on must have several values for curves; got {got}"
+        )
     plane = xr.Dataset(coords=coordinates(planned.cells), attrs=asked(planned))
     map_borders.check_map(plane, planned.cells.dynamic)

@@ -30,15 +30,13 @@ class CurvesRequest:
     """Curves that are asked for.
 
     Attributes:
-        map: Of labels; None where `plan` is to be run for it.
-        plan: Of the map.
+        map: Of labels, or the plan of one that is to be run.
         files: Store, table and picture to write, where they are wanted.
         budget: Arguments of `bifurcation_curves`.
         shown: Arguments of `plots.curves`.
     """
 
-    map: "xr.Dataset | None"
-    plan: "SweepPlan | None"
+    map: "xr.Dataset | SweepPlan"
     files: tuple[Path | None, Path | None, Path | None]
     budget: dict[str, Any]
     shown: dict[str, Any]
@@ -52,13 +50,12 @@ def bifurcations(overwrite: bool, yes: bool, **given: Any) -> None:
     """
     with process.door():
         asked = _asked(overwrite, given)
-        if asked.plan is not None:
-            _agree(asked.plan, yes)
+        _agree(asked.map, yes)
     if asked.files[2] is not None:
         process.import_beside("vijax.plots.curve_maps")
-    labelled, ran = (asked.map, "") if asked.plan is None else _run(asked.plan)
+    labelled, lines = _run(asked.map)
     found, said = search(labelled, asked.budget)
-    lines = [ran, said] if ran else [said]
+    lines.append(said)
     if not found.curves:
         click.echo("\n".join([*lines, *summary(found), "nothing was written"]))
         return
@@ -72,7 +69,9 @@ def bifurcations(overwrite: bool, yes: bool, **given: Any) -> None:
 
 
 def _asked(overwrite: bool, given: dict[str, Any]) -> CurvesRequest:
+    from vijax.orbits.map_curves import check_budget
     from vijax.plots.style import check_format
+    from vijax.runtime import checks
 
     out, plot, rows, source = (given.pop(name) for name in ("out", "plot", "csv", "map"))
     alone = out is None and plot is None
@@ -86,11 +85,10 @@ def _asked(overwrite: bool, given: dict[str, Any]) -> CurvesRequest:
     shown = {name: given.pop(name) for name in ("ground", "unstable")}
     budget = {name: given.pop(name) for name in ("max_rounds", "max_seconds", "limits")}
     budget = {name: value for name, value in budget.items() if value is not None}
-    labelled, planned = (None, _planned(given)) if source is None else (_loaded(source, given), None)
-    grounds = ["label", *([*planned.outputs] if planned else map(str, labelled or ()))]
-    if shown["ground"] not in grounds:
-        raise ValueError(f"ground must be among {', '.join(grounds)}; got {shown['ground']!r}")
-    return CurvesRequest(labelled, planned, (store, table, picture), budget, shown)
+    labelled, variables = _planned(given) if source is None else _loaded(source, given)
+    checks.choice("ground", shown["ground"], ["label", *variables])
+    check_budget(**{name: budget[name] for name in ("max_rounds", "max_seconds") if name in budget})
+    return CurvesRequest(labelled, (store, table, picture), budget, shown)
 
 
 def _table(rows: str | None, overwrite: bool) -> Path | None:
@@ -102,8 +100,8 @@ def _table(rows: str | None, overwrite: bool) -> Path | None:
     return check_output("csv", rows, overwrite)
 
 
-def _planned(given: dict[str, Any]) -> "SweepPlan":
-    """Plan the map that is to be run."""
+def _planned(given: dict[str, Any]) -> "tuple[SweepPlan, list[str]]":
+    """Plan the map that is to be run, and name what it will hold."""
     from vijax.planes.outputs import ON_REQUEST, OUTPUTS
     from vijax.planes.sweep import check_room, plan
 
@@ -112,11 +110,11 @@ def _planned(given: dict[str, Any]) -> "SweepPlan":
     planned = plan(axes, outputs, made, SweepSettings(**given))
     check_room(planned)
     check_map(planned)
-    return planned
+    return planned, [*planned.outputs]
 
 
-def _loaded(source: str, given: dict[str, Any]) -> "xr.Dataset":
-    """Load the map of a store; raise where an option says how one is to be run."""
+def _loaded(source: str, given: dict[str, Any]) -> "tuple[xr.Dataset, list[str]]":
+    """Load the map of a store, and name what it holds; raise where an option says how one is to be run."""
     from vijax.orbits.map_borders import labelled_plane
     from vijax.planes.store import load
 
@@ -128,19 +126,26 @@ def _loaded(source: str, given: dict[str, Any]) -> "xr.Dataset":
     with about("map"):
         labelled = load(source)
         labelled_plane(labelled)
-    return labelled
+    return labelled, [*map(str, labelled)]
 
 
-def _agree(planned: "SweepPlan", yes: bool) -> None:
+def _agree(asked: "xr.Dataset | SweepPlan", yes: bool) -> None:
     from vijax.planes import estimate
+    from vijax.planes.dataset import SweepPlan
 
-    process.agree(estimate.of(planned), yes)
+    if isinstance(asked, SweepPlan):
+        process.agree(estimate.of(asked), yes)
 
 
-def _run(planned: "SweepPlan") -> "tuple[xr.Dataset, str]":
+def _run(asked: "xr.Dataset | SweepPlan") -> "tuple[xr.Dataset, list[str]]":
+    """Run the map, unless it is there; say how fast."""
     from vijax.planes import sweep
+    from vijax.planes.dataset import SweepPlan
 
-    return counted(planned.count, lambda tell: sweep.run(planned, tell))
+    if not isinstance(asked, SweepPlan):
+        return asked, []
+    dataset, said = counted(asked.count, lambda tell: sweep.run(asked, tell))
+    return dataset, [said]
 
 
 def _write(dataset: "xr.Dataset", labelled: "xr.Dataset", asked: CurvesRequest, overwrite: bool) -> None:

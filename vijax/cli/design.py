@@ -283,10 +283,10 @@ def _judged(found: "Design", asked: DesignRequest, alone: bool) -> dict[str, Any
     if alone:
         judged["surroundings"] = surroundings(found.best, starts=asked.basin_starts)
         judged |= {"extents": extents(found.best), "arrival": arrival(found.best)}
-    if asked.plane and not isinstance(found.best, Optimum):
-        warnings.warn("the design's motion is no orbit, and has no curves of bifurcations", stacklevel=2)
-    elif asked.plane:
+    if asked.plane and isinstance(found.best, Optimum):
         judged["plane"] = tolerance_plane(found.best, asked.plane)
+    elif asked.plane:
+        warnings.warn("the design's motion is no orbit, and has no curves of bifurcations", stacklevel=2)
     return judged
 
 

@@ -127,16 +127,16 @@ class CurvePath(eqx.Module):
             both = shooting.multiplier_conditions(pair, self.sequence, knots)
             return jnp.where(self.multiplier > 0, both.plus, both.minus)[None]
         if self.device is not None:
-            return self._loads(y[-2:], pair, knots)[self.touch.impact][None] - 1
+            return self._loads(self.device, y[-2:], pair, knots)[self.touch.impact][None] - 1
         leave = jax.tree.map(lambda leaf: leaf[self.touch.impact], shooting.departures(pair, self.sequence, knots))
         rise, v = flow.flight(flow.flight_force(pair.gamma, leave.t), -leave.side * leave.speed, y[-3])
         return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])
 
-    def _loads(self, z, pair: ImpactPair, knots) -> Float[Array, "impact"]:
+    def _loads(self, device: Harvester, z, pair: ImpactPair, knots) -> Float[Array, "impact"]:
         """Compute penetrations over their limit, or harvested energies over those given to the membrane."""
         x = self.places(z)
         own = {name: x[index] for index, name in enumerate(self.along) if name in ("A", "omega")}
-        device = dataclasses.replace(self.device, **own)
+        device = dataclasses.replace(device, **own)
         # When a contact is deepest is found by a search, and moves with the knots by its own equation.
         frozen = jax.tree.map(lax.stop_gradient, (pair, self.sequence, knots))
         depth, energy, work = steady.yields(device, pair, self.sequence, knots, grazing.between(*frozen).deepest)
@@ -167,7 +167,7 @@ class CurvePath(eqx.Module):
             push = -self.touch.wall * flow.acceleration(pair.gamma, leave + y[-3])
         elif self.device is not None:
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
-            loads, here = self._loads(y[-2:], pair, knots), jnp.arange(knots.shape[0]) == self.touch.impact
+            loads, here = self._loads(self.device, y[-2:], pair, knots), jnp.arange(knots.shape[0]) == self.touch.impact
             push = loads[self.touch.impact] - jnp.where(here, 0.0, loads).max()
         else:
             cubic = jnp.where(self.multiplier > 0, one, cubic_coefficient(pair, self.sequence, knots))

@@ -40,9 +40,10 @@ def check_plane(pair: Any, within: Any) -> Plane:
 def _moved(pair: Any, plane: Plane, name: str, value: float) -> ImpactPair:
     """Move one parameter of a plane from its lower bound, the other one staying there."""
     host = jax.tree.map(np.asarray, pair)
-    low = tuple(np.asarray(bound) for bound, _ in plane.values())
-    there = tuple(np.asarray(value) if one == name else bound for one, bound in zip(plane, low, strict=True))
-    return moved_together(host, tuple(plane), there, low, np.asarray(1.0))
+    low: Any = tuple(np.asarray(bound) for bound, _ in plane.values())
+    there: Any = tuple(np.asarray(value) if one == name else bound for one, bound in zip(plane, low, strict=True))
+    steepest: Any = np.asarray(1.0)
+    return moved_together(host, tuple(plane), there, low, steepest)
 
 
 def place_of(point: Point, along: str, plane: Plane, device: Harvester) -> tuple[float, float]:

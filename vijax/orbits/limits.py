@@ -31,8 +31,9 @@ def loads(orbit: Orbit, device: Harvester) -> dict[str, np.ndarray]:
     """
     depth, work = np.asarray(orbit.depth), np.asarray(orbit.work)
     metres = depth * np.asarray(depth_unit(device, orbit.pair))
-    energy = np.asarray(harvested_energy(device, tiles.arrays(metres)))
-    given = work * np.asarray(device.m_b * device.speed_unit**2)
+    energy, given = tiles.arrays(
+        (np.asarray(harvested_energy(device, metres)), work * np.asarray(device.m_b * device.speed_unit**2))
+    )
     found = {LIMITS[0]: metres / float(device.depth_limit), LIMITS[1]: np.asarray(energy_ratio(energy, given))}
     real = np.asarray(orbit.sequence.real)
     return {kind: np.where(real, load, 0.0) for kind, load in found.items()}

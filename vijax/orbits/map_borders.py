@@ -83,8 +83,9 @@ def labelled_plane(dataset: "xr.Dataset") -> LabelledPlane:
     if not (names != "").any():
         raise ValueError("dataset must have periodic cells with impacts, whose orbits curves begin at; got none")
     axes = tuple(np.asarray(ordered[name].values, float) for name in along)
-    kept = ordered.get("admissible")
-    kept = None if kept is None or set(kept.dims) != set(along) else kept.transpose(*along).values.astype(bool)
+    told = ordered.get("admissible")
+    # Along an axis that the motion does not depend on there may be several verdicts a cell.
+    kept = None if told is None or set(told.dims) != set(along) else told.transpose(*along).values.astype(bool)
     return LabelledPlane(along, (axes[0], axes[1]), names, like["period"], cells, kept)
 
 
@@ -105,8 +106,8 @@ def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
         raise ValueError(f"dataset must have at least two values along each axis; got {got}")
     if dataset.attrs.get("membrane", "linear") != "linear":
         raise ValueError(f"dataset must be of linear membranes; got one of {dataset.attrs['membrane']}")
-    first = {name: x.flat[0] for name, x in _cells(dataset).items() if x is not None}
-    pair = ImpactPair(*(first.get(name) for name in _PAIR))
+    first: dict[str, Any] = {name: x.flat[0] for name, x in _cells(dataset).items() if x is not None}
+    pair = ImpactPair(first["d"], first.get("kappa"), first["r"], first["gamma"])
     check_plane(pair, {name: (float(dataset[name].min()), float(dataset[name].max())) for name in dims})
     return one, other
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _SPREAD = 5  # so many cells a side are followed across the whole map at first
+_MOST_ROUNDS = 1000
 _WHOLE_POINTS = 300  # Most points of each such branch.
 _REACH = 3.0  # cells on either side of a border that is looked at
 _FIRST_STEP, _MAX_STEP = 0.02, 0.05  # across them, in units of all that way
@@ -98,14 +99,14 @@ def bifurcation_curves(
     Raises:
         ValueError: No map of labels over two parameters that its orbits depend on, or one without periodic cells.
     """
-    max_rounds = checks.whole("max_rounds", max_rounds, 0, 1000)
-    max_seconds = checks.real("max_seconds", max_seconds, "a positive number", lambda x: x > 0)
+    max_rounds, max_seconds = check_budget(max_rounds, max_seconds)
     round_borders = checks.whole("round_borders", round_borders, 1, 10_000)
     max_points, settings = checks.whole("max_points", max_points, 2, 10**6), check_settings(settings)
+    tell = checks.function("progress", progress)
     plane = labelled_plane(dataset)
     device = device_of(dataset) if device is None else one_device(device)
     beside = limit_borders(plane) if checks.flag("limits", limits) else borders(plane)[:0]
-    search = _Search(plane, device, max_points, settings, checks.function("progress", progress))
+    search = _Search(plane, device, max_points, settings, tell)
     try:
         ended = search.run(max_rounds, round_borders, beside, time.monotonic() + max_seconds)
     except KeyboardInterrupt:
@@ -113,6 +114,12 @@ def bifurcation_curves(
     left = search.left
     where = plane.places(left), plane.places(largest_piece(left))
     return MapCurves(plane.along, search.found, search.borders, search.borders - len(left), *where, ended)
+
+
+def check_budget(max_rounds: int = 8, max_seconds: float = math.inf) -> tuple[int, float]:
+    """Take the rounds and the seconds that a search may spend."""
+    rounds = checks.whole("max_rounds", max_rounds, 0, _MOST_ROUNDS)
+    return rounds, checks.real("max_seconds", max_seconds, "a positive number", lambda x: x > 0)
 
 
 class _Search:

@@ -61,7 +61,8 @@ def curves_about(
             begin, along, plane[along], device=own, points=_BRANCH_POINTS, settings=settings
         )
         met = [*branch.points, *limit_points([branch], device=own)]
-        places = [tuple({along: point.value, other: value}[name] for name in plane) for point in met]
+        first = along == next(iter(plane))
+        places = [(point.value, value) if first else (value, point.value) for point in met]
         starts = [
             limit_start(point, place, tuple(plane), device, settings.asymmetry)
             if point.kind in LIMITS

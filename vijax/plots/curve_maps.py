@@ -124,7 +124,9 @@ def draw_curves(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: boo
         one = dataset.isel(curve=index)
         kind, stable = str(one["kind"].item()), one["stable"].values == 1
         across, up = one[x].values, one[y].values
-        for shown, style in ((stable, {"linewidth": 1.2}), (~stable & unstable, {"linewidth": 0.8, "alpha": _FAINT})):
+        faint: dict[str, Any] = {"linewidth": 0.8, "alpha": _FAINT}
+        strong: dict[str, Any] = {"linewidth": 1.2}
+        for shown, style in ((stable, strong), (~stable & unstable, faint)):
             if (shown & np.isfinite(across)).any():
                 line = np.where(shown, across, np.nan)
                 if shown is stable:
