@@ -68,7 +68,7 @@ def test_a_map_may_be_drawn_with_its_curves(folder, capsys):
         (["--d", "0.2", "--kappa", "3:40:4"], "must have several values for curves; got kappa"),
         (
             ["--d", "0.2:0.3:4", "--kappa", "3", "--A", "1:2:3"],
-            "that the motion depends on must have several values for curves; got d",
+            "that the motion depends on, and nothing else, must have several values",
         ),
         (
             ["--d", "0.2:0.3:4", "--kappa", "3:40:4", "--v0=-1:1:3"],

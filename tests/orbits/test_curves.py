@@ -9,6 +9,7 @@ import xarray as xr
 
 import vijax
 from vijax.model.device import Harvester
+from vijax.model.energy import rigid_penetration
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
 from vijax.orbits import curve_rows, curves, limits, orbit_search, periodic, shooting, switching
@@ -170,8 +171,8 @@ def test_the_dataset_has_what_the_curves_have(found, tmp_path):
 def test_a_picture_has_a_line_a_kind_and_a_mark_a_point(found):
     table = vijax.curve_dataset(list(found.values()))
     figure = vijax.plots.curves(table, unstable=True)
-    drawn = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
-    assert len({line.get_color() for line in drawn}) == 3
+    drawn = {line.get_color() for line in figure.axes[0].lines if len(line.get_xdata()) > 1}
+    assert len(drawn - {"white"}) == 3  # white is the edge around each
     marks = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 1]
     # The flip's end and the point of the graze there are one place.
     assert len(marks) == len({point.kind + f"{point.values[0]:.4g}" for c in found.values() for point in c.points})
@@ -246,16 +247,31 @@ def test_rows_have_every_point_and_what_was_met(found, tmp_path):
 # --- limits ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_limit_of_penetration_is_where_the_impact_map_is_as_deep(met):
-    """The symmetric orbit's impacts are alike, and its speed is known: both sides of the limit are seen."""
-    device = Harvester(penetration_limit=8e-4)
+@pytest.fixture(scope="module")
+def limited():
+    """The symmetric orbit of rigid walls where its impacts are 1 mm deep: d and r along that curve, and the device."""
+    device = Harvester(penetration_limit=1e-3)
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
     start = periodic.solve(impact_pair([0.2], None, 0.5), half, jnp.array([[[0.15, 0.5, 0.0]]]))
-    branches = switching.family(start, "d", (0.1, 0.3), max_switches=0)
+    branches = switching.family(start, "d", (0.1, 0.3))[:1]
     points = vijax.limit_points(branches, device=device)
-    assert {point.kind for point in points} <= set(limits.LIMITS)
-    listed = curves.follow_curves(points, "d", {"d": (0.15, 0.35), "r": (0.3, 0.7)}, device=device)
-    (curve,) = (one for one in listed if one.kind == "penetration limit")
+    (point,) = (one for one in points if one.kind == "penetration limit")
+    (curve,) = curves.follow_curves([point], "d", {"d": (0.15, 0.35), "r": (0.3, 0.7)}, device=device)
+    return curve, device
+
+
+def test_a_limit_of_penetration_is_where_it_is_known_to_be(limited):
+    """Speed and gap of the orbit in closed form (physics.md, 1:1 at gamma 0); the depth is Eq. (35)'s."""
+    curve, device = limited
+    d, r = curve.values.T
+    speed = 1e-3 * float(device.omega0) / float(device.speed_unit) / np.asarray(rigid_penetration(jnp.asarray(r)))
+    cosine = -np.sqrt(1 - (0.5 * np.pi * (1 - r) * speed) ** 2)
+    np.testing.assert_allclose(d, 0.5 * (1 + r) * speed + 2 / np.pi**2 * cosine, rtol=0, atol=1e-12)
+    assert np.ptp(r) > 0.1
+
+
+def test_impacts_at_a_limit_are_flown_as_deep(limited):
+    curve, device = limited
     load = limits.loads(curve.orbit, device)["penetration limit"].max(axis=1)
     flown = np.asarray(curve.orbit.status) == Status.OK
     assert flown[1:-1].all()
@@ -263,16 +279,22 @@ def test_a_limit_of_penetration_is_where_the_impact_map_is_as_deep(met):
     assert (np.asarray(curve.orbit.residual) < 1e-12).all()
 
 
-def test_limits_of_the_energy_on_soft_walls_hold_and_end_at_bounds():
-    device = Harvester(s=0.2)
+def test_limits_on_soft_walls_hold_as_the_device_changes():
+    """Along omega units of length and energy change as well; both limits are flown by the impact map."""
+    device = Harvester(omega0=60.0, s=0.2)
     orbit = orbit_search.search(device.pair(), "RL", guesses=64)
-    branches = switching.family(orbit[:1], "omega", (2.5, 6.0), device=device, max_switches=0)
+    branches = switching.family(orbit[:1], "omega0", (20.0, 400.0), device=device, max_switches=0)
     points = vijax.limit_points(branches, device=device)
-    for curve in curves.follow_curves(points, "omega", {"omega": (2.5, 6.0), "omega0": (20.0, 400.0)}, device=device):
-        for index, name in enumerate(curve.along):
-            device = limits.device_at(device, name, curve.values[:, index, None])
-        load = limits.loads(curve.orbit, device)[curve.kind].max(axis=1)
-        np.testing.assert_allclose(load[np.asarray(curve.orbit.status) == Status.OK], 1, rtol=0, atol=1e-12)
+    listed = curves.follow_curves(points, "omega0", {"omega0": (20.0, 400.0), "omega": (2.8, 3.4)}, device=device)
+    assert {curve.kind for curve in listed} == set(limits.LIMITS)
+    for curve in listed:
+        omega0, omega = curve.values.T
+        here = limits.device_at(limits.device_at(device, "omega", omega[:, None]), "omega0", omega0[:, None])
+        load = limits.loads(curve.orbit, here)[curve.kind].max(axis=1)
+        flown = np.asarray(curve.orbit.status) == Status.OK
+        assert flown[1:-1].all()
+        np.testing.assert_allclose(load[flown], 1, rtol=0, atol=1e-12)
+        assert np.ptp(omega) > 0.1
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------

@@ -77,10 +77,11 @@ def check_map(planned: "SweepPlan") -> None:
     from vijax.orbits import map_borders
     from vijax.planes.dataset import asked, coordinates
 
-    if len(planned.cells.dynamic) != 2:
-        got = ", ".join(planned.cells.dynamic) or "none"
+    several = [name for name, size in planned.cells.sizes.items() if size > 1]
+    if len(several) != 2 or set(several) != set(planned.cells.dynamic):
         raise ValueError(
-            f"two of {', '.join(PARAMETERS)} that the motion depends on must have several values for curves; got {got}"
+            f"two of {', '.join(PARAMETERS)} that the motion depends on, and nothing else, must have several values "
+            f"for curves; got {', '.join(several) or 'none'}"
         )
     plane = xr.Dataset(coords=coordinates(planned.cells), attrs=asked(planned))
     map_borders.check_map(plane, planned.cells.dynamic)

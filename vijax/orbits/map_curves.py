@@ -84,7 +84,8 @@ def bifurcation_curves(
         dataset: What `vijax.sweep` returned, over two parameters, with period, impacts and status.
         device: Of the map, unless it says so itself: along "beta" g/A is read.
         max_rounds: Rounds, after the first look, at most; it ends sooner where one finds nothing.
-        max_seconds: After these nothing more is begun: neither a round nor another batch of curves.
+        max_seconds: After these nothing more is begun: no round, no batch of branches or of curves. What is under way is
+            finished, and may have to be compiled first.
         round_borders: Borders that are looked at in a round, drawn from all that are left.
         max_points: Most points of a curve each way.
         limits: Whether to follow also where orbits meet the penetration limit and the energy limit of the device,
@@ -167,9 +168,12 @@ class _Search:
     ) -> bool:
         """Follow orbits of cells along an axis each, and curves from what they meet; say whether time did for all."""
         plane, steepest = self._plane, float(self._device.g / self._device.A)
-        if time.monotonic() > deadline:
-            return False
-        return self._follow(seeds(plane, cells, ways, reach, steepest, _WHOLE_POINTS, steps), deadline)
+        starts: list[CurveStart] = []
+        for some in seeds(plane, cells, ways, reach, steepest, _WHOLE_POINTS, steps):
+            starts += some
+            if time.monotonic() > deadline:
+                return False
+        return self._follow(starts, deadline)
 
     def _look_at_limits(self, order: np.ndarray, beside: Borders, round_borders: int, deadline: float) -> bool:
         """Follow limits from cells beside them until a curve lies at each; say whether time did for all."""

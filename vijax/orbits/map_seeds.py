@@ -1,5 +1,6 @@
 """What the orbits of some cells of a map meet along one of its axes: where curves over the map begin."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -35,8 +36,8 @@ def seeds(
     steepest: float,
     max_points: int,
     settings: ContinuationSettings,
-) -> list[CurveStart]:
-    """Find the bifurcations that the orbits of some cells meet, each along an axis of the map.
+) -> Iterator[list[CurveStart]]:
+    """Find the bifurcations that the orbits of some cells meet, each along an axis of the map, in several parts.
 
     Args:
         plane: The map.
@@ -56,12 +57,11 @@ def seeds(
                 if some.any():
                     key = way, orbit.knots.shape[1]
                     groups.setdefault(key, []).append((orbit[np.flatnonzero(some)], mine[rows[some]]))
-    found = []
+        yield []  # Whoever counts the seconds may stop here.
     for (way, _), parts in groups.items():
         orbit = periodic.concatenate([part for part, _ in parts])
         where = cells[np.concatenate([rows for _, rows in parts])]
-        found += _met(plane, orbit, where, way, reach, steepest, max_points, settings)
-    return found
+        yield _met(plane, orbit, where, way, reach, steepest, max_points, settings)
 
 
 def limit_seeds(plane: LabelledPlane, cells: np.ndarray, device: Harvester) -> list[CurveStart]:

@@ -90,7 +90,7 @@ def _ground(over: "xr.Dataset", names: list[str], ground: str) -> tuple[Figure, 
     checks.variables("over", over, ("period",), "vijax.sweep")
     checks.choice("ground", ground, ["label", *map(str, over)])
     over = over.squeeze()
-    dims = [str(dim) for dim in over["period"].dims]
+    dims = [str(dim) for dim in over["period" if ground == "label" else ground].dims]
     if set(dims) != set(names):
         got = ", ".join(dims) or "none"
         raise ValueError(f"over must be a map over {names[0]} and {names[1]} alone; got one over {got}")
