@@ -84,8 +84,8 @@ def bifurcation_curves(
         dataset: What `vijax.sweep` returned, over two parameters, with period, impacts and status.
         device: Of the map, unless it says so itself: along "beta" g/A is read.
         max_rounds: Rounds, after the first look, at most; it ends sooner where one finds nothing.
-        max_seconds: After these nothing more is begun: no round, no batch of branches or of curves. What is under way is
-            finished, and may have to be compiled first.
+        max_seconds: After these nothing more is begun: no round, no batch of branches or of curves. What is under way
+            is finished, and may have to be compiled first.
         round_borders: Borders that are looked at in a round, drawn from all that are left.
         max_points: Most points of a curve each way.
         limits: Whether to follow also where orbits meet the penetration limit and the energy limit of the device,
