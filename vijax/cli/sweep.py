@@ -64,6 +64,8 @@ def power_map(
         over, told = _curves(dataset)
         said += f"\n{told}"
     finish(dataset, said, out, plot, partial(_draw, show, over), overwrite, kept=True)
+    if over is not None and over.attrs["ended"] == "stopped":
+        process.stop("the map and the curves found until then are kept")
 
 
 def _check_curves(planned: "SweepPlan", plot: Path | None) -> None:

@@ -167,7 +167,8 @@ class CurvePath(eqx.Module):
             push = -self.touch.wall * flow.acceleration(pair.gamma, leave + y[-3])
         elif self.device is not None:
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
-            loads, here = self._loads(self.device, y[-2:], pair, knots), jnp.arange(knots.shape[0]) == self.touch.impact
+            loads = self._loads(self.device, y[-2:], pair, knots)
+            here = jnp.arange(knots.shape[0], dtype=jnp.int32) == self.touch.impact
             push = loads[self.touch.impact] - jnp.where(here, 0.0, loads).max()
         else:
             cubic = jnp.where(self.multiplier > 0, one, cubic_coefficient(pair, self.sequence, knots))

@@ -107,7 +107,7 @@ def bifurcation_curves(
     plane = labelled_plane(dataset)
     device = device_of(dataset) if device is None else one_device(device)
     beside = limit_borders(plane) if checks.flag("limits", limits) else borders(plane)[:0]
-    search = _Search(plane, device, max_points, settings, tell)
+    search = _CurveSearch(plane, device, max_points, settings, tell)
     try:
         ended = search.run(max_rounds, round_borders, beside, time.monotonic() + max_seconds)
     except KeyboardInterrupt:
@@ -123,7 +123,7 @@ def check_budget(max_rounds: int = 8, max_seconds: float = math.inf) -> tuple[in
     return rounds, checks.real("max_seconds", max_seconds, "a positive number", lambda x: x > 0)
 
 
-class _Search:
+class _CurveSearch:
     """A search for the curves over a map: what it has found so far, and the borders that are left."""
 
     def __init__(
