@@ -175,7 +175,8 @@ class CurvePath(eqx.Module):
         room = grazing.between(pair, self.sequence, knots, touch).clearance
         z = y[-2:]
         return CurveTests(
-            turn=(tangent[-2:] @ former[-2:]) / jnp.linalg.norm(former[-2:]),
+            # Where a limit turns back its orbit has met its mirror image or has doubled, which `push` says.
+            turn=(tangent[-2:] @ former[-2:]) / jnp.linalg.norm(former[-2:]) if self.device is None else one,
             cubic=cubic,
             plus=plus,
             minus=minus,

@@ -31,6 +31,8 @@ class NumberedPoint(NamedTuple):
 def numbered_points(dataset: "xr.Dataset") -> list[NumberedPoint]:
     """List the points of codimension 2 of curves, each place once, from the first curve to the last.
 
+    What curves of limits meet is left out: a limit crosses bifurcations wherever it goes.
+
     Args:
         dataset: What `vijax.curve_dataset` returned.
     """
@@ -41,7 +43,7 @@ def numbered_points(dataset: "xr.Dataset") -> list[NumberedPoint]:
     columns = [dataset["event"].values.flat, *(dataset[f"event_{name}"].values.flat for name in names)]
     for kind, x, y in zip(*columns, strict=True):
         place = float(x), float(y)
-        if kind and not any(one.kind == kind and _near(one.place, place, sides) for one in found):
+        if kind and not kind.endswith("limit") and not any(one.kind == kind and _near(one.place, place, sides) for one in found):
             found.append(NumberedPoint(len(found) + 1, str(kind), place))
     return found
 
