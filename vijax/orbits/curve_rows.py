@@ -43,7 +43,8 @@ def numbered_points(dataset: "xr.Dataset") -> list[NumberedPoint]:
     columns = [dataset["event"].values.flat, *(dataset[f"event_{name}"].values.flat for name in names)]
     for kind, x, y in zip(*columns, strict=True):
         place = float(x), float(y)
-        if kind and not kind.endswith("limit") and not any(one.kind == kind and _near(one.place, place, sides) for one in found):
+        known = any(one.kind == kind and _near(one.place, place, sides) for one in found)
+        if kind and not known and not kind.endswith("limit"):
             found.append(NumberedPoint(len(found) + 1, str(kind), place))
     return found
 
