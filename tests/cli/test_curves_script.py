@@ -44,7 +44,7 @@ SEARCH = map_curves.bifurcation_curves
 
 
 def test_ctrl_c_keeps_what_was_found_and_says_so(folder, capsys, monkeypatch):
-    assert grid.main([*PLANE, "--out", "map.zarr"]) == 0
+    assert grid.main([*PLANE, "--kappa", "400", "--out", "map.zarr"]) == 0
     monkeypatch.setattr(map_curves, "bifurcation_curves", stopped)
     assert script.main(["--map", "map.zarr", "--out", "curves.zarr"]) == 130
     out, err = capsys.readouterr()
@@ -54,7 +54,7 @@ def test_ctrl_c_keeps_what_was_found_and_says_so(folder, capsys, monkeypatch):
 
 
 def test_a_map_may_be_drawn_with_its_curves(folder, capsys):
-    assert grid.main([*PLANE, "--show", "label", "--curves", "--plot", "labels.png"]) == 0
+    assert grid.main([*PLANE, "--kappa", "400", "--show", "label", "--curves", "--plot", "labels.png"]) == 0
     assert "within a cell of a curve" in capsys.readouterr().out
     assert is_drawn(folder / "labels.png")
 

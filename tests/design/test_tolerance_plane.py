@@ -28,7 +28,11 @@ def plane():
 
 def test_the_nearest_bifurcation_is_where_a_branch_meets_it(plane):
     near = plane.nearest
+    # Of the two folds that meet in a cusp beside the optimum, the one below it in omega0 is its own orbit's; the other
+    # one, which is nearer, is that of another orbit, and within the tolerances the motion lasts.
     assert near.kind == "fold"
+    assert near.percent[0] < 0 < near.percent[1]
+    assert near.times > 1
     away = [abs(off) / (100 * one.spread) for off, one in zip(near.percent, BOTH, strict=True)]
     assert max(away) == pytest.approx(near.times, rel=1e-9)
     # Along omega0 alone the fold is 7.8 % off; where the gap may be off too, it is nearer.
@@ -67,7 +71,8 @@ def test_the_report_says_how_far_it_is(plane):
 )
 def test_the_box_of_the_tolerances_meets_a_piece_where_it_first_reaches_it(piece, place):
     begin, step = (np.array([row]) for row in piece)
-    at, times = tolerance_plane._closest(begin, step)
+    at, times, which = tolerance_plane._closest(begin, step)
+    assert which == 0
     dense = begin + np.linspace(0, 1, 10_001)[:, None] * step
     assert times == pytest.approx(np.abs(dense).max(axis=1).min(), abs=1e-3)
     assert np.abs(at).max() == pytest.approx(max(map(abs, place)), abs=1e-12)

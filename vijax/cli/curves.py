@@ -15,6 +15,7 @@ from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
 from vijax.cli.sweep import PLANE, complete_outputs, plane_options
 from vijax.cli.targets import targets
+from vijax.model.quantities import AXES
 from vijax.planes.sweep_settings import SweepSettings
 
 if TYPE_CHECKING:
@@ -43,10 +44,10 @@ class CurvesRequest:
 
 
 def bifurcations(overwrite: bool, yes: bool, **given: Any) -> None:
-    """Find the curves of bifurcations over a map, and what of codimension 2 they meet.
+    """Find the curves of bifurcations over a map.
 
-    The map is that of a store, or is run first: over two parameters that the motion depends on. Ctrl-C ends the search
-    for curves, and keeps those found until then.
+    The map is that of a store, or is run first: over two parameters that the motion depends on. What the curves meet of
+    codimension 2 is listed. Ctrl-C ends the search for them, and keeps those found until then.
     """
     with process.door():
         asked = _asked(overwrite, given)
@@ -105,7 +106,9 @@ def _planned(given: dict[str, Any]) -> "tuple[SweepPlan, list[str]]":
     from vijax.planes.outputs import ON_REQUEST, OUTPUTS
     from vijax.planes.sweep import check_room, plan
 
-    axes, made = take_axes(given, PLANE), device(given.pop("constants"))
+    # Where two others have several values d and kappa are the device's.
+    several = [name for name in AXES if set(given[name] or "") & set(":,@")]
+    axes, made = take_axes(given, PLANE if len(several) < 2 else {}), device(given.pop("constants"))
     outputs = [name for name in OUTPUTS if name not in ON_REQUEST or name == "lyapunov"]
     planned = plan(axes, outputs, made, SweepSettings(**given))
     check_room(planned)

@@ -1,13 +1,19 @@
 """What bounds an optimum in the plane of two tolerances: the curves there, and how far the nearest of them is."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vijax.design.optimum import Optimum
 from vijax.design.tolerance import Tolerance, check_tolerances
+from vijax.model.device import with_constants
 from vijax.model.quantities import QUANTITIES
+from vijax.model.records import Status
+from vijax.orbits import curves, periodic
 from vijax.orbits.curves import BifurcationCurve
 from vijax.orbits.limits import LIMITS
 from vijax.orbits.orbit_curves import curves_about
@@ -17,6 +23,11 @@ from vijax.runtime.context import door
 
 _TIMES = 3.0  # The plane reaches so many times the tolerances to either side, and at least `_REACH` of the values.
 _REACH, _MOST = 0.2, 0.9
+# Parts of the way to a curve by which an orbit goes there: beside a fold it moves by the root of what is left.
+_SHARES = (*np.linspace(0.1, 0.9, 9), 0.97, 0.99, 0.997, 0.999, 0.9997, 0.9999)
+# How near its traits then are to those of the curve's orbit, at whose fold it would be: the root of 1e-4 times a bend
+# of order one. Another orbit's differ by as much as the two are apart.
+_ALIKE = 0.1
 
 
 class NearestPoint(NamedTuple):
@@ -42,8 +53,8 @@ class TolerancePlane(NamedTuple):
         tolerances: Both.
         here: The optimum's constants.
         within: Bounds of the plane.
-        curves: Of bifurcations and limits of its orbit.
-        nearest: Of all bifurcations that a stable orbit meets; None where there is none in the plane.
+        curves: Of bifurcations and limits of its orbit, beyond their cusps of others that coexist.
+        nearest: Of all bifurcations that it meets on the straight way there; None where there is none in the plane.
         limit: Of the limits of penetration and energy.
     """
 
@@ -70,12 +81,12 @@ def tolerance_plane(optimum: Optimum, tolerances: Sequence[Tolerance]) -> Tolera
     one, other = check_pair(tolerances)
     here = float(getattr(optimum.device, one.name)), float(getattr(optimum.device, other.name))
     within = {t.name: _about(t, x) for t, x in zip((one, other), here, strict=True)}
-    curves = curves_about(optimum.orbit, within, device=optimum.device)
+    found = curves_about(optimum.orbit, within, device=optimum.device)
     spread = one.spread, other.spread
-    bifurcations = [curve for curve in curves if curve.kind not in LIMITS]
-    limits = [curve for curve in curves if curve.kind in LIMITS]
-    found = _nearest(bifurcations, here, spread), _nearest(limits, here, spread)
-    return TolerancePlane((one, other), here, within, curves, *found)
+    bifurcations = [curve for curve in found if curve.kind not in LIMITS]
+    limits = [curve for curve in found if curve.kind in LIMITS]
+    found_of = _nearest(bifurcations, optimum, spread), _nearest(limits, optimum, spread)
+    return TolerancePlane((one, other), here, within, found, *found_of)
 
 
 def check_pair(tolerances: Sequence[Tolerance]) -> tuple[Tolerance, Tolerance]:
@@ -94,28 +105,61 @@ def _about(of: Tolerance, x: float) -> tuple[float, float]:
     return x * (1 - reach), min(x * (1 + reach), 1.0) if of.name == "r" else x * (1 + reach)
 
 
-def _nearest(
-    curves: list[BifurcationCurve], here: tuple[float, float], spread: tuple[float, float]
-) -> NearestPoint | None:
-    """Find the point that the box of the tolerances reaches first as it grows."""
-    best: NearestPoint | None = None
-    middle, unit = np.array(here), np.array(here) * spread
-    for curve in curves:
-        place = (curve.values - middle) / unit
-        begin, step = place[:-1], np.diff(place, axis=0)
-        kept = curve.stable[:-1] & curve.stable[1:]
-        if not kept.any():
-            continue
-        at, times = _closest(begin[kept], step[kept])
-        if best is None or times < best.times:
-            x, y = (float(value) for value in middle + at * unit)
-            percent = 100 * (x / here[0] - 1), 100 * (y / here[1] - 1)
-            best = NearestPoint(curve.kind, (x, y), percent, times)
-    return best
+def _nearest(found: list[BifurcationCurve], optimum: Optimum, spread: tuple[float, float]) -> NearestPoint | None:
+    """Find the point that the box of the tolerances reaches first as it grows, of those that the optimum's orbit meets.
+
+    Past a cusp a curve is that of another orbit, which coexists with the optimum's.
+    """
+    candidates = [piece for curve in found for piece in _pieces(curve, optimum, spread)]
+    for piece in sorted(candidates, key=lambda one: one.point.times):
+        if _meets(optimum, piece):
+            return piece.point
+    return None
 
 
-def _closest(begin: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float]:
-    """Find the place on straight pieces whose larger coordinate is least, and that coordinate.
+class _Piece(NamedTuple):
+    """A curve between two of its cusps: its point that is nearest, and its orbit next to there."""
+
+    curve: BifurcationCurve
+    index: int
+    point: NearestPoint
+
+
+def _pieces(curve: BifurcationCurve, optimum: Optimum, spread: tuple[float, float]) -> Iterator[_Piece]:
+    """Find the nearest point of every piece of a curve on which stable orbits border."""
+    here = np.array([float(getattr(optimum.device, name)) for name in curve.along])
+    unit = here * spread
+    place = (curve.values - here) / unit
+    begin, step = place[:-1], np.diff(place, axis=0)
+    kept = curve.stable[:-1] & curve.stable[1:]
+    cusps = [np.array(point.values) for point in curve.points if point.kind == "cusp"]
+    cuts = sorted(int(np.abs((curve.values - cusp) / unit).max(axis=1).argmin()) for cusp in cusps)
+    for first, last in pairwise([0, *cuts, len(begin)]):
+        mine = np.arange(first, last)[kept[first:last]]
+        if mine.size:
+            at, times, which = _closest(begin[mine], step[mine])
+            x, y = (float(value) for value in here + at * unit)
+            percent = 100 * (x / float(here[0]) - 1), 100 * (y / float(here[1]) - 1)
+            yield _Piece(curve, int(mine[which]), NearestPoint(curve.kind, (x, y), percent, times))
+
+
+def _meets(optimum: Optimum, piece: _Piece) -> bool:
+    """Say whether the optimum's orbit, as its device moves straight to a point of a curve, becomes that curve's."""
+    along, orbit = piece.curve.along, optimum.orbit
+    here = [float(getattr(optimum.device, name)) for name in along]
+    for share in _SHARES:
+        moved = {name: a + share * (b - a) for name, a, b in zip(along, here, piece.point.values, strict=True)}
+        pair = jax.tree.map(lambda x: jnp.asarray(x, float)[None], with_constants(optimum.device, **moved).pair())
+        orbit = periodic.solve(pair, orbit.sequence, jnp.nan_to_num(orbit.knots))
+        if int(orbit.status[0]) == Status.NO_ORBIT:
+            return False
+    own = curves.traits(orbit, images=True)
+    theirs = curves.traits(piece.curve.orbit[piece.index : piece.index + 2])
+    return bool(min(np.abs(one - other).max() for one in own for other in theirs) < _ALIKE)
+
+
+def _closest(begin: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float, int]:
+    """Find the place on straight pieces whose larger coordinate is least, that coordinate, and on which piece it is.
 
     On a piece it is at an end, where a coordinate is zero, or where both are as large.
     """
@@ -126,4 +170,4 @@ def _closest(begin: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float]:
     places = begin + shares[..., None] * step
     size = np.abs(places).max(axis=-1)
     which = np.unravel_index(size.argmin(), size.shape)
-    return places[which], float(size[which])
+    return places[which], float(size[which]), int(which[1])

@@ -195,7 +195,7 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
             path, place = jax.tree.map(lambda leaf, i=index: leaf[i], (paths, first))
             if good:
                 start = _moved(batch[index], path, place.y) if limit else batch[index]
-                lanes.append(_Lane(start, _traits(start.orbit, images=True), path, place))
+                lanes.append(_Lane(start, traits(start.orbit, images=True), path, place))
             else:
                 lost.append(batch[index])
     if lost:
@@ -215,7 +215,7 @@ def _moved(start: CurveStart, path: CurvePath, y: np.ndarray) -> CurveStart:
 
 def unmet(lanes: list[_Lane], curves: list[BifurcationCurve], plane: Plane) -> list[_Lane]:
     """Keep the starts that lie on none of the curves, nor do their mirror images."""
-    paths = [(one.kind, np.column_stack([_traits(one.orbit), units(one.values, plane)])) for one in curves]
+    paths = [(one.kind, np.column_stack([traits(one.orbit), units(one.values, plane)])) for one in curves]
 
     def lies(lane: _Lane) -> bool:
         place = units(np.array(lane.start.place), plane)
@@ -235,7 +235,7 @@ def _family(start: CurveStart) -> tuple:
     return start.kind, float(sequence.span[0]), bool(sequence.mirrored[0]), *walls
 
 
-def _traits(orbit: Orbit, images: bool = False) -> Traits:
+def traits(orbit: Orbit, images: bool = False) -> Traits:
     """Give numbers that tell orbits apart, whichever impact they begin with; those of their mirror images, too."""
     host = jax.tree.map(np.asarray, orbit)
     side, knots = host.sequence.side, host.knots

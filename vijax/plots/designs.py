@@ -12,6 +12,7 @@ from vijax.design.report import factors
 from vijax.design.report_lines import amount
 from vijax.design.tolerance_plane import TolerancePlane
 from vijax.design.variables import LINEAR, constant
+from vijax.model.quantities import AXES
 from vijax.model.units import UNITS
 from vijax.orbits.curve_dataset import curve_dataset
 from vijax.plots.curve_maps import draw_curves, kind_handles
@@ -96,7 +97,7 @@ def _in_plane(axes: Axes, plane: TolerancePlane) -> list[Any]:
         if found is not None:
             axes.plot(*found.values, zorder=5, linestyle="none", **_TIP)
     axes.plot(across, up, zorder=6, linestyle="none", **_STAR)
-    axes.set(xlim=plane.within[x], ylim=plane.within[y], xlabel=_named(x), ylabel=_named(y))
+    axes.set(xlim=plane.within[x], ylim=plane.within[y], xlabel=_symbol(x), ylabel=_symbol(y))
     tip = Line2D([], [], linestyle="none", label="nearest bifurcation, limit", **_TIP)
     return [*kind_handles(kinds), *([tip] if plane.nearest or plane.limit else [])]
 
@@ -269,6 +270,11 @@ def _holding(best: dict[str, Any]) -> str:
     if best["active"]:
         return best["active"][0].split()[0]
     return "" if best["stopped"] == "maximum" else "unsettled"
+
+
+def _symbol(name: str) -> str:
+    about = AXES[name].attributes
+    return f"${about['symbol']}$" + (f" [{UNITS[name]}]" if name in UNITS else "")
 
 
 def _named(name: str) -> str:
