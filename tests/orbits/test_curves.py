@@ -340,6 +340,38 @@ def energy_only(dataset):
     return dataset.isel(r=0, drop=True).assign(P=(("d", "A"), np.ones((9, 2)))).assign_coords(A=[1.0, 2.0])
 
 
+def test_curves_lie_where_they_are_whichever_axis_of_the_map_is_across(found):
+    table, over = vijax.curve_dataset(list(found.values())), made_map().assign_attrs(periods=40)
+    seen = []
+    for plane in (over, over.transpose("r", "d")):
+        axes = vijax.plots.curves(table, plane, ground="label").axes[0]
+        marks = [np.ravel(line.get_data()) for line in axes.lines if len(line.get_xdata()) == 1]
+        seen.append(marks if axes.get_xlabel() == "$d$" else [mark[::-1] for mark in marks])
+    assert len(seen[0]) == 3
+    np.testing.assert_array_equal(*seen)
+
+
+def test_grazings_of_unstable_orbits_are_drawn_on_request(found):
+    table = vijax.curve_dataset([found["grazing"]])
+    faint = [
+        {line.get_alpha() for line in vijax.plots.curves(table, unstable=wanted).axes[0].lines}
+        for wanted in (False, True)
+    ]
+    assert (len(faint[0]), len(faint[1])) == (1, 2)
+
+
+def test_a_map_that_curves_cannot_lie_over_is_told(found):
+    table = vijax.curve_dataset(list(found.values()))
+    for over, ground, message in (
+        (made_map(), "mass", "ground must be among"),
+        (made_map().rename(r="gamma_"), "label", "over must be a map over d and r alone"),
+        (made_map().isel(r=0), "label", "over must be a map over d and r alone; got one over d"),
+        (3, "label", "over must be a dataset"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vijax.plots.curves(table, over, ground=ground)
+
+
 @pytest.mark.parametrize(
     ("dataset", "message"),
     [
