@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from vijax.model.device import Harvester, one_device
+from vijax.model.records import Status
 from vijax.orbits import continuation
 from vijax.orbits.continuation import Branch
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
@@ -77,8 +78,9 @@ def curves_about(
         starts += found
         for part in _ASIDE:
             index = int(part * (len(branch.values) - 1))
-            _, found = followed(branch.orbit[index : index + 1], other, along, float(branch.values[index]))
-            starts += found
+            aside = branch.orbit[index : index + 1]
+            if int(aside.status[0]) == Status.OK:
+                starts += followed(aside, other, along, float(branch.values[index]))[1]
     with warnings.catch_warnings():
         # Where a ball just no longer flies nothing begins.
         warnings.filterwarnings("ignore", message=".* begin no curve")
