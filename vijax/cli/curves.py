@@ -57,14 +57,14 @@ def bifurcations(overwrite: bool, yes: bool, **given: Any) -> None:
     labelled, lines = _run(asked.map)
     found, said = search(labelled, asked.budget)
     lines.append(said)
-    if not found.curves:
-        click.echo("\n".join([*lines, *summary(found), "nothing was written"]))
-        return
-    from vijax.orbits.curve_dataset import curve_dataset
+    if found.curves:
+        from vijax.orbits.curve_dataset import curve_dataset
 
-    dataset = curve_dataset(found)
-    _write(dataset, labelled, asked, overwrite)
-    close("\n".join([*lines, *summary(found, dataset)]), *asked.files)
+        dataset = curve_dataset(found)
+        _write(dataset, labelled, asked, overwrite)
+        close("\n".join([*lines, *summary(found, dataset)]), *asked.files)
+    else:
+        click.echo("\n".join([*lines, *summary(found), "nothing was written"]))
     if found.ended == "stopped":
         process.stop(f"the {how_many(len(found.curves), 'curves')} found until then are kept")
 

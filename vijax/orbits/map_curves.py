@@ -13,6 +13,7 @@ from vijax.model.device import Harvester, one_device
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.curve_starts import CurveStart
 from vijax.orbits.curves import BifurcationCurve, curves_from
+from vijax.orbits.limits import LIMITS
 from vijax.orbits.map_borders import (
     Borders,
     LabelledPlane,
@@ -196,7 +197,8 @@ class _CurveSearch:
             known = [*self.found]
             for some in curves_from(starts, plane.bounds, self._device, self._max_points, self._settings, known):
                 self.found += some
-                for curve in some:
+                # Where a limit is met the label stays.
+                for curve in (one for one in some if one.kind not in LIMITS):
                     self.left = self.left[~near(self.left, curve.values, plane)]
                 self._tell()
                 if time.monotonic() > deadline:
