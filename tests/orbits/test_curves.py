@@ -260,14 +260,32 @@ def limited():
     return curve, device
 
 
+def deep_gap(r):
+    """Give the gap at which the symmetric orbit's impacts are 1 mm deep at kappa = 400, A = 1 and omega = pi.
+
+    Speed and gap in closed form (physics.md, 1:1 at gamma 0); the depth is Eq. (35)'s.
+    """
+    speed = 1e-3 * 400 / np.asarray(rigid_penetration(jnp.asarray(r)))
+    return 0.5 * (1 + r) * speed - 2 / np.pi**2 * np.sqrt(1 - (0.5 * np.pi * (1 - r) * speed) ** 2)
+
+
 def test_a_limit_of_penetration_is_where_it_is_known_to_be(limited):
-    """Speed and gap of the orbit in closed form (physics.md, 1:1 at gamma 0); the depth is Eq. (35)'s."""
-    curve, device = limited
+    curve, _ = limited
     d, r = curve.values.T
-    speed = 1e-3 * float(device.omega0) / float(device.speed_unit) / np.asarray(rigid_penetration(jnp.asarray(r)))
-    cosine = -np.sqrt(1 - (0.5 * np.pi * (1 - r) * speed) ** 2)
-    np.testing.assert_allclose(d, 0.5 * (1 + r) * speed + 2 / np.pi**2 * cosine, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(d, deep_gap(r), rtol=0, atol=1e-12)
     assert np.ptp(r) > 0.1
+
+
+def test_limits_of_a_map_begin_at_its_cells():
+    dataset = made_map()
+    within = dataset["d"].values[:, None] < deep_gap(dataset["r"].values)
+    told = dataset.assign(admissible=(("d", "r"), within)).assign_attrs(harvester_penetration_limit=1e-3)
+    found = vijax.bifurcation_curves(told, max_rounds=0, limits=True)
+    listed = [one for one in found.curves if one.kind == "penetration limit" and one.orbit.sequence.mirrored[0]]
+    (curve,) = listed
+    d, r = curve.values.T
+    np.testing.assert_allclose(d, deep_gap(r), rtol=0, atol=1e-12)
+    assert found.explained == vijax.bifurcation_curves(told, max_rounds=0).explained
 
 
 def test_impacts_at_a_limit_are_flown_as_deep(limited):
