@@ -121,7 +121,7 @@ class _Piece(NamedTuple):
     """A curve between two of its cusps: its point that is nearest, and its orbit next to there."""
 
     curve: BifurcationCurve
-    index: int
+    place: int
     point: NearestPoint
 
 
@@ -154,7 +154,7 @@ def _meets(optimum: Optimum, piece: _Piece) -> bool:
         if int(orbit.status[0]) == Status.NO_ORBIT:
             return False
     own = curves.traits(orbit, images=True)
-    theirs = curves.traits(piece.curve.orbit[piece.index : piece.index + 2])
+    theirs = curves.traits(piece.curve.orbit[piece.place : piece.place + 2])
     return bool(min(np.abs(one - other).max() for one in own for other in theirs) < _ALIKE)
 
 
