@@ -205,9 +205,9 @@ def test_a_search_without_time_says_what_is_left():
     found = vijax.bifurcation_curves(dataset, max_seconds=1e-9, progress=lambda *step: told.append(step))
     assert (found.curves, found.explained, found.ended) == ([], 0, "seconds")
     assert told == [(0, found.borders)]
-    assert found.unexplained.shape == (found.borders, 2)
+    assert found.left.shape == (found.borders, 2)
     # They lie half way between cells of the pitchfork's two sides, all in one piece.
-    away = found.unexplained[:, 0] - pitchfork(found.unexplained[:, 1])
+    away = found.left[:, 0] - pitchfork(found.left[:, 1])
     assert np.abs(away).max() < 0.0125
     assert len(found.largest) == found.borders
 
@@ -222,7 +222,7 @@ def test_ctrl_c_keeps_the_curves_found_until_then():
     assert found.curves
     assert 0 < found.explained <= found.borders
     table = vijax.curve_dataset(found)
-    assert (table.attrs["ended"], table.sizes["border"]) == ("stopped", len(found.unexplained))
+    assert (table.attrs["ended"], table.sizes["border"]) == ("stopped", len(found.left))
 
 
 def test_rows_have_every_point_and_what_was_met(found, tmp_path):

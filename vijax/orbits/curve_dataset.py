@@ -37,7 +37,7 @@ def curve_dataset(curves: list[BifurcationCurve] | MapCurves) -> "xr.Dataset":
         `stable`; over curve `kind`, the `label` of its orbits, `end_first`, `end_last`; over (curve, event) what of
         codimension 2 was met: `event`, the grazing that ends the curve there as `event_test`, both parameters as
         `event_` and their name, and the `event_residual` there. Of a map, over border, where those are that no curve
-        explains, as `unexplained_` and the parameters' names, and as attributes `borders`, `explained` and `ended`.
+        explains, as `left_` and the parameters' names, and as attributes `borders`, `explained` and `ended`.
 
     Raises:
         ValueError: No curves, or curves of several planes.
@@ -101,10 +101,7 @@ def _constants(curve: BifurcationCurve) -> dict[str, tuple]:
 def _with_borders(dataset: "xr.Dataset", of: MapCurves) -> "xr.Dataset":
     """Add what the curves explain of their map."""
     names = dataset.attrs["along"].split()
-    places = {
-        f"unexplained_{name}": ("border", of.unexplained[:, index], AXES[name].attributes)
-        for index, name in enumerate(names)
-    }
+    places = {f"left_{name}": ("border", of.left[:, index], AXES[name].attributes) for index, name in enumerate(names)}
     return dataset.assign(places).assign_attrs(borders=of.borders, explained=of.explained, ended=of.ended)
 
 

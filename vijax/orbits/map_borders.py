@@ -49,11 +49,6 @@ class LabelledPlane:
         """Give the bounds of the plane."""
         return {name: (float(axis[0]), float(axis[-1])) for name, axis in zip(self.along, self.axes, strict=True)}
 
-    def places(self, found: "Borders") -> np.ndarray:
-        """Give both parameters at borders, half way between the cells that they part, a row a border."""
-        steps = [np.arange(len(axis)) for axis in self.axes]
-        return np.stack([np.interp(found.middle[:, i], steps[i], self.axes[i]) for i in (0, 1)], axis=1)
-
 
 def device_of(dataset: "xr.Dataset") -> Harvester:
     """Read the device of a map, as far as the map says; along its axes it is that of the first cell."""
@@ -140,6 +135,21 @@ class Borders:
     def middle(self) -> np.ndarray:
         """Give the places of the borders in cells, a row each."""
         return self.cell + 0.5 * np.eye(2)[self.axis]
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """Give the cells behind the borders, a row each."""
+        return self.cell + np.eye(2, dtype=int)[self.axis]
+
+    @property
+    def number(self) -> np.ndarray:
+        """Number the borders of a map: no two have one number."""
+        return (self.cell[:, 0] << 32) + 2 * self.cell[:, 1] + self.axis
+
+    def places(self, plane: LabelledPlane) -> np.ndarray:
+        """Give both parameters half way between the cells, a row each."""
+        middle = self.middle
+        return np.stack([np.interp(middle[:, i], np.arange(len(x)), x) for i, x in enumerate(plane.axes)], axis=1)
 
     def __getitem__(self, index: Any) -> "Borders":
         """Pick some."""

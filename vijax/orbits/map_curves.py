@@ -48,7 +48,7 @@ class MapCurves(NamedTuple):
         curves: Each once.
         borders: How many pairs of neighbouring periodic cells of the map differ in their label.
         explained: How many of these lie within one cell of a curve.
-        unexplained: Where the others are, by both parameters, a row a border.
+        left: Both parameters at the others, a row each.
         largest: Those of them that are the longest chain of neighbours.
         ended: Why the search for more came to its end: all borders are "explained", each of the others was "tried",
             "rounds" or "seconds" were spent, or it was "stopped" by Ctrl-C.
@@ -58,7 +58,7 @@ class MapCurves(NamedTuple):
     curves: list[BifurcationCurve]
     borders: int
     explained: int
-    unexplained: np.ndarray
+    left: np.ndarray
     largest: np.ndarray
     ended: Ended
 
@@ -114,7 +114,7 @@ def bifurcation_curves(
     except KeyboardInterrupt:
         ended = "stopped"
     left = search.left
-    where = plane.places(left), plane.places(largest_piece(left))
+    where = left.places(plane), largest_piece(left).places(plane)
     return MapCurves(plane.along, search.found, search.borders, search.borders - len(left), *where, ended)
 
 
@@ -148,18 +148,18 @@ class _CurveSearch:
         whole = self._look(np.tile(cells, (2, 1)), ways, np.inf, self._settings, deadline)
         draw = np.random.default_rng(0)
         whole = whole and self._look_at_limits(draw.permutation(len(beside)), beside, round_borders, deadline)
-        untried = self.left
+        untried, tried = self.left, np.zeros(0, int)
         short = dataclasses.replace(self._settings, first_step=_FIRST_STEP, max_step=_MAX_STEP)
         for _ in range(max_rounds):
             chosen = draw.permutation(len(untried))[:round_borders]
             if not chosen.size or not whole:
                 break
             some = untried[chosen]
-            across = some.cell + np.eye(2, dtype=int)[some.axis]
-            both = np.concatenate([some.cell, across]), np.tile(some.axis, 2)
+            both = np.concatenate([some.cell, some.beyond]), np.tile(some.axis, 2)
             whole = self._look(*both, _REACH, short, deadline)
             # Those of which nothing came are left, and not tried again.
-            untried = untried[_isin(untried, self.left) & ~_isin(untried, some)]
+            tried = np.append(tried, some.number)
+            untried = self.left[~np.isin(self.left.number, tried)]
         if not len(self.left):
             return "explained"
         return "seconds" if not whole else "rounds" if len(untried) else "tried"
@@ -217,13 +217,3 @@ def _spread(plane: LabelledPlane) -> np.ndarray:
     lattice = (np.stack(np.meshgrid(*2 * [np.arange(_SPREAD)], indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / _SPREAD
     away = [np.abs(periodic / shape - point).sum(axis=1).argmin() for point in lattice]
     return periodic[np.unique(away)]
-
-
-def _isin(some: Borders, others: Borders) -> np.ndarray:
-    """Say which borders are among others."""
-
-    def keys(of: Borders) -> list[tuple[int, ...]]:
-        return [(*map(int, cell), int(axis)) for cell, axis in zip(of.cell, of.axis, strict=True)]
-
-    known = set(keys(others))
-    return np.array([key in known for key in keys(some)], bool)
