@@ -41,8 +41,8 @@ from vijax.runtime.context import door
 _AT_ONCE = 4  # starts of one family that are followed at once, though they may turn out to lie on one curve
 # Two starts on one curve differ from it by less than a step's bend; other curves of the same label are farther apart.
 _ON_CURVE = 5e-4
-# How far from a limit an orbit may be from which Newton is to find it: about a cell of a coarse map.
-_BESIDE = 0.1
+# How far from a limit an orbit may be from which Newton is to find it: a cell of a map with few of them.
+_BESIDE = 0.2
 
 
 class BifurcationCurve(NamedTuple):
@@ -184,11 +184,8 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
     lanes, lost = [], []
     for batch in batches.values():
         paths, y = _set_out(batch, plane, device, settings)
-        # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
-        across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
-        across = np.broadcast_to(across / np.linalg.norm(across), y.shape)
-        first = advance(paths, y, across, np.zeros(len(y)))
         limit = paths.device is not None
+        first = _beside(paths, y) if limit else _on(paths, y)
         near = np.abs(first.y - y).max(axis=1) < (_BESIDE if limit else settings.max_step)
         real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
         for index, good in enumerate(real & (first.size <= settings.newton_tolerance)):
@@ -205,6 +202,26 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
             stacklevel=2,
         )
     return lanes
+
+
+def _on(paths: CurvePath, y: np.ndarray) -> BranchPlace:
+    """Correct points that lie on their curves already, to find the tangents there."""
+    # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
+    across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
+    return advance(paths, y, np.broadcast_to(across / np.linalg.norm(across), y.shape), np.zeros(len(y)))
+
+
+def _beside(paths: CurvePath, y: np.ndarray) -> BranchPlace:
+    """Bring orbits that are near a limit onto its curve: by either parameter alone, whichever has less to move."""
+    still = np.eye(y.shape[1])[[-2, -1]]
+    tries = [advance(paths, y, np.broadcast_to(one, y.shape), np.zeros(len(y))) for one in still]
+    far = [np.where(one.size <= paths.newton_tolerance, np.abs(one.y - y).max(axis=1), np.inf) for one in tries]
+    first = far[0] <= far[1]
+
+    def chosen(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.where(first.reshape(-1, *(1,) * (one.ndim - 1)), one, other)
+
+    return jax.tree.map(chosen, *tries)
 
 
 def _moved(start: CurveStart, path: CurvePath, y: np.ndarray) -> CurveStart:
