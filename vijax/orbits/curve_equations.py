@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vijax.model import flow
 from vijax.model.device import Harvester
@@ -27,11 +27,6 @@ from vijax.runtime.arrays import AnyArray
 Condition = Literal["multiplier", "touch", "depth", "energy"]
 CONDITIONS: dict[str, Condition] = {"grazing": "touch", "penetration limit": "depth", "energy limit": "energy"}
 """What holds on curves of a kind; on those of all other kinds a multiplier is given."""
-
-
-# Impacts whose loads differ by less are alike by symmetry: both of a 1:1 orbit of rigid walls are, also where it is no
-# mirror image of itself. Rounding is far below.
-_ALIKE = 1e-9
 
 
 class CurveTests(NamedTuple):
@@ -62,6 +57,7 @@ class Touch(eqx.Module):
 
     impact: Int[AnyArray, "*orbit"]
     wall: Float[AnyArray, "*orbit"]
+    alike: Bool[AnyArray, "*orbit impact"] | None = None  # at a limit, the impacts that are there with it by symmetry
 
 
 class CurvePath(eqx.Module):
@@ -173,9 +169,7 @@ class CurvePath(eqx.Module):
         elif self.device is not None:
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
             loads = self._loads(self.device, y[-2:], pair, knots)
-            here = jnp.arange(knots.shape[0], dtype=jnp.int32) == self.touch.impact
-            less = loads[self.touch.impact] - loads
-            push = jnp.where(here | (jnp.abs(less) < _ALIKE), 1.0, less).min()
+            push = jnp.where(self.touch.alike, 1.0, loads[self.touch.impact] - loads).min()
         else:
             cubic = jnp.where(self.multiplier > 0, one, cubic_coefficient(pair, self.sequence, knots))
         room = grazing.between(pair, self.sequence, knots, touch).clearance

@@ -62,7 +62,7 @@ def curve_rows(dataset: "xr.Dataset") -> "pd.DataFrame":
 
     Returns:
         A table of pandas with the columns curve, point, kind and label, both parameters, multiplier, its product with
-        the other one, residual, status, stable, and event: what of codimension 2 the curve met there, or nothing.
+        the other one, residual, status, stable, and what of codimension 2 the curve met there as event.
 
     Raises:
         ValueError: Another dataset.

@@ -32,7 +32,7 @@ from vijax.orbits.curve_events import CurvePoint, curve_events
 from vijax.orbits.curve_plane import Plane, check_plane, logarithmic, place_of, units
 from vijax.orbits.curve_starts import CurveStart, check_points, curve_start, with_touch
 from vijax.orbits.events import Point, orbits_at
-from vijax.orbits.limits import LIMITS, limit_start
+from vijax.orbits.limits import LIMITS, alike, limit_start
 from vijax.orbits.parameter import MOVED
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks, tiles
@@ -294,15 +294,14 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
             "multiplier": np.array([1.0 if start.kind == "fold" else -1.0 for start in starts]),
         }
     )
+    limit = condition in ("depth", "energy")
+    impact, wall = np.array([start.impact for start in starts], np.int32), np.array([start.wall for start in starts])
+    same = alike(starts, orbit, (one, other), device) if limit else None
     paths = CurvePath(
         pair=orbit.pair,
         sequence=orbit.sequence,
-        touch=Touch(
-            *tiles.arrays(
-                (np.array([start.impact for start in starts], np.int32), np.array([start.wall for start in starts]))
-            )
-        ),
-        device=_broadcast(device, size) if condition in ("depth", "energy") else None,
+        touch=Touch(*tiles.arrays((impact, wall, same))),
+        device=_broadcast(device, size) if limit else None,
         along=(one, other),
         logarithmic=(logarithms[0], logarithms[1]),
         condition=condition,

@@ -21,6 +21,8 @@ from vijax.runtime.context import door
 LIMITS = ("penetration limit", "energy limit")
 """Kinds of points and of curves."""
 
+_ALIKE = 1e-9  # Loads of impacts that differ by less are the same: rounding is far below.
+
 
 def loads(orbit: Orbit, device: Harvester) -> dict[str, np.ndarray]:
     """Compute how near each impact [orbit, impact] is to each limit: 1 there, less where admissible, 0 where padded.
@@ -51,8 +53,8 @@ def limit_points(branches: list[Branch], *, device: Harvester | None = None) -> 
         device: Whose limits they are, as the branches were told.
 
     Returns:
-        A point for every crossing, with `kind` "penetration limit" or "energy limit": of the two neighbours between
-        which it is the one nearer to it. A curve that begins there is on the limit exactly.
+        For every crossing the nearer one of the two orbits between which it is, with `kind` "penetration limit" or
+        "energy limit". A curve that begins there is on the limit exactly.
     """
     device = one_device(device)
     return [
@@ -99,6 +101,20 @@ def limit_start(
     for name, value in zip(plane, place, strict=True):
         device = device_at(device, name, value)
     return CurveStart(point.kind, orbit, place, int(loads(orbit, device)[point.kind][0].argmax()))
+
+
+def alike(starts: list[CurveStart], orbit: Orbit, plane: tuple[str, ...], device: Harvester) -> np.ndarray:
+    """Say which impacts [start, impact] are as hard as the one that is at its limit, itself and padding among them.
+
+    Both of a 1:1 orbit of rigid walls are, also where it is no mirror image of itself. Under gravity none stay so.
+    """
+    for index, name in enumerate(plane):
+        device = device_at(device, name, np.array([[start.place[index]] for start in starts]))
+    load, rows = loads(orbit, device)[starts[0].kind], np.arange(len(starts))
+    impact = np.array([start.impact for start in starts])
+    close = np.abs(load - load[rows, impact][:, None]) < _ALIKE
+    itself = np.arange(load.shape[1]) == impact[:, None]
+    return itself | ~np.asarray(orbit.sequence.real) | (close & (not any(map(tilts, plane))))
 
 
 def near_limits(
