@@ -166,7 +166,7 @@ class CurvePath(eqx.Module):
             touch = jnp.where(here, y[-3], jnp.nan)
             leave = shooting.departures(pair, self.sequence, knots).t[self.touch.impact]
             push = -self.touch.wall * flow.acceleration(pair.gamma, leave + y[-3])
-        elif self.device is not None:
+        elif self.device is not None and self.touch.alike is not None:
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
             loads = self._loads(self.device, y[-2:], pair, knots)
             push = jnp.where(self.touch.alike, 1.0, loads[self.touch.impact] - loads).min()
