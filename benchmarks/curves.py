@@ -2,6 +2,8 @@
 
     python benchmarks/curves.py               # all figures
     python benchmarks/curves.py --only known  # one part
+    python benchmarks/curves.py --only limits
+    python benchmarks/curves.py --only explained --charts .  # and pictures of both planes with their curves
 
 One line a figure. Errors are against closed forms, against points that branches along random lines through a plane
 locate by themselves, and against the product of both multipliers, which is known of every orbit.
@@ -11,6 +13,8 @@ import argparse
 import sys
 import time
 import warnings
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +24,7 @@ from benchmarks.orbits import say
 from vijax.model import flow
 from vijax.orbits.curves import BifurcationCurve
 from vijax.orbits.events import Point
+from vijax.orbits.limits import LIMITS, loads
 
 R = (0.02, 0.98)
 PLANE = {"d": (0.05, 0.32), "r": (0.15, 0.9)}
@@ -180,7 +185,27 @@ def speed() -> None:
     )
 
 
-def explained() -> None:
+def limits() -> None:
+    """Compare impacts on curves of limits, as the impact map flies them, with the limits."""
+    device = vijax.Harvester()
+    pair = vijax.impact_pair(0.2, 60.0, 0.5)
+    branches = vijax.follow_families(vijax.find_orbits(pair, "1:1", guesses=512), "kappa", (20.0, 400.0))
+    points = vijax.limit_points(branches, device=device)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        plane = {"d": (0.05, 0.3), "kappa": (20.0, 400.0)}
+        curves = vijax.follow_curves(points, "kappa", plane, device=device)
+    for kind in LIMITS:
+        mine = [curve for curve in curves if curve.kind == kind]
+        if mine:
+            flown = [curve.orbit[np.flatnonzero(np.asarray(curve.orbit.status) == vijax.Status.OK)] for curve in mine]
+            off = [np.abs(loads(orbit, device)[kind].max(axis=1) - 1).max() for orbit in flown]
+            count = sum(len(curve.values) for curve in mine)
+            say(f"{kind}: curves, points, verified ones", f"{len(mine)}, {count}, {sum(map(len, flown))}")
+            say(f"{kind}: largest error of these, relative to it", f"{max(off):.1e}")
+
+
+def explained(charts: Path | None = None) -> None:
     """Count the borders between labels of periodic cells that lie within one cell of a curve, on two planes."""
     planes: dict[str, dict[str, Any]] = {
         "d x kappa, 256 x 256": {"d": np.linspace(0.05, 0.3, 256), "kappa": np.geomspace(3, 400, 256), "r": 0.5},
@@ -201,19 +226,30 @@ def explained() -> None:
         say(f"{name}: borders, share within a cell of a curve", f"{found.borders}, {share:.1%}")
         points = sum(len(curve.values) for curve in found.curves)
         say(f"{name}: curves, points, seconds once compiled", f"{len(found.curves)}, {points}, {seconds:.0f}")
+        say(f"{name}: largest piece that no curve explains, in borders; ended", f"{len(found.largest)}; {found.ended}")
+        if charts is not None:
+            figure = vijax.plots.curves(vijax.curve_dataset(found), dataset)
+            vijax.plots.save(figure, charts / f"curves_{'_'.join(found.along)}.png")
 
 
-PARTS = {"known": known, "lines": lines, "speed": speed, "explained": explained}
+PARTS: dict[str, Callable[..., None]] = {
+    "known": known,
+    "lines": lines,
+    "speed": speed,
+    "limits": limits,
+    "explained": explained,
+}
 
 
 def main() -> int:
     """Print what the command line asks for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", choices=PARTS)
+    parser.add_argument("--charts", type=Path, metavar="FOLDER", help="where to draw the planes that are explained")
     given = parser.parse_args()
     for name, part in PARTS.items():
         if given.only in (None, name):
-            part()
+            part(given.charts) if part is explained else part()
     return 0
 
 

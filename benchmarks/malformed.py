@@ -20,12 +20,18 @@ from vijax.design import optimise, optimum, report
 from vijax.design.report_lines import lines, table
 from vijax.design.robustness import surroundings, weighted
 from vijax.design.tolerance import Tolerance, nodes
+from vijax.design.tolerance_plane import tolerance_plane
 from vijax.model import device
 from vijax.orbits import (
     branch_dataset,
     continuation,
+    curve_rows,
+    curves,
     events,
+    limits,
+    map_curves,
     motion,
+    orbit_curves,
     orbit_properties,
     orbit_search,
     periodic,
@@ -437,6 +443,53 @@ CALLS: Table = {
             "points": (0, 1.5, 10**9),
         },
     ),
+    "curves.follow_curves": (
+        curves.follow_curves,
+        {
+            "points": [events.Point("fold", 0.2, an_orbit())],
+            "along": "d",
+            "within": {"d": (0.1, 0.3), "kappa": (3, 400)},
+        },
+        {
+            "points": (3, None, [], ["fold"], "fold"),
+            "along": (3, "mass"),
+            "within": (3, (0.1, 0.3), {"d": (0.1, 0.3)}, {"d": (0.3, 0.1), "r": (0.2, 0.8)}, {"d": 3, "r": (0.2, 0.8)}),
+            "max_points": (*COUNT, 1),
+            "settings": (3, "fine"),
+            "device": DEVICE,
+        },
+    ),
+    "bifurcation_curves": (
+        map_curves.bifurcation_curves,
+        {"dataset": a_map()},
+        {
+            "dataset": (*DATASET, a_map()),
+            "max_rounds": WHOLE,
+            "max_seconds": (*REAL, 0, -1),
+            "round_borders": COUNT,
+            "max_points": (*COUNT, 1),
+            "progress": FUNCTION,
+        },
+    ),
+    "limit_points": (limits.limit_points, {"branches": []}, {"branches": (3, None, ["d"]), "device": DEVICE}),
+    "curves_about": (
+        orbit_curves.curves_about,
+        {"orbit": an_orbit(), "within": {"d": (0.1, 0.3), "kappa": (3, 400)}},
+        {
+            "orbit": ORBIT,
+            "within": (3, {"d": (0.1, 0.3)}, {"d": (0.3, 0.1), "r": (0.2, 0.8)}),
+            "max_points": (*COUNT, 1),
+        },
+    ),
+    "design_plane": (
+        tolerance_plane,
+        {"optimum": an_optimum(), "tolerances": [Tolerance("omega0", 0.05), Tolerance("s", 0.02)]},
+        {
+            "optimum": (3, None, "best", a_design()),
+            "tolerances": (3, [3], [Tolerance("s", 0.1)], [Tolerance("s", 0.1), Tolerance("V", 0.1)]),
+        },
+    ),
+    "curve_rows": (curve_rows.curve_rows, {}, {"dataset": (*DATASET, a_map())}),
     "branch_dataset.dataset": (branch_dataset.dataset, {}, {"branches": (3, None, [], ["d"], "d")}),
     "surroundings": (
         surroundings,

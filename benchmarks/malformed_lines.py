@@ -145,6 +145,25 @@ LINES: Lines = {
             "plot": PLOT,
         },
     ),
+    "curves": (
+        (*_SMALL, "--periods", "40"),
+        {
+            "map": ("", "nowhere.zarr", ".", "/dev/null", "\0.zarr"),
+            "d": ("0", "x", "0.2"),
+            "kappa": ("0", "x", "3"),
+            "r": ("2", "half"),
+            "periods": COUNTS,
+            "wall": WORDS,
+            "max-rounds max_rounds": WHOLES,
+            "max-seconds max_seconds": (*REALS, "0", "-1"),
+            "ground": WORDS,
+            "set": SETS,
+            "out": OUT,
+            "csv": ("", ".", "curves.txt", "nowhere/curves.csv", "/proc", "/dev/null"),
+            "plot": PLOT,
+            "unknown": ("1",),
+        },
+    ),
     "design": (
         ("--d", "0.2", "--survey-points", "8"),
         {
@@ -177,6 +196,7 @@ LINES: Lines = {
             "max-impacts max_impacts": (*COUNTS, "10000000000"),
             "diagram-points diagram_points": (*COUNTS, "1", "10000000000"),
             "basin-starts basin_starts": (*COUNTS, "10000000000"),
+            "curves": ("", "omega0", "omega0,s", "mass,s", ",", "omega0;s"),
             "over": ("", "d", "r", "r=", "r=x", "r=0", "=1", "omega0=20:40:3", "mass=1", "u0=0.1", "d=0.1:0.2:3"),
             "d": ("0", "0.1,0.2", "x"),
             "set": ("=1", "V=x"),

@@ -19,7 +19,6 @@ from vijax.engine import method_choice
 from vijax.model import choices
 from vijax.orbits import continuation
 from vijax.planes import axes, orbit_diagram
-from vijax.plots import curve_maps
 
 OFFERED = {name: getattr(vijax, name) for name in vijax.__all__}
 OFFERED |= {f"plots.{name}": getattr(vijax.plots, name) for name in vijax.plots.__all__}
@@ -29,7 +28,6 @@ ROOMS = [room.name for room in pkgutil.walk_packages(vijax.__path__, "vijax.")]
 CHOICES = {
     "direction": {continuation.Direction, choices.Direction},
     "dtype": {choices.Precision},
-    "ground": {curve_maps.Ground},
     "method": {choices.MethodName},
     "motion": {choices.Motion},
     "objective": {objective.Objective},

@@ -19,14 +19,16 @@ has its Floquet `multipliers`, and `orbit_impacts`, `orbit_labels`, `orbit_power
 `follow_orbits` gives the `Branch` of each along a parameter, `follow_families` also those that begin on it,
 `branch_dataset` both as a dataset; `ContinuationSettings` decide the steps. `follow_curves` follows what branches met
 in a plane of two parameters, each a `BifurcationCurve`; `bifurcation_curves` finds those that explain a map, as
-`MapCurves`; `curve_dataset` makes a dataset of them.
+`MapCurves`, and `curves_about` those that bound an orbit; from `limit_points` on limits of a device are followed too;
+`curve_dataset` makes a dataset of them, `curve_rows` a table.
 
 The best device: `steady` is the steady state of an orbit, a `Steady` with derivatives; `average` is that of any motion,
 chaos too, an `Average` with derivatives, their errors and their `Smoothness`; `optimise` finds the `Design` that
 harvests most, an `Optimum` on an orbit or an `AperiodicOptimum` in chaos; `under_tolerances` says what becomes of it
-when constants scatter as a `Tolerance` says, `surroundings` what lies around it (`Surroundings`), `design_extents` how
-far off it may be, `design_arrival` how balls arrive at it, `weigh_basins` which is best if its basin counts;
-`DesignSettings` decide where ascents begin and how they climb.
+when constants scatter as a `Tolerance` says, `surroundings` what lies around it (`Surroundings`), `design_plane` what
+bounds it where two constants are off (`TolerancePlane`), `design_extents` how far off it may be, `design_arrival` how
+balls arrive at it, `weigh_basins` which is best if its basin counts; `DesignSettings` decide where ascents begin and
+how they climb.
 
 Pictures: `plots`, which is loaded, and matplotlib with it, when it is first asked for.
 """

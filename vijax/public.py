@@ -14,6 +14,8 @@ from vijax.design.optimum import AperiodicOptimum, Optimum
 from vijax.design.robustness import Surroundings, surroundings
 from vijax.design.robustness import weighted as weigh_basins
 from vijax.design.tolerance import Tolerance
+from vijax.design.tolerance_plane import TolerancePlane
+from vijax.design.tolerance_plane import tolerance_plane as design_plane
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
 from vijax.model.membrane import HuntCrossley
@@ -24,8 +26,11 @@ from vijax.orbits.continuation import Branch
 from vijax.orbits.continuation import follow as follow_orbits
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_dataset import curve_dataset
+from vijax.orbits.curve_rows import curve_rows
 from vijax.orbits.curves import BifurcationCurve, follow_curves
+from vijax.orbits.limits import limit_points
 from vijax.orbits.map_curves import MapCurves, bifurcation_curves
+from vijax.orbits.orbit_curves import curves_about
 from vijax.orbits.orbit_properties import impacts as orbit_impacts
 from vijax.orbits.orbit_properties import labels as orbit_labels
 from vijax.orbits.orbit_properties import path as orbit_path
@@ -66,6 +71,7 @@ __all__ = [
     "Steady",
     "Surroundings",
     "Tolerance",
+    "TolerancePlane",
     "Trajectory",
     "average",
     "basin_fractions",
@@ -75,14 +81,18 @@ __all__ = [
     "cheapest_model",
     "compare",
     "curve_dataset",
+    "curve_rows",
+    "curves_about",
     "design_arrival",
     "design_extents",
+    "design_plane",
     "find_orbits",
     "follow_curves",
     "follow_families",
     "follow_orbits",
     "harvested_energy",
     "impact_pair",
+    "limit_points",
     "load",
     "lyapunov",
     "optimise",

@@ -60,7 +60,8 @@ def orbits(vijax, np, jax):
     vijax.branch_dataset([one])
     folds = [point for point in one.points if point.kind == "fold"]
     vijax.curve_dataset(vijax.follow_curves(folds, "d", {"d": (0.1, 0.3), "r": (0.4, 0.6)}, max_points=4))
-    vijax.follow_families(found[:1], "d", (0.185, 0.195), points=4)
+    branches = vijax.follow_families(found[:1], "d", (0.185, 0.195), points=4)
+    vijax.limit_points(branches)
     u, v = np.array([[0.0, 0.1], [0.3, -0.2]])
     found = vijax.orbits_from_states(vijax.impact_pair(0.2, 5.0, 0.5), u, v, settle=40)
     vijax.orbit_impacts(found), vijax.orbit_labels(found), vijax.orbit_path(found)

@@ -20,7 +20,9 @@ from vijax.orbits import orbit_search, switching
 from vijax.plots import branch_diagrams, orbit_diagrams
 
 ROOT = SCRIPTS.parent
-DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram", "basins": "basins", "branch": "branch", "design": "design"}
+DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram"} | {
+    name: name for name in ("basins", "branch", "curves", "design")
+}
 PAGES = [*DOORS, "compare"]
 # As many kappa as make the programs of `planes/test_compare`.
 PLANE = ["--d", "0.2,0.3", "--kappa", "100:400:5:log", "--periods", "40"]
@@ -140,6 +142,8 @@ LEAST = {
     "basins --speed 0": lambda: vijax.basin_fractions(**CELL, starts=4, speed=0.0),
     "branch --guesses 0": lambda: orbit_search.search(vijax.impact_pair(0.2, 3.0, 0.5), "1:1", guesses=0),
     "branch --max-switches=-1": lambda: switching.family(None, "d", (0.1, 0.2), max_switches=-1),
+    "curves --max-rounds=-1": lambda: vijax.bifurcation_curves(None, max_rounds=-1),
+    "curves --max-seconds 0": lambda: vijax.bifurcation_curves(None, max_seconds=0.0),
     "design --survey-points 1": lambda: vijax.optimise(survey_points=1),
     "design --starts 0": lambda: vijax.optimise(starts=0),
     "design --max-impacts 0": lambda: vijax.optimise(max_impacts=0),
@@ -193,7 +197,7 @@ def test_help_needs_no_jax():
         "print(codes, grid.main(['--help']), {'jax', 'numpy', 'xarray', 'matplotlib'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout.splitlines()[-1] == "[0, 0, 0, 0, 0, 0, 0] 0 set()"
+    assert done.stdout.splitlines()[-1] == "[0, 0, 0, 0, 0, 0, 0, 0] 0 set()"
 
 
 def test_alone_it_says_what_there_is_and_which_version(capsys):
@@ -256,7 +260,7 @@ def completed(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("vijax ", ["sweep", "compare", "orbit-diagram", "basins", "branch", "design", "docs"]),
+        ("vijax ", ["sweep", "compare", "orbit-diagram", "basins", "branch", "curves", "design", "docs"]),
         ("vijax b", ["basins", "branch"]),
         ("vijax sweep --me", ["--method", "--membrane"]),
         ("vijax sweep --wall ", ["soft", "rigid"]),
@@ -266,6 +270,7 @@ def completed(monkeypatch, capsys):
         ("vijax branch --quantity m", ["multiplier"]),
         ("vijax design --objective ", ["P", "power", "speed", "mean", "worst", "expected"]),
         ("vijax sweep --show l", ["lyapunov", "label"]),
+        ("vijax curves --ground l", ["lyapunov", "label"]),
         ("vijax sweep --outputs P,peri", ["P,period", "P,periods_run"]),
     ],
 )

@@ -1,5 +1,6 @@
 """Curves of bifurcations: at their known places, with the multipliers that make them, ended where orbits end."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,9 +9,10 @@ import xarray as xr
 
 import vijax
 from vijax.model.device import Harvester
+from vijax.model.energy import rigid_penetration
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
-from vijax.orbits import curves, orbit_search, periodic, shooting, switching
+from vijax.orbits import curve_rows, curves, limits, orbit_search, periodic, shooting, switching
 from vijax.orbits.shooting import Sequence
 
 PLANE = {"d": (0.05, 0.35), "r": (0.02, 0.98)}
@@ -169,8 +171,8 @@ def test_the_dataset_has_what_the_curves_have(found, tmp_path):
 def test_a_picture_has_a_line_a_kind_and_a_mark_a_point(found):
     table = vijax.curve_dataset(list(found.values()))
     figure = vijax.plots.curves(table, unstable=True)
-    drawn = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
-    assert len({line.get_color() for line in drawn}) == 3
+    drawn = {line.get_color() for line in figure.axes[0].lines if len(line.get_xdata()) > 1}
+    assert len(drawn - {"white"}) == 3  # white is the edge around each
     marks = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 1]
     # The flip's end and the point of the graze there are one place.
     assert len(marks) == len({point.kind + f"{point.values[0]:.4g}" for c in found.values() for point in c.points})
@@ -182,8 +184,10 @@ def made_map(label=lambda d, r: d < pitchfork(r)):
     below = label(d[:, None], r[None])
     one = np.ones(below.shape, int)
     variables = {"period": one, "impacts_left": one, "impacts_right": one + below, "status": 0 * one}
-    still = {"gamma": 0.0, "v0": -0.3, "u0": 0.05}
-    return xr.Dataset({name: (("d", "r"), x) for name, x in variables.items()}, coords={"d": d, "r": r, **still})
+    # A map of rigid walls has a kappa too, for its energies.
+    still = {"gamma": 0.0, "v0": -0.3, "u0": 0.05, "kappa": 400.0}
+    found = {name: (("d", "r"), x) for name, x in variables.items()}
+    return xr.Dataset(found, coords={"d": d, "r": r, **still}, attrs={"wall": "rigid"})
 
 
 def test_a_map_is_explained_by_the_curve_on_its_border():
@@ -196,12 +200,204 @@ def test_a_map_is_explained_by_the_curve_on_its_border():
     np.testing.assert_allclose(np.sort(curve.values[[0, -1], 1]), [0.3, 0.6], rtol=1e-12)
 
 
+def test_a_search_without_time_says_what_is_left():
+    dataset, told = made_map(), []
+    found = vijax.bifurcation_curves(dataset, max_seconds=1e-9, progress=lambda *step: told.append(step))
+    assert (found.curves, found.explained, found.ended) == ([], 0, "seconds")
+    assert told == [(0, found.borders)]
+    assert found.left.shape == (found.borders, 2)
+    # They lie half way between cells of the pitchfork's two sides, all in one piece.
+    away = found.left[:, 0] - pitchfork(found.left[:, 1])
+    assert np.abs(away).max() < 0.0125
+    assert len(found.largest) == found.borders
+
+
+def test_ctrl_c_keeps_the_curves_found_until_then():
+    def stop(explained, borders):
+        if explained:
+            raise KeyboardInterrupt
+
+    found = vijax.bifurcation_curves(made_map(), progress=stop)
+    assert found.ended == "stopped"
+    assert found.curves
+    assert 0 < found.explained <= found.borders
+    table = vijax.curve_dataset(found)
+    assert (table.attrs["ended"], table.sizes["border"]) == ("stopped", len(found.left))
+
+
+def test_rows_have_every_point_and_what_was_met(found, tmp_path):
+    listed = list(found.values())
+    table = vijax.curve_dataset(listed)
+    rows = vijax.curve_rows(table)
+    assert len(rows) == sum(len(curve.values) for curve in listed)
+    np.testing.assert_array_equal(rows[["d", "r"]], np.concatenate([curve.values for curve in listed]))
+    met = rows[rows["event"] != ""]
+    assert sorted(met["event"]) == sorted(point.kind for curve in listed for point in curve.points)
+    places = {point.kind: point.values for curve in listed for point in curve.points}
+    for row in met.itertuples():
+        np.testing.assert_allclose((row.d, row.r), places[row.event], rtol=0, atol=1e-8)
+    # The flip's end and the point of the graze there are one point.
+    numbered = curve_rows.numbered_points(table)
+    assert [one.number for one in numbered] == list(range(1, len(numbered) + 1))
+    assert sorted(one.kind for one in numbered) == ["double graze", "flip-graze", "pitchfork-graze"]
+    curve_rows.write_rows(table.assign_coords(d=table["d"].assign_attrs(units="m")), tmp_path / "curves.csv")
+    assert (tmp_path / "curves.csv").read_text().startswith("curve,point,kind,label,d [m],r,multiplier,")
+
+
+# --- limits ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def limited():
+    """The symmetric orbit of rigid walls where its impacts are 1 mm deep: d and r along that curve, and the device."""
+    device = Harvester(penetration_limit=1e-3)
+    half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
+    start = periodic.solve(impact_pair([0.2], None, 0.5), half, jnp.array([[[0.15, 0.5, 0.0]]]))
+    branches = switching.family(start, "d", (0.1, 0.3))[:1]
+    points = vijax.limit_points(branches, device=device)
+    (point,) = (one for one in points if one.kind == "penetration limit")
+    (curve,) = curves.follow_curves([point], "d", {"d": (0.15, 0.35), "r": (0.3, 0.7)}, device=device)
+    return curve, device
+
+
+def deep_gap(r):
+    """Give the gap at which the symmetric orbit's impacts are 1 mm deep at kappa = 400, A = 1 and omega = pi.
+
+    Speed and gap in closed form (physics.md, 1:1 at gamma 0); the depth is Eq. (35)'s.
+    """
+    speed = 1e-3 * 400 / np.asarray(rigid_penetration(jnp.asarray(r)))
+    return 0.5 * (1 + r) * speed - 2 / np.pi**2 * np.sqrt(1 - (0.5 * np.pi * (1 - r) * speed) ** 2)
+
+
+def test_a_limit_of_penetration_is_where_it_is_known_to_be(limited):
+    curve, _ = limited
+    d, r = curve.values.T
+    np.testing.assert_allclose(d, deep_gap(r), rtol=0, atol=1e-12)
+    assert np.ptp(r) > 0.1
+
+
+def test_limits_of_a_map_begin_at_its_cells():
+    dataset = made_map()
+    within = dataset["d"].values[:, None] < deep_gap(dataset["r"].values)
+    told = dataset.assign(admissible=(("d", "r"), within)).assign_attrs(harvester_penetration_limit=1e-3)
+    found = vijax.bifurcation_curves(told, max_rounds=0, limits=True)
+    listed = [one for one in found.curves if one.kind == "penetration limit" and one.orbit.sequence.mirrored[0]]
+    (curve,) = listed
+    d, r = curve.values.T
+    np.testing.assert_allclose(d, deep_gap(r), rtol=0, atol=1e-12)
+    assert found.explained == vijax.bifurcation_curves(told, max_rounds=0).explained
+
+
+def test_impacts_at_a_limit_are_flown_as_deep(limited):
+    curve, device = limited
+    load = limits.loads(curve.orbit, device)["penetration limit"].max(axis=1)
+    flown = np.asarray(curve.orbit.status) == Status.OK
+    assert flown[1:-1].all()
+    np.testing.assert_allclose(load[flown], 1, rtol=0, atol=1e-12)
+    assert (np.asarray(curve.orbit.residual) < 1e-12).all()
+
+
+def test_a_limit_of_energy_holds_on_soft_walls_as_the_device_changes():
+    """Along omega units of length and energy change as well; the impact map flies what is on the curve."""
+    device = Harvester(omega0=60.0, s=0.2)
+    orbit = orbit_search.search(device.pair(), "RL", guesses=64)
+    branches = switching.family(orbit[:1], "omega0", (20.0, 400.0), device=device, max_switches=0)
+    points = [point for point in vijax.limit_points(branches, device=device) if point.kind == "energy limit"]
+    listed = curves.follow_curves(points, "omega0", {"omega0": (20.0, 400.0), "omega": (2.8, 3.4)}, device=device)
+    assert listed
+    for curve in listed:
+        omega0, omega = curve.values.T
+        here = limits.device_at(limits.device_at(device, "omega", omega[:, None]), "omega0", omega0[:, None])
+        load = limits.loads(curve.orbit, here)[curve.kind].max(axis=1)
+        flown = np.asarray(curve.orbit.status) == Status.OK
+        assert flown[1:-1].all()
+        np.testing.assert_allclose(load[flown], 1, rtol=0, atol=1e-12)
+        assert np.ptp(omega) > 0.1
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("plane", "message"),
+    [
+        ({"d": (0.1, 0.3)}, "within must give two parameters their bounds"),
+        ({"d": (0.1, 0.3), "s": (0.1, 0.3)}, "within must name two parameters; got d and s, which say the same"),
+        ({"gamma": (-0.1, 0.1), "beta": (-0.1, 0.1)}, "got gamma and beta, which say the same"),
+        ({"d": (0.3, 0.1), "r": (0.2, 0.8)}, "within must be two finite bounds, the lower first"),
+        ({"d": (0.1, 0.3), "r": (0.2, np.nan)}, "within must be two finite bounds"),
+        ({"d": (0.1, 0.3), "r": (0.2, 1.5)}, "within must lie in"),
+        ({"d": (0.1, 0.3), "kappa": (3, 40)}, "a rigid wall has no kappa"),
+        ({"d": (0.1, 0.3), "A": (1, 2)}, "got A, which changes none of d, kappa, r and gamma where d is given"),
+        ({"d": (0.3, 0.4), "r": (0.2, 0.8)}, "within must hold the points"),
+    ],
+)
+def test_a_plane_that_cannot_be_is_told(met, plane, message):
+    with pytest.raises(ValueError, match=message):
+        curves.follow_curves(met, "d", plane)
+
+
+def test_malformed_starts_are_told(met):
+    (fold,) = met[:1]
+    soft = fold._replace(orbit=eqx.tree_at(lambda o: o.pair, fold.orbit, impact_pair([0.2], [40.0], [0.5])))
+    two = fold._replace(orbit=periodic.concatenate([fold.orbit, fold.orbit]))
+    for points, message in (
+        ([], "points must hold at least one"),
+        (3, "points must be"),
+        ([*met, "fold"], "points must be"),
+        ([fold, soft], "points must be of one kind of wall"),
+        ([two], "points must have one orbit each; got 2 at index 0"),
+        ([fold._replace(value=np.nan)], "within must hold the points"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            curves.follow_curves(points, "d", PLANE)
+
+
+def energy_only(dataset):
+    """A map over d and A, where the motion depends on d alone."""
+    return dataset.isel(r=0, drop=True).assign(P=(("d", "A"), np.ones((9, 2)))).assign_coords(A=[1.0, 2.0])
+
+
+def test_curves_lie_where_they_are_whichever_axis_of_the_map_is_across(found):
+    table, over = vijax.curve_dataset(list(found.values())), made_map().assign_attrs(periods=40)
+    seen = []
+    for plane in (over, over.transpose("r", "d")):
+        axes = vijax.plots.curves(table, plane, ground="label").axes[0]
+        marks = [np.ravel(line.get_data()) for line in axes.lines if len(line.get_xdata()) == 1]
+        seen.append(marks if axes.get_xlabel() == "$d$" else [mark[::-1] for mark in marks])
+    assert len(seen[0]) == 3
+    np.testing.assert_array_equal(*seen)
+
+
+def test_grazings_of_unstable_orbits_are_drawn_on_request(found):
+    table = vijax.curve_dataset([found["grazing"]])
+    faint = [
+        {line.get_alpha() for line in vijax.plots.curves(table, unstable=wanted).axes[0].lines}
+        for wanted in (False, True)
+    ]
+    assert (len(faint[0]), len(faint[1])) == (1, 2)
+
+
+def test_a_map_that_curves_cannot_lie_over_is_told(found):
+    table = vijax.curve_dataset(list(found.values()))
+    for over, ground, message in (
+        (made_map(), "mass", "ground must be among"),
+        (made_map().rename(r="gamma_"), "label", "over must be a map over d and r alone"),
+        (made_map().isel(r=0), "label", "over must be a map over d and r alone; got one over d"),
+        (3, "label", "over must be a dataset"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vijax.plots.curves(table, over, ground=ground)
+
+
 @pytest.mark.parametrize(
     ("dataset", "message"),
     [
         (made_map().drop_vars("period"), "dataset must hold period"),
         (made_map().isel(d=0), "dataset must be a map over two parameters; got one over r"),
         (made_map().isel(d=[0]), "dataset must have at least two values along each axis; got 1 and 7"),
+        (energy_only(made_map()), "got one over d; its motion does not depend on A"),
+        (made_map().assign_attrs(membrane="hunt-crossley"), "dataset must be of linear membranes"),
         (made_map().assign(period=0 * made_map()["period"]), "dataset must have periodic cells with impacts"),
         (5, "dataset must be a dataset"),
     ],
@@ -209,3 +405,17 @@ def test_a_map_is_explained_by_the_curve_on_its_border():
 def test_a_map_without_labels_is_told(dataset, message):
     with pytest.raises(ValueError, match=message):
         vijax.bifurcation_curves(dataset)
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("max_seconds", 0.0), ("max_seconds", np.nan), ("max_rounds", -1), ("max_points", 1), ("progress", 3)],
+)
+def test_a_budget_that_cannot_be_is_told(argument, value):
+    with pytest.raises(ValueError, match=f"{argument} must be"):
+        vijax.bifurcation_curves(made_map(), **{argument: value})
+
+
+def test_limits_want_a_map_that_tells_what_is_admissible():
+    with pytest.raises(ValueError, match="limits must be those of a map with admissible"):
+        vijax.bifurcation_curves(made_map(), limits=True)

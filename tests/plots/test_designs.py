@@ -5,6 +5,8 @@ import pytest
 import xarray as xr
 from matplotlib.colors import to_rgba
 
+from vijax.design.tolerance import Tolerance
+from vijax.design.tolerance_plane import NearestPoint, TolerancePlane
 from vijax.plots import designs, save
 
 GREEN = to_rgba(designs._STAR["color"])
@@ -141,3 +143,18 @@ def test_a_picture_of_another_kind_is_refused(tmp_path):
     with pytest.raises(ValueError, match="plot must end in"):
         save(designs.design(diagram(), report()), tmp_path / "picture.txt")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_plane_of_two_tolerances_shows_the_optimum_in_its_box(tmp_path):
+    both = (Tolerance("omega0", 0.05), Tolerance("s", 0.02))
+    within = {"omega0": (40.0, 60.0), "s": (0.004, 0.008)}
+    near = NearestPoint("fold", (46.0, 0.0061), (-8.0, 1.7), 1.6)
+    figure = designs.design(diagram(), report(), TolerancePlane(both, (50.0, 0.006), within, [], near, None))
+    axes = figure.axes[2]
+    assert (axes.get_xlim(), axes.get_ylim()) == (within["omega0"], within["s"])
+    (box,) = axes.patches
+    assert box.get_bbox().bounds == pytest.approx((47.5, 0.00588, 5.0, 0.00024))
+    places = [tuple(float(x) for one in line.get_data() for x in np.ravel(one)) for line in axes.lines]
+    assert places == [near.values, (50.0, 0.006)]
+    assert "nearest bifurcation, limit" in words(figure)
+    save(figure, tmp_path / "design.png")

@@ -60,8 +60,8 @@ def about(option: str) -> Iterator[None]:
     """Name the option that a value came by in whatever is found wrong with it."""
     try:
         yield
-    except ValueError as error:
-        raise ValueError(f"--{option}: {error}") from None
+    except (ValueError, OSError) as error:
+        raise type(error)(f"--{option}: {error}") from None
 
 
 def part(option: str, text: str) -> float:

@@ -1,6 +1,7 @@
 """`vijax design`: the best membrane, what surrounds it, and what tolerances make of it."""
 
 import time
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from vijax.design.optimise import Design
     from vijax.design.tolerance import Tolerance
+    from vijax.design.tolerance_plane import TolerancePlane
     from vijax.model.device import Harvester
 
 _FILES = ("design.json", "design.png")
@@ -39,6 +41,7 @@ class DesignRequest:
         devices: One, or one for each value of the axis `over`.
         over: The axis along which designs are wanted, and its values.
         tolerances: By how much constants may be off.
+        plane: Two of them, in whose plane curves are wanted; or none.
         diagram_points: Values at which the picture shows P, half as many more close by the best design.
         basin_starts: Starts that show what attracts there.
         search: Of the arguments of `optimise_all` all the others.
@@ -47,6 +50,7 @@ class DesignRequest:
     devices: "list[Harvester]"
     over: "tuple[str, np.ndarray] | None"
     tolerances: "tuple[Tolerance, ...]"
+    plane: "tuple[Tolerance, ...]"
     diagram_points: int
     basin_starts: int
     search: dict[str, Any]
@@ -64,8 +68,8 @@ def best(out: str | None, plot: str | None, overwrite: bool, yes: bool, **given:
             _check_format(picture)
         asked = _asked(**given)
         _agree(asked, yes)
-    whole, diagram, climbed = _run(asked)
-    _write(whole, diagram, written, picture)
+    whole, diagram, plane, climbed = _run(asked)
+    _write(whole, diagram, plane, written, picture)
     close("\n".join([climbed, *_lines(whole)]), written, picture)
 
 
@@ -79,6 +83,7 @@ def _asked(
     tune: str,
     bounds: tuple[str, ...],
     tolerance: tuple[str, ...],
+    curves: str | None,
     objective: str,
     motion: str,
     reliability: str,
@@ -98,6 +103,7 @@ def _asked(
     names = tuple(name.strip() for name in tune.split(","))
     along, devices = _devices(over, take_axes(given, {}), device(constants), names)
     scatter = _tolerances(tolerance)
+    plane = _plane(curves, scatter, over)
     within = _bounds(bounds)
     weighed = scatter if objective in _OF_SCATTER else ()
     optimise.check(devices, names, within, objective, weighed)
@@ -107,7 +113,7 @@ def _asked(
     search |= {"survey_points": survey_points, "starts": starts, "max_impacts": max_impacts}
     points = checks.whole("diagram_points", diagram_points, 2, _MOST_POINTS)
     balls = checks.whole("basin_starts", basin_starts, 1, MOST_STARTS)
-    return DesignRequest(devices, along, scatter, points, balls, search)
+    return DesignRequest(devices, along, scatter, plane, points, balls, search)
 
 
 def _agree(asked: DesignRequest, yes: bool) -> None:
@@ -117,8 +123,8 @@ def _agree(asked: DesignRequest, yes: bool) -> None:
     process.agree(optimise.expected(len(asked.devices), asked.search["tune"], effort), yes)
 
 
-def _run(asked: DesignRequest) -> "tuple[dict[str, Any], xr.Dataset | None, str]":
-    """Find the designs; give the report, the diagram along the first tuned axis, and how long the ascents took."""
+def _run(asked: DesignRequest) -> "tuple[dict[str, Any], xr.Dataset | None, TolerancePlane | None, str]":
+    """Find the designs; give the report, what pictures show besides, and how long the ascents took."""
     from vijax.design import optimise, report
 
     alone = asked.over is None
@@ -134,22 +140,29 @@ def _run(asked: DesignRequest) -> "tuple[dict[str, Any], xr.Dataset | None, str]
             diagram = _diagram(found[0], asked.devices[0], asked.diagram_points)
             show(2, stages)
         waiting("surroundings and tolerances")
-        told = [report.describe(one, diagram=diagram, **_judged(one, asked, alone)) for one in found]
+        judged = [_judged(one, asked, alone) for one in found]
+        told = [report.describe(one, diagram=diagram, **given) for one, given in zip(found, judged, strict=True)]
         show(stages, stages)
     climbed = f"{how_many(sum(one.ascents for one in found), 'ascents')} in {seconds:.1f} s"
     if asked.over is None:
-        return told[0], diagram, climbed
-    return {"over": {"name": asked.over[0], "values": asked.over[1]}, "designs": told}, None, climbed
+        return told[0], diagram, judged[0].get("plane"), climbed
+    return {"over": {"name": asked.over[0], "values": asked.over[1]}, "designs": told}, None, None, climbed
 
 
-def _write(whole: dict[str, Any], diagram: "xr.Dataset | None", written: Path | None, picture: Path | None) -> None:
+def _write(
+    whole: dict[str, Any],
+    diagram: "xr.Dataset | None",
+    plane: "TolerancePlane | None",
+    written: Path | None,
+    picture: Path | None,
+) -> None:
     from vijax import plots
     from vijax.runtime.files import write_json
 
     if written is not None:
         write_json(whole, written)
     if picture is not None and diagram is not None:
-        plots.save(plots.design(diagram, whole), picture)
+        plots.save(plots.design(diagram, whole, plane), picture)
     elif picture is not None:
         plots.save(plots.design_map(whole), picture)
 
@@ -214,6 +227,26 @@ def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
         return check_tolerances(found)
 
 
+def _plane(
+    curves: str | None, scatter: "tuple[Tolerance, ...]", over: str | None
+) -> "tuple[Tolerance, Tolerance] | tuple[()]":
+    """Take the two tolerances in whose plane curves are wanted."""
+    from vijax.design.tolerance_plane import check_pair
+
+    if curves is None:
+        return ()
+    if over is not None:
+        raise ValueError(f"curves must be left out with over, which has many designs; got {curves}")
+    names = [name.strip() for name in curves.split(",")]
+    known = {one.name: one for one in scatter}
+    missing = [name for name in names if name not in known]
+    if len(names) != 2 or missing:
+        advice = f"; add --tolerance {missing[0]}=5%" if missing and missing[0] else ""
+        raise ValueError(f"curves must name two of the tolerances, as in omega0,s; got {curves!r}{advice}")
+    with about("curves"):
+        return check_pair([known[name] for name in names])
+
+
 def _diagram(found: "Design", device: "Harvester", points: int) -> "xr.Dataset":
     """Compute P up and down along the first tuned axis, closer by about the best design, all else as there."""
     import numpy as np
@@ -237,7 +270,9 @@ def _judged(found: "Design", asked: DesignRequest, alone: bool) -> dict[str, Any
     """Find what becomes of the best design over the tolerances; what lies around it, where it is the only one."""
     from vijax.design.off_design import arrival, extents, ranked
     from vijax.design.optimise import under
+    from vijax.design.optimum import Optimum
     from vijax.design.robustness import surroundings
+    from vijax.design.tolerance_plane import tolerance_plane
 
     scatter = asked.tolerances
     if found.best is None:
@@ -248,6 +283,10 @@ def _judged(found: "Design", asked: DesignRequest, alone: bool) -> dict[str, Any
     if alone:
         judged["surroundings"] = surroundings(found.best, starts=asked.basin_starts)
         judged |= {"extents": extents(found.best), "arrival": arrival(found.best)}
+    if asked.plane and isinstance(found.best, Optimum):
+        judged["plane"] = tolerance_plane(found.best, asked.plane)
+    elif asked.plane:
+        warnings.warn("the design's motion is no orbit, and has no curves of bifurcations", stacklevel=2)
     return judged
 
 
@@ -273,6 +312,7 @@ def _goal_options() -> list[click.Parameter]:
 
 def _sections() -> Sections:
     shown: dict[str, Any] = {"show_default": True}
+    curves = "two of the tolerances: the bifurcations and limits in their plane, of which the nearest is told"
     return {
         "Goal": _goal_options(),
         "Survey": [
@@ -285,6 +325,7 @@ def _sections() -> Sections:
         "Report": [
             click.Option(["--diagram-points"], type=Whole(2), default=320, help="values at which P is shown", **shown),
             click.Option(["--basin-starts"], type=Whole(1), default=2000, help="balls that show basins", **shown),
+            click.Option(["--curves"], metavar="NAME,NAME", help=curves),
         ],
         "Device": [*options.axis_options(PARAMETERS), *options.device_options()],
         "Files": options.file_options(".json", "report"),
@@ -295,6 +336,7 @@ def _sections() -> Sections:
 _EXAMPLES = (
     "",
     "--d 0.2 --r 0.5 --A 3 --omega 10pi --set V=1700 --tolerance omega0=5%",
+    "--d 0.2 --r 0.5 --A 3 --omega 10pi --set V=1700 --tolerance omega0=5%,s=2% --curves omega0,s",
     "--d 0.2 --tune omega0,r --bounds r=0.3:0.8 --tolerance omega0=5%,s=1% --objective worst",
     "--d 0.088 --r 0.27 --A 2 --omega 6 --set V=1700 --objective expected --tolerance omega0=2% --reliability 99%",
     "--over d=0.05:0.3:64 --out designs.json --plot designs.png",

@@ -40,6 +40,8 @@ def _leave_out(given: dict[str, Any]) -> None:
     for name in _METHOD_OPTIONS:
         if (value := given.pop(name)) != getattr(SweepSettings, name, None):
             raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
+    if given.pop("curves"):
+        raise ValueError("curves must be left out with compare, whose maps have no labels; got them")
     crew = [given.pop(name) for name in ("workers", "scheduler")]
     if crew != [None, None]:
         raise ValueError(f"workers must be left out with compare, which runs in one process; got {crew[0] or crew[1]}")

@@ -18,6 +18,7 @@ _PAGES = {
     "orbit-diagram": "orbit_diagram",
     "basins": "basins",
     "branch": "branch",
+    "curves": "curves",
     "design": "design",
     "docs": "docs",
 }

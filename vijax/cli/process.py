@@ -75,6 +75,13 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
     return 0
 
 
+def stop(note: str) -> NoReturn:
+    """End a run whose Ctrl-C, or SIGTERM, was caught to keep what there was until then; the note says what that is."""
+    error: KeyboardInterrupt = _Terminated() if _TERMINATED else KeyboardInterrupt()
+    error.add_note(note)
+    raise error
+
+
 def leave(code: int) -> NoReturn:
     """End the process with the exit code of `run`, at once where the run came to no end.
 
@@ -107,7 +114,11 @@ class _Terminated(KeyboardInterrupt):
     """What SIGTERM raises."""
 
 
+_TERMINATED: list[int] = []  # signals that have come: a run that catches what they raise goes on to its end
+
+
 def _terminate(signum: int, frame: Any) -> None:
+    _TERMINATED.append(signum)
     raise _Terminated
 
 

@@ -35,6 +35,7 @@ def power_map(
     workers: int | None,
     scheduler: str | None,
     yes: bool,
+    curves: bool,
     **given: Any,
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
@@ -48,6 +49,8 @@ def power_map(
         plot = drawn(plot, picture, planned.cells.sizes)
         if plot is not None:
             _check_picture(plot, planned, show)
+        if curves:
+            _check_curves(planned, plot)
         crew = _crew(planned, workers, scheduler, out)
         _check_room(planned, out, overwrite)
         _agree(planned, yes)
@@ -56,7 +59,36 @@ def power_map(
     from vijax.planes import sweep as sweeps
 
     dataset, pace = counted(planned.count, lambda tell: sweeps.run(planned, tell, out, overwrite, crew))
-    finish(dataset, f"{pace}\n{_summary(dataset)}", out, plot, partial(_draw, show), overwrite, kept=True)
+    said, over = f"{pace}\n{_summary(dataset)}", None
+    if curves:
+        over, told = _curves(dataset)
+        said += f"\n{told}"
+    finish(dataset, said, out, plot, partial(_draw, show, over), overwrite, kept=True)
+    if over is not None and over.attrs["ended"] == "stopped":
+        process.stop("the map and the curves found until then are kept")
+
+
+def _check_curves(planned: "SweepPlan", plot: Path | None) -> None:
+    """Raise ValueError unless curves of bifurcations can be drawn over the map."""
+    from vijax.cli.curve_search import check_map
+    from vijax.plots.style import LABEL_NEEDS
+
+    if plot is None:
+        raise ValueError("curves must come with a picture that they are drawn on; got none; add --plot")
+    missing = [name for name in LABEL_NEEDS if name not in planned.outputs]
+    if missing:
+        raise ValueError(f"outputs must hold {', '.join(missing)} for curves; add them, or leave --curves out")
+    check_map(planned)
+
+
+def _curves(dataset: "xr.Dataset") -> "tuple[xr.Dataset | None, str]":
+    """Find the curves of bifurcations over a map, and tell what they are."""
+    from vijax.cli.curve_search import search, summary
+    from vijax.orbits.curve_dataset import curve_dataset
+
+    found, pace = search(dataset.load(), {})
+    table = curve_dataset(found) if found.curves else None
+    return table, "\n".join([pace, *summary(found, table)])
 
 
 def _crew(planned: "SweepPlan", workers: int | None, scheduler: str | None, out: Path | None) -> int | str | None:
@@ -149,9 +181,12 @@ def _check_picture(path: Path, planned: "SweepPlan", show: str) -> None:
     fits({str(dim): sizes[str(dim)] for dim in drawn.dims})
 
 
-def _draw(show: str, dataset: "xr.Dataset", path: Path) -> None:
+def _draw(show: str, curves: "xr.Dataset | None", dataset: "xr.Dataset", path: Path) -> None:
     from vijax import plots
 
+    if curves is not None:
+        plots.save(plots.curves(curves, dataset, ground=show), path)
+        return
     known = {"P": plots.power_map, "label": plots.label_map}
     plots.save(known[show](dataset) if show in known else plots.variable_map(dataset, show), path)
 
@@ -250,21 +285,23 @@ def _output_options() -> list[click.Parameter]:
     wanted = "variables wanted [all but asymmetry, lyapunov; for labels lyapunov too]"
     some = "compute every 2^LEVELS-th cell along each axis, then those at borders; fill the others"
     shown = "what the picture shows: any variable, or label"
+    drawn = "draw curves of bifurcations over the picture, and list what they meet"
     return [
-        click.Option(["--outputs"], metavar="NAME,NAME", shell_complete=_complete_outputs, help=wanted),
+        click.Option(["--outputs"], metavar="NAME,NAME", shell_complete=complete_outputs, help=wanted),
         click.Option(["--refine"], type=Whole(1), metavar="LEVELS", help=some),
         click.Option(
-            ["--show"], metavar="NAME", default="P", show_default=True, shell_complete=_complete_outputs, help=shown
+            ["--show"], metavar="NAME", default="P", show_default=True, shell_complete=complete_outputs, help=shown
         ),
+        click.Option(["--curves"], is_flag=True, help=drawn),
     ]
 
 
-def _complete_outputs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    """Complete the last of several names of variables. The rooms that know them take a moment to load."""
+def complete_outputs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    """Complete a name of variables, or the last of several. The rooms that know them take a moment to load."""
     from vijax.planes.outputs import OUTPUTS
 
     before, comma, begun = incomplete.rpartition(",")
-    names = [*OUTPUTS, "label"] if param.name == "show" else OUTPUTS
+    names = OUTPUTS if param.name == "outputs" else [*OUTPUTS, "label"]
     return [f"{before}{comma}{name}" for name in names if name.startswith(begun)]
 
 
@@ -294,6 +331,7 @@ EXAMPLES = (
     "--omega pi:6pi:96 --omega0 20:400:96 --plot device.png",
     "--show label --plot labels.png",
     "--show max_penetration --plot depth.png",
+    "--show label --curves --plot curves.png",
     "--d 0.05:0.3:1024 --kappa 3:400:1024:log --refine 3 --out fine.zarr --plot fine.png",
     "--d 0.2,0.3 --kappa 40:400:8:log --method ode --membrane hunt-crossley --chi 0.8 --out hertz.zarr",
 )

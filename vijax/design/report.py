@@ -11,6 +11,7 @@ from vijax.design.optimise import Design
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.robustness import Surroundings
 from vijax.design.tolerance import Spread, Tolerance
+from vijax.design.tolerance_plane import TolerancePlane
 from vijax.design.variables import LINEAR, constant, value_of
 from vijax.model.device import CONSTANTS
 from vijax.model.energy import energy_ratio
@@ -30,6 +31,7 @@ def describe(
     tolerances: Sequence[Tolerance] = (),
     spread: Spread | None = None,
     ranking: Sequence[tuple[AnyOptimum, Spread]] = (),
+    plane: TolerancePlane | None = None,
 ) -> dict[str, Any]:
     """Describe all of a design in nested dicts and lists of numbers and words.
 
@@ -41,6 +43,7 @@ def describe(
         tolerances, spread: Over which tolerances the best optimum was judged, and a `vijax.design.optimise.under`
             of them.
         ranking: All optima by what devices give that are off by the tolerances: `vijax.design.off_design.ranked`.
+        plane: What bounds the best optimum in the plane of two of them: `vijax.design_plane`.
 
     Returns:
         `best` (None if no admissible motion was found), `others`, and what was asked. With `diagram`, `highest`: the
@@ -51,6 +54,8 @@ def describe(
         checks.instance("surroundings", surroundings, Surroundings, "vijax.design.robustness.surroundings(...)")
     if spread is not None:
         checks.instance("spread", spread, Spread, "vijax.design.optimise.under(...)")
+    if plane is not None:
+        checks.instance("plane", plane, TolerancePlane, "vijax.design_plane(...)")
     if diagram is not None:
         checks.variables("diagram", diagram, ("P", "max_penetration", "energy_ratio", "admissible"), "orbit_diagram")
     checks.sequence("tolerances", tolerances, Tolerance, "vijax.design.tolerance.Tolerance records")
@@ -69,6 +74,7 @@ def describe(
         "tolerances": [one._asdict() for one in tolerances],
         "spread": spread._asdict() if spread else None,
         "ranking": [{"optimum": _place(design, one)} | given._asdict() for one, given in ranking],
+        "plane": _plane(plane) if plane else None,
         "highest": _highest(diagram) if diagram is not None else None,
     }
 
@@ -153,6 +159,18 @@ def _surroundings(found: Surroundings) -> dict[str, Any]:
         "attractors": [one._asdict() for one in found.attractors],
         "below": found.below._asdict() if found.below else None,
         "above": found.above._asdict() if found.above else None,
+    }
+
+
+def _plane(found: TolerancePlane) -> dict[str, Any]:
+    return {
+        "names": [one.name for one in found.tolerances],
+        "spreads": [one.spread for one in found.tolerances],
+        "here": list(found.here),
+        "within": {name: list(pair) for name, pair in found.within.items()},
+        "curves": len(found.curves),
+        "nearest": found.nearest._asdict() if found.nearest else None,
+        "limit": found.limit._asdict() if found.limit else None,
     }
 
 

@@ -44,6 +44,7 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
         yield from _best(best, report["objective"])
         yield from _off_design(best, report["extents"], report["arrival"])
         yield from _around(best, report["surroundings"])
+        yield from _in_plane(report["plane"])
         yield from _others(best, report["others"], report["objective"])
         yield from _off(report)
     yield from _unconstrained(report)
@@ -177,6 +178,22 @@ def _around(best: dict[str, Any], around: dict[str, Any] | None) -> Iterator[str
         yield f"    {one['label']:<18}{100 * one['share']:>8.3g} %   P {amount(one['P'], 'J', 5)}{flaw}"
     if len(around["attractors"]) > len(shown):
         yield f"    and {len(around['attractors']) - len(shown)} more"
+
+
+def _in_plane(plane: dict[str, Any] | None) -> Iterator[str]:
+    """Say what bounds the optimum in the plane of two tolerances."""
+    if plane is None:
+        return
+    names, spreads = plane["names"], plane["spreads"]
+    both = " and ".join(f"{name} +-{100 * spread:.3g} %" for name, spread in zip(names, spreads, strict=True))
+    yield f"  in the plane of {both}, {plane['curves']} curves of bifurcations and limits:"
+    for what, one in (("bifurcation", plane["nearest"]), ("limit", plane["limit"])):
+        if one is None:
+            reach = ", ".join(f"{name} {low:.5g} to {high:.5g}" for name, (low, high) in plane["within"].items())
+            yield f"    nearest {what}: none within {reach}"
+            continue
+        where = ", ".join(f"{name} {off:+.3g} %" for name, off in zip(names, one["percent"], strict=True))
+        yield f"    nearest {what}: {one['kind']}, {one['times']:.3g} times the tolerances away, at {where}"
 
 
 def _edge(edge: dict[str, Any]) -> str:

@@ -213,7 +213,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     certain = crest.first & crest.only
     if long is not None:
         ebbs = wall.kappa * jnp.abs(duration - when) < 0.5
-        certain = jnp.where(long, ebbs & crest.first & crest.highest if deep else ebbs, certain)
+        certain = jnp.where(long, ebbs & crest.first & present(crest.highest) if deep else ebbs, certain)
     depth = None
     if deep:
         depth, exact = _deepest(wall, entry, crest.s)

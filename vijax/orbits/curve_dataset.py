@@ -9,6 +9,7 @@ from vijax.model.quantities import AXES, MEASURED
 from vijax.orbits import orbit_properties
 from vijax.orbits.branch_dataset import padded
 from vijax.orbits.curves import BifurcationCurve
+from vijax.orbits.map_curves import MapCurves
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -25,20 +26,27 @@ _ABOUT = {
 
 
 @door
-def curve_dataset(curves: list[BifurcationCurve]) -> "xr.Dataset":
+def curve_dataset(curves: list[BifurcationCurve] | MapCurves) -> "xr.Dataset":
     """Make one dataset of curves in a plane: what every orbit is, and what was met, padded with NaN.
 
     Args:
-        curves: Of one plane.
+        curves: Of one plane, or what `vijax.bifurcation_curves` found of a map.
 
     Returns:
         Over (curve, point) both parameters, `multiplier` (largest modulus), `multiplier_product`, `residual`, `status`,
         `stable`; over curve `kind`, the `label` of its orbits, `end_first`, `end_last`; over (curve, event) what of
         codimension 2 was met: `event`, what grazes besides as `event_test`, how the curve goes on then as
-        `event_onward`, both parameters as `event_` and their name.
+        `event_onward`, both parameters as `event_` and their name, and the `event_residual` there. Of a map, over
+        border, where those are that no curve explains, as `left_` and the parameters' names, and as attributes
+        `borders`, `explained` and `ended`.
+
+    Raises:
+        ValueError: No curves, or curves of several planes.
     """
     import xarray as xr  # here, as importing vijax must not load it
 
+    of_map = curves if isinstance(curves, MapCurves) else None
+    curves = curves.curves if isinstance(curves, MapCurves) else curves
     listed = checks.sequence("curves", curves, BifurcationCurve, "curves, as curves.follow_curves returns them")
     if not listed:
         raise ValueError("curves must hold at least one; got none")
@@ -48,33 +56,56 @@ def curve_dataset(curves: list[BifurcationCurve]) -> "xr.Dataset":
     columns = [_columns(curve) for curve in listed]
     found = {name: padded([column[name] for column in columns]) for name in columns[0]}
     dims = ("curve", "point")
-    most = max(len(curve.points) for curve in listed)
-    events = [[point.kind for point in curve.points] for curve in listed]
-    tests = [[point.test for point in curve.points] for curve in listed]
-    onward = [[point.onward for point in curve.points] for curve in listed]
-    places = padded([np.array([point.values for point in curve.points]).reshape(-1, 2) for curve in listed])
-    return xr.Dataset(
+    words = {
+        "kind": [curve.kind for curve in listed],
+        "label": [_label(curve) for curve in listed],
+        "end_first": [curve.ends[0] for curve in listed],
+        "end_last": [curve.ends[1] for curve in listed],
+    }
+    made = xr.Dataset(
         {name: (dims, found[name], about) for name, about in _ABOUT.items()}
-        | {
-            "kind": ("curve", _texts([curve.kind for curve in listed])),
-            "label": ("curve", _texts([_label(curve) for curve in listed])),
-            "end_first": ("curve", _texts([curve.ends[0] for curve in listed])),
-            "end_last": ("curve", _texts([curve.ends[1] for curve in listed])),
-            "event": (("curve", "event_number"), _table(events, most)),
-            "event_test": (("curve", "event_number"), _table(tests, most)),
-            "event_onward": (("curve", "event_number"), _table(onward, most)),
-        }
-        | {
-            f"event_{name}": (("curve", "event_number"), places[..., index], AXES[name].attributes)
-            for index, name in enumerate(along)
-        },
-        coords={name: (dims, found[name], AXES[name].attributes) for name in along},
+        | {name: ("curve", _texts(texts)) for name, texts in words.items()}
+        | _events(listed),
+        coords={name: (dims, found[name], AXES[name].attributes) for name in along} | _constants(listed[0]),
         attrs={
             "title": "Curves of bifurcations of a vibro-impact pair",
             "along": " ".join(along),
             "wall": "rigid" if listed[0].orbit.pair.rigid else "soft",
         },
     )
+    return made if of_map is None else _with_borders(made, of_map)
+
+
+def _events(listed: list[BifurcationCurve]) -> dict[str, tuple]:
+    """Lay out what of codimension 2 the curves met."""
+    dims, most = ("curve", "event_number"), max(len(curve.points) for curve in listed)
+    kinds = [[point.kind for point in curve.points] for curve in listed]
+    tests = [[point.test for point in curve.points] for curve in listed]
+    onward = [[point.onward for point in curve.points] for curve in listed]
+    places = padded([np.array([point.values for point in curve.points]).reshape(-1, 2) for curve in listed])
+    residuals = padded([np.array([float(point.orbit.residual[0]) for point in curve.points]) for curve in listed])
+    found = {
+        "event": (dims, _table(kinds, most)),
+        "event_test": (dims, _table(tests, most)),
+        "event_onward": (dims, _table(onward, most)),
+        "event_residual": (dims, residuals, _ABOUT["residual"]),
+    }
+    named = enumerate(listed[0].along)
+    return found | {f"event_{name}": (dims, places[..., index], AXES[name].attributes) for index, name in named}
+
+
+def _constants(curve: BifurcationCurve) -> dict[str, tuple]:
+    """Name the parameters that are the same all along a curve."""
+    pair = {name: getattr(curve.orbit.pair, name) for name in ("d", "kappa", "r", "gamma") if name not in curve.along}
+    still = {name: np.asarray(x) for name, x in pair.items() if x is not None and np.ptp(np.asarray(x)) == 0}
+    return {name: ((), float(x[0]), AXES[name].attributes) for name, x in still.items()}
+
+
+def _with_borders(dataset: "xr.Dataset", of: MapCurves) -> "xr.Dataset":
+    """Add what the curves explain of their map."""
+    names = dataset.attrs["along"].split()
+    places = {f"left_{name}": ("border", of.left[:, index], AXES[name].attributes) for index, name in enumerate(names)}
+    return dataset.assign(places).assign_attrs(borders=of.borders, explained=of.explained, ended=of.ended)
 
 
 def _columns(curve: BifurcationCurve) -> dict[str, np.ndarray]:

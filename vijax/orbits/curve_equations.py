@@ -1,26 +1,32 @@
 """A curve of bifurcations in a plane of two parameters as a path in the space of knots and both parameters.
 
-To the equations of the orbit come those of what it is that happens: a multiplier is 1 or -1, or the ball just touches
-a wall in flight. Past the end of real orbits the equations go on, as those of orbits do; test functions say where.
+To the equations of the orbit come those of what it is that happens: a multiplier is 1 or -1, the ball just touches a
+wall in flight, or an impact is as deep, or harvests as much of what it gives to the membrane, as may be. Past the end
+of real orbits the equations go on, as those of orbits do; test functions say where.
 """
 
+import dataclasses
 from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from vijax.model import flow
+from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.orbits import grazing, shooting
+from vijax.orbits import grazing, shooting, steady
 from vijax.orbits.criticality import cubic_coefficient
 from vijax.orbits.parameter import moved_together
 from vijax.orbits.shooting import LinearisedEquations, Sequence
 from vijax.runtime.arrays import AnyArray
 
-Condition = Literal["multiplier", "touch"]
+Condition = Literal["multiplier", "touch", "depth", "energy"]
+CONDITIONS: dict[str, Condition] = {"grazing": "touch", "penetration limit": "depth", "energy limit": "energy"}
+"""What holds on curves of a kind; on those of all other kinds a multiplier is given."""
 
 
 class CurveTests(NamedTuple):
@@ -30,7 +36,8 @@ class CurveTests(NamedTuple):
     cubic: Float[Array, ""]  # the cubic coefficient of a flip: on which side the doubled orbits lie
     plus: Float[Array, ""]  # A multiplier of a grazing orbit passes +1 where it changes sign.
     minus: Float[Array, ""]  # One passes -1 here.
-    push: Float[Array, ""]  # The acceleration away from the wall that is touched.
+    # At a graze the acceleration away from the wall that is touched; at a limit how far off all other impacts are.
+    push: Float[Array, ""]
     speed: Float[Array, ""]  # the clearances of `Tests`, but for the graze itself
     flight: Float[Array, ""]
     contact: Float[Array, ""]
@@ -46,10 +53,11 @@ FIRST_CURVE_END = CurveTests._fields.index("push")
 
 
 class Touch(eqx.Module):
-    """Where the ball touches a wall: after which impact, and which wall."""
+    """Where the ball touches a wall: after which impact, and which wall; at a limit, which impact is there."""
 
     impact: Int[AnyArray, "*orbit"]
     wall: Float[AnyArray, "*orbit"]
+    alike: Bool[AnyArray, "*orbit impact"] | None = None  # at a limit, the impacts that are there with it by symmetry
 
 
 class CurvePath(eqx.Module):
@@ -65,10 +73,11 @@ class CurvePath(eqx.Module):
         steepest: g/A of the device, gamma of a vertical tube (along "beta" only).
         low, high: Corners of the plane.
         multiplier: Which one of the orbit's multipliers is: +1. or -1. (flips, pitchforks of orbits closed half way).
-        touch: Where the ball touches a wall, on curves of grazing.
+        touch: Where the ball touches a wall, on curves of grazing; which impact is at the limit, on those of limits.
+        device: Whose limits they are, with its `penetration_limit`; None on curves of bifurcations.
         along: Which parameters move.
         logarithmic: Which of them count in their logarithms.
-        condition: Whether a multiplier is given, or a wall touched.
+        condition: Whether a multiplier is given, a wall touched, or an impact at a limit.
         newton_tolerance, max_corrections: See `ContinuationSettings`.
     """
 
@@ -80,6 +89,7 @@ class CurvePath(eqx.Module):
     high: Float[AnyArray, "*orbit 2"]
     multiplier: Float[AnyArray, "*orbit"]
     touch: Touch
+    device: Harvester | None
     along: tuple[str, str] = eqx.field(static=True)
     logarithmic: tuple[bool, bool] = eqx.field(static=True)
     condition: Condition = eqx.field(static=True)
@@ -117,9 +127,21 @@ class CurvePath(eqx.Module):
         if self.condition == "multiplier":
             both = shooting.multiplier_conditions(pair, self.sequence, knots)
             return jnp.where(self.multiplier > 0, both.plus, both.minus)[None]
+        if self.device is not None:
+            return self._loads(self.device, y[-2:], pair, knots)[self.touch.impact][None] - 1
         leave = jax.tree.map(lambda leaf: leaf[self.touch.impact], shooting.departures(pair, self.sequence, knots))
         rise, v = flow.flight(flow.flight_force(pair.gamma, leave.t), -leave.side * leave.speed, y[-3])
         return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])
+
+    def _loads(self, device: Harvester, z, pair: ImpactPair, knots) -> Float[Array, "impact"]:
+        """Compute penetrations over their limit, or harvested energies over those given to the membrane."""
+        x = self.places(z)
+        own = {name: x[index] for index, name in enumerate(self.along) if name in ("A", "omega")}
+        device = dataclasses.replace(device, **own)
+        # When a contact is deepest is found by a search, and moves with the knots by its own equation.
+        frozen = jax.tree.map(lax.stop_gradient, (pair, self.sequence, knots))
+        depth, energy, work = steady.yields(device, pair, self.sequence, knots, grazing.between(*frozen).deepest)
+        return depth / device.depth_limit if self.condition == "depth" else energy / work
 
     def equations(self, y) -> LinearisedEquations:
         """Compute the gap and the condition, and their derivatives in all unknowns."""
@@ -144,12 +166,17 @@ class CurvePath(eqx.Module):
             touch = jnp.where(here, y[-3], jnp.nan)
             leave = shooting.departures(pair, self.sequence, knots).t[self.touch.impact]
             push = -self.touch.wall * flow.acceleration(pair.gamma, leave + y[-3])
+        elif self.device is not None and self.touch.alike is not None:
+            plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
+            loads = self._loads(self.device, y[-2:], pair, knots)
+            push = jnp.where(self.touch.alike, 1.0, loads[self.touch.impact] - loads).min()
         else:
             cubic = jnp.where(self.multiplier > 0, one, cubic_coefficient(pair, self.sequence, knots))
         room = grazing.between(pair, self.sequence, knots, touch).clearance
         z = y[-2:]
         return CurveTests(
-            turn=(tangent[-2:] @ former[-2:]) / jnp.linalg.norm(former[-2:]),
+            # Where a limit turns back its orbit has met its mirror image or has doubled, which `push` says.
+            turn=(tangent[-2:] @ former[-2:]) / jnp.linalg.norm(former[-2:]) if self.device is None else one,
             cubic=cubic,
             plus=plus,
             minus=minus,

@@ -29,7 +29,8 @@ class CurvePoint(NamedTuple):
 
     Attributes:
         kind: "cusp", "generalised flip", "degenerate pitchfork", "fold-graze", "flip-graze", "pitchfork-graze", "double
-            graze", "degenerate graze" (no acceleration where the ball touches).
+            graze", "degenerate graze" (no acceleration where the ball touches); on a limit "fold", "flip", "pitchfork"
+            and "graze at a limit", "double limit" (another impact is there, too).
         test: What grazes besides, where orbits cease to be real: flight, impact, contact or exit; else "". At soft
             walls it has the name that fits the orbit with fewer impacts, as with a branch's `Point`.
         values: Of both parameters.
@@ -92,11 +93,14 @@ def _named(path: CurvePath, test: int, y: np.ndarray, kind: str, settings: Conti
         return _turning(orbits_at(path, y[None]), settings)
     if test == CUBIC:
         return ("degenerate pitchfork" if kind == "pitchfork" else "generalised flip"), False
+    limit = path.device is not None
     if name in ("plus", "minus"):
         flip = "pitchfork" if bool(path.sequence.mirrored) else "flip"
-        return f"{'fold' if name == 'plus' else flip}-graze", False
+        return f"{'fold' if name == 'plus' else flip}{' at a limit' if limit else '-graze'}", False
     if name == "push":
-        return "degenerate graze", True
+        return ("double limit" if limit else "degenerate graze"), True
+    if name in _TEST and limit:
+        return "graze at a limit", True
     if name in _TEST:
         return ("double graze" if kind == "grazing" else f"{kind}-graze"), True
     bound, _, which = name.partition("_")

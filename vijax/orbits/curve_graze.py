@@ -22,14 +22,14 @@ _LOOK = 1e-5
 def curve_passage(path: CurvePath, y: np.ndarray, test: str) -> Passage | None:
     """Find what is beyond a graze that a curve of folds, flips or pitchforks has come to.
 
-    None at a rigid wall, where no impact would be left, and where no curve sets out.
+    None at a rigid wall, where no impact would be left, on curves of grazes and limits, and where no curve sets out.
 
     Args:
         path, y: The path that has come to the graze, and its unknowns there.
         test: What grazes: flight, contact, impact or exit.
     """
     pair, knots = path.pair_and_knots(y)
-    if pair.rigid or path.condition == "touch":
+    if pair.rigid or path.condition != "multiplier":
         return None
     if (found := touching(pair, path.sequence, np.asarray(knots), test)) is None:
         return None

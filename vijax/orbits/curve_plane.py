@@ -3,12 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
 from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
 from vijax.model.quantities import synonyms
 from vijax.orbits.events import Point
-from vijax.orbits.parameter import check_along
+from vijax.orbits.parameter import check_along, moved_together
 from vijax.runtime import checks
 
 # A quantity whose bounds are farther apart than this counts in its logarithm.
@@ -25,7 +27,23 @@ def check_plane(pair: Any, within: Any) -> Plane:
     one, other = plane
     if other in synonyms(one):
         raise ValueError(f"within must name two parameters; got {one} and {other}, which say the same; keep one")
+    for name, (low, high) in plane.items():
+        ends = [_moved(pair, plane, name, value) for value in (low, high)]
+        if all(np.array_equal(*both) for both in zip(*map(jax.tree.leaves, ends), strict=True)):
+            raise ValueError(
+                f"within must name parameters that the orbits depend on; got {name}, which changes none of d, kappa, r "
+                f"and gamma where {one if name == other else other} is given"
+            )
     return plane
+
+
+def _moved(pair: Any, plane: Plane, name: str, value: float) -> ImpactPair:
+    """Move one parameter of a plane from its lower bound, the other one staying there."""
+    host = jax.tree.map(np.asarray, pair)
+    low: Any = tuple(np.asarray(bound) for bound, _ in plane.values())
+    there: Any = tuple(np.asarray(value) if one == name else bound for one, bound in zip(plane, low, strict=True))
+    steepest: Any = np.asarray(1.0)
+    return moved_together(host, tuple(plane), there, low, steepest)
 
 
 def place_of(point: Point, along: str, plane: Plane, device: Harvester) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Where curves begin: at what branches met, brought into the one form in which each kind of bifurcation is followed."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,8 +11,9 @@ from vijax.model.records import Status
 from vijax.orbits import grazing, symmetry
 from vijax.orbits.curve_equations import Touch
 from vijax.orbits.events import Point
-from vijax.orbits.periodic import Orbit, guessed, proven
+from vijax.orbits.periodic import Orbit, check_orbit, guessed, proven
 from vijax.orbits.shooting import Sequence
+from vijax.runtime import checks
 from vijax.runtime.programs import jitted
 
 
@@ -33,6 +34,19 @@ class CurveStart(NamedTuple):
     impact: int = 0
     wait: float = 0.0
     wall: float = 1.0
+
+
+def check_points(points: Any) -> list[Point]:
+    """Take points of branches, if curves can begin at them: at least one, an orbit each, all of one kind of wall."""
+    listed = checks.sequence("points", points, Point, "points of branches, such as branch.points")
+    if not listed:
+        raise ValueError("points must hold at least one to begin at; got none; branches meet them")
+    for index, point in enumerate(listed):
+        if len(check_orbit(point.orbit)) != 1:
+            raise ValueError(f"points must have one orbit each; got {len(point.orbit)} at index {index}; take [0:1]")
+        if point.orbit.pair.rigid != listed[0].orbit.pair.rigid:
+            raise ValueError(f"points must be of one kind of wall; got soft and rigid ones, the first at index {index}")
+    return listed
 
 
 def curve_start(point: Point, place: tuple[float, float], asymmetry: float) -> CurveStart | str:

@@ -4,8 +4,9 @@ They begin where branches met something (`curve_starts`); all lanes step togethe
 located afterwards (`curve_events`).
 """
 
+import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,6 +21,7 @@ from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation import MOST_POINTS
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.curve_equations import (
+    CONDITIONS,
     FIRST_CURVE_END,
     Condition,
     CurvePath,
@@ -29,8 +31,9 @@ from vijax.orbits.curve_equations import (
 from vijax.orbits.curve_events import CurvePoint, curve_events
 from vijax.orbits.curve_graze import curve_passage
 from vijax.orbits.curve_plane import Plane, check_plane, logarithmic, place_of, units
-from vijax.orbits.curve_starts import CurveStart, curve_start, with_touch
+from vijax.orbits.curve_starts import CurveStart, check_points, curve_start, with_touch
 from vijax.orbits.events import Point, orbits_at
+from vijax.orbits.limits import LIMITS, alike, limit_start
 from vijax.orbits.parameter import MOVED
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.pieces import Piece, follow_pieces, joined
@@ -40,13 +43,16 @@ from vijax.runtime.context import door
 _AT_ONCE = 4  # starts of one family that are followed at once, though they may turn out to lie on one curve
 # Two starts on one curve differ from it by less than a step's bend; other curves of the same label are farther apart.
 _ON_CURVE = 5e-4
+# How far from a limit an orbit may be from which Newton is to find it: a cell of a map with few of them.
+_BESIDE = 0.2
 
 
 class BifurcationCurve(NamedTuple):
     """A curve of one bifurcation in a plane, in the order in which it was followed.
 
     Attributes:
-        kind: "fold", "flip", "pitchfork" or "grazing" (the ball touches a wall in flight).
+        kind: "fold", "flip", "pitchfork", "grazing" (the ball touches a wall in flight), "penetration limit" or "energy
+            limit" (an impact is as deep, or harvests as much of what it gives to the membrane, as is admissible).
         along: Both parameters of the plane.
         values: Of both, a row an orbit.
         orbit: The orbits, with multipliers; those of a graze without the impact that begins there.
@@ -67,10 +73,10 @@ class BifurcationCurve(NamedTuple):
         """Say whether stable orbits border on each point.
 
         Always at folds, flips and pitchforks: the other multiplier is smaller than 1, as the product of both is. A
-        graze may be one of an unstable orbit.
+        graze or a limit may be one of an unstable orbit.
         """
         largest = np.abs(np.asarray(self.orbit.multipliers)).max(axis=1)
-        return largest < 1 if self.kind == "grazing" else np.full(len(largest), True)
+        return largest < 1 if self.kind in CONDITIONS else np.full(len(largest), True)
 
 
 @door
@@ -87,11 +93,11 @@ def follow_curves(
 
     Args:
         points: What branches met. From folds, flips, pitchforks and grazings of flights and impacts curves are
-            followed; of others a warning says so.
+            followed, and from where limits are met (`limit_points`); of others a warning says so.
         along: The parameter of these branches.
         within: The two parameters of the plane with their bounds, as in {"d": (0.05, 0.3), "kappa": (3, 400)}. Bounds
             more than a decade apart are gone through in logarithms.
-        device: For quantities of the device: its other constants, as branches were told.
+        device: For quantities of the device: its other constants, as branches were told; for limits, whose they are.
         max_points: Most points of a curve each way.
         settings: Of steps and events; arclengths are in units of the plane's sides and of knots.
 
@@ -101,24 +107,26 @@ def follow_curves(
     Raises:
         ValueError: Not two parameters, two names of one, bounds in the wrong order, or a point outside.
     """
-    listed = checks.sequence("points", points, Point, "points of branches, such as branch.points")
+    listed = check_points(points)
     max_points, settings = checks.whole("max_points", max_points, 2, MOST_POINTS), check_settings(settings)
-    if not listed:
-        raise ValueError("points must hold at least one to begin at; got none; branches meet them")
     device = one_device(device)
     plane = check_plane(listed[0].orbit.pair, within)
     checks.choice("along", along, MOVED)
     starts: list[CurveStart] = []
     refused: list[str] = []
     for point in listed:
-        start = curve_start(point, place_of(point, along, plane, device), settings.asymmetry)
+        place = place_of(point, along, plane, device)
+        if point.kind in LIMITS:
+            start = limit_start(point, place, tuple(plane), device, settings.asymmetry)
+        else:
+            start = curve_start(point, place, settings.asymmetry)
         if isinstance(start, str):
             refused.append(start)
         else:
             starts.append(start)
     if refused:
         warnings.warn(f"{len(refused)} of {len(listed)} points begin no curve: {refused[0]}", stacklevel=2)
-    return curves_from(starts, plane, device, max_points, settings)
+    return [one for some in curves_from(starts, plane, device, max_points, settings) for one in some]
 
 
 def curves_from(
@@ -128,8 +136,10 @@ def curves_from(
     max_points: int,
     settings: ContinuationSettings,
     known: list[BifurcationCurve] | None = None,
-) -> list[BifurcationCurve]:
+) -> Iterator[list[BifurcationCurve]]:
     """Follow every start that lies on no curve yet: one of each family at a time, all these together.
+
+    They come batch by batch, so that whoever stops in between has those before.
 
     Args:
         starts: All of one kind of wall, in the plane.
@@ -137,7 +147,6 @@ def curves_from(
         known: Curves that are there already.
     """
     left = unmet(_lanes(starts, plane, device, settings), known or [], plane)
-    found: list[BifurcationCurve] = []
     while left:
         chosen: dict[tuple, list[_Lane]] = {}
         for lane in left:
@@ -149,11 +158,11 @@ def curves_from(
             batches.setdefault((lane.path.condition, lane.first.y.size), []).append(lane)
         new: list[BifurcationCurve] = []
         for batch in batches.values():
-            new += _followed(batch, plane, max_points, settings, new)
+            some = _followed(batch, plane, max_points, settings, new)
+            new += some
+            yield some
         taken = {id(lane) for batch in batches.values() for lane in batch}
         left = unmet([lane for lane in left if id(lane) not in taken], new, plane)
-        found += new
-    return found
 
 
 Traits = np.ndarray
@@ -173,20 +182,19 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
     """Bring starts onto their curves; those are left out, with a warning, at which no real orbit is."""
     batches: dict[tuple, list[CurveStart]] = {}
     for start in starts:
-        batches.setdefault((start.kind == "grazing", start.orbit.knots.shape[1]), []).append(start)
+        batches.setdefault((CONDITIONS.get(start.kind), start.orbit.knots.shape[1]), []).append(start)
     lanes, lost = [], []
     for batch in batches.values():
         paths, y = _set_out(batch, plane, device, settings)
-        # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
-        across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
-        across = np.broadcast_to(across / np.linalg.norm(across), y.shape)
-        first = advance(paths, y, across, np.zeros(len(y)))
-        near = np.abs(first.y - y).max(axis=1) < settings.max_step
+        limit = paths.device is not None
+        first = _beside(paths, y) if limit else _on(paths, y)
+        near = np.abs(first.y - y).max(axis=1) < (_BESIDE if limit else settings.max_step)
         real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
         for index, good in enumerate(real & (first.size <= settings.newton_tolerance)):
             path, place = jax.tree.map(lambda leaf, i=index: leaf[i], (paths, first))
             if good:
-                lanes.append(_Lane(batch[index], _traits(batch[index].orbit, images=True), path, place))
+                start = _moved(batch[index], path, place.y) if limit else batch[index]
+                lanes.append(_Lane(start, traits(start.orbit, images=True), path, place))
             else:
                 lost.append(batch[index])
     if lost:
@@ -198,9 +206,35 @@ def _lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: 
     return lanes
 
 
+def _on(paths: CurvePath, y: np.ndarray) -> BranchPlace:
+    """Correct points that lie on their curves already, to find the tangents there."""
+    # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
+    across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
+    return advance(paths, y, np.broadcast_to(across / np.linalg.norm(across), y.shape), np.zeros(len(y)))
+
+
+def _beside(paths: CurvePath, y: np.ndarray) -> BranchPlace:
+    """Bring orbits that are near a limit onto its curve: by either parameter alone, whichever has less to move."""
+    still = np.eye(y.shape[1])[[-2, -1]]
+    tries = [advance(paths, y, np.broadcast_to(one, y.shape), np.zeros(len(y))) for one in still]
+    far = [np.where(one.size <= paths.newton_tolerance, np.abs(one.y - y).max(axis=1), np.inf) for one in tries]
+    first = far[0] <= far[1]
+
+    def chosen(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.where(first.reshape(-1, *(1,) * (one.ndim - 1)), one, other)
+
+    return jax.tree.map(chosen, *tries)
+
+
+def _moved(start: CurveStart, path: CurvePath, y: np.ndarray) -> CurveStart:
+    """Move a start that lay beside its curve onto it."""
+    x, other = map(float, path.places(y))
+    return start._replace(place=(x, other), orbit=orbits_at(path, y[None]))
+
+
 def unmet(lanes: list[_Lane], curves: list[BifurcationCurve], plane: Plane) -> list[_Lane]:
     """Keep the starts that lie on none of the curves, nor do their mirror images."""
-    paths = [(one.kind, np.column_stack([_traits(one.orbit), units(one.values, plane)])) for one in curves]
+    paths = [(one.kind, np.column_stack([traits(one.orbit), units(one.values, plane)])) for one in curves]
 
     def lies(lane: _Lane) -> bool:
         place = units(np.array(lane.start.place), plane)
@@ -220,7 +254,7 @@ def _family(start: CurveStart) -> tuple:
     return start.kind, float(sequence.span[0]), bool(sequence.mirrored[0]), *walls
 
 
-def _traits(orbit: Orbit, images: bool = False) -> Traits:
+def traits(orbit: Orbit, images: bool = False) -> Traits:
     """Give numbers that tell orbits apart, whichever impact they begin with; those of their mirror images, too."""
     host = jax.tree.map(np.asarray, orbit)
     side, knots = host.sequence.side, host.knots
@@ -252,7 +286,7 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
     orbit = periodic.concatenate([start.orbit for start in starts])
     size, (one, other), logarithms = len(starts), plane, logarithmic(plane)
     place = np.array([start.place for start in starts], float)
-    touches = starts[0].kind == "grazing"
+    condition: Condition = CONDITIONS.get(starts[0].kind, "multiplier")
     rows = tiles.arrays(
         {
             "start": place,
@@ -262,15 +296,14 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
             "multiplier": np.array([1.0 if start.kind == "fold" else -1.0 for start in starts]),
         }
     )
-    condition: Condition = "touch" if touches else "multiplier"
+    limit = condition in ("depth", "energy")
+    impact, wall = np.array([start.impact for start in starts], np.int32), np.array([start.wall for start in starts])
+    same = alike(starts, orbit, (one, other), device) if limit else None
     paths = CurvePath(
         pair=orbit.pair,
         sequence=orbit.sequence,
-        touch=Touch(
-            *tiles.arrays(
-                (np.array([start.impact for start in starts], np.int32), np.array([start.wall for start in starts]))
-            )
-        ),
+        touch=Touch(*tiles.arrays((impact, wall, same))),
+        device=_broadcast(device, size) if limit else None,
         along=(one, other),
         logarithmic=(logarithms[0], logarithms[1]),
         condition=condition,
@@ -280,8 +313,14 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
     )
     paths = jax.tree.map(np.asarray, paths)
     knots = np.where(paths.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
-    waits = np.array([[start.wait] for start in starts])[:, : int(touches)]
+    waits = np.array([[start.wait] for start in starts])[:, : int(condition == "touch")]
     return paths, np.concatenate([knots, waits, units(place, plane)], axis=1)
+
+
+def _broadcast(device: Harvester, size: int) -> Harvester:
+    """Give every lane the constants of the device, its penetration limit among them."""
+    whole = dataclasses.replace(device, penetration_limit=device.depth_limit)
+    return jax.tree.map(lambda x: np.full(size, float(x)), whole)
 
 
 def _followed(
@@ -338,7 +377,7 @@ def orbits_of(path: CurvePath, ys: np.ndarray) -> Orbit:
     real as it is, or with an impact of speed 0 there.
     """
     found = orbits_at(path, ys)
-    if path.condition == "multiplier" or (np.asarray(found.status) == Status.OK).all():
+    if path.condition != "touch" or (np.asarray(found.status) == Status.OK).all():
         return found
     wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), path)
     pair, knots = wide.pair_and_knots(ys)

@@ -1,18 +1,26 @@
 """Borders between differently labelled cells of a map, and which of them lie at a curve."""
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vijax.model.device import Harvester, with_constants
 from vijax.model.label import label
+from vijax.model.pair import ImpactPair
 from vijax.model.quantities import PARAMETERS
+from vijax.orbits.curve_plane import check_plane
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
     import xarray as xr
 
+_PAIR = ("d", "kappa", "r", "gamma")
+# Constants of the device that a map has among its attributes, and those that it has as coordinates.
+_TOLD = ("m_b", "g", "w0", "R0", "eps_M", "C_T", "V", "r_b", "penetration_limit")
+_MOVED = ("A", "omega", "kappa", "s", "r", "beta")
 _NEEDED = ("period", "impacts_left", "impacts_right", "status")
 
 
@@ -26,6 +34,7 @@ class LabelledPlane:
         names: Label of each cell; "" where the motion is not periodic, or has no impacts. Mirror images have one.
         period: Forcing periods of each cell's motion.
         cells: d, kappa (None at rigid walls), r, gamma, u0 and v0 of each cell.
+        admissible: Whether each cell is, where the map tells.
     """
 
     along: tuple[str, str]
@@ -33,6 +42,7 @@ class LabelledPlane:
     names: np.ndarray
     period: np.ndarray
     cells: dict[str, Any]
+    admissible: np.ndarray | None
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
@@ -40,36 +50,73 @@ class LabelledPlane:
         return {name: (float(axis[0]), float(axis[-1])) for name, axis in zip(self.along, self.axes, strict=True)}
 
 
+def device_of(dataset: "xr.Dataset") -> Harvester:
+    """Read the device of a map, as far as the map says; along its axes it is that of the first cell."""
+    told = {name: dataset.attrs[f"harvester_{name}"] for name in _TOLD if f"harvester_{name}" in dataset.attrs}
+    first = {name: float(dataset[name].values.flat[0]) for name in _MOVED if name in dataset.coords}
+    device = Harvester(**told | {name: first[name] for name in first if name != "kappa"})
+    if "kappa" in first:
+        device = with_constants(device, omega0=first["kappa"] * device.omega / math.pi)
+    return device
+
+
 def labelled_plane(dataset: "xr.Dataset") -> LabelledPlane:
     """Read the labels of a map over two parameters.
 
     Raises:
-        ValueError: No dataset with labels, other axes, or no periodic cell.
+        ValueError: No dataset with labels, axes along which curves cannot be followed, or no periodic cell.
     """
     checks.variables("dataset", dataset, _NEEDED, "vijax.sweep", "ask for these outputs")
-    period = dataset["period"]
-    if len(period.dims) != 2 or not set(period.dims) <= set(PARAMETERS):
-        raise ValueError(f"dataset must be a map over two parameters; got one over {', '.join(map(str, period.dims))}")
-    ordered = dataset.sortby(list(period.dims))
+    along = check_map(dataset, tuple(map(str, dataset["period"].dims)))
+    ordered = dataset.sortby(list(along))
     period = ordered["period"]
     like = {name: ordered[name].broadcast_like(period).transpose(*period.dims).values for name in _NEEDED}
-    cells: dict[str, Any] = {"kappa": None}
-    for name in ("d", "kappa", "r", "gamma", "u0", "v0"):
-        if name in ordered.coords:
-            cells[name] = ordered[name].broadcast_like(period).transpose(*period.dims).values
-    merge = cells["gamma"] == 0
-    names = label(*(like[name] for name in _NEEDED), merge_mirrors=merge)
+    cells = _cells(ordered, period)
+    names = label(*(like[name] for name in _NEEDED), merge_mirrors=cells["gamma"] == 0)
     impacts = like["impacts_left"] + like["impacts_right"]
     names = np.where((like["period"] > 0) & (impacts > 0), names, "")
     if not (names != "").any():
         raise ValueError("dataset must have periodic cells with impacts, whose orbits curves begin at; got none")
-    one, other = map(str, period.dims)
-    axes = tuple(np.asarray(ordered[name].values, float) for name in (one, other))
-    if min(map(len, axes)) < 2:
-        raise ValueError(
-            f"dataset must have at least two values along each axis; got {len(axes[0])} and {len(axes[1])}"
-        )
-    return LabelledPlane((one, other), (axes[0], axes[1]), names, like["period"], cells)
+    axes = tuple(np.asarray(ordered[name].values, float) for name in along)
+    told = ordered.get("admissible")
+    # Along an axis that the motion does not depend on there may be several verdicts a cell.
+    kept = None if told is None or set(told.dims) != set(along) else told.transpose(*along).values.astype(bool)
+    return LabelledPlane(along, (axes[0], axes[1]), names, like["period"], cells, kept)
+
+
+def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
+    """Give the two axes of a map, if curves can be followed in their plane; what its cells do is not looked at.
+
+    Args:
+        dataset: The map, or its coordinates and attributes alone.
+        dims: What its motion depends on.
+    """
+    if len(dims) != 2 or not set(dims) <= set(PARAMETERS):
+        idle = [str(dim) for dim in dataset.sizes if dim not in dims]
+        hint = f"; its motion does not depend on {checks.joined(idle)}" if idle else ""
+        raise ValueError(f"dataset must be a map over two parameters; got one over {', '.join(dims) or 'none'}{hint}")
+    one, other = dims
+    if min(dataset.sizes[one], dataset.sizes[other]) < 2:
+        got = f"{dataset.sizes[one]} and {dataset.sizes[other]}"
+        raise ValueError(f"dataset must have at least two values along each axis; got {got}")
+    if dataset.attrs.get("membrane", "linear") != "linear":
+        raise ValueError(f"dataset must be of linear membranes; got one of {dataset.attrs['membrane']}")
+    first: dict[str, Any] = {name: x.flat[0] for name, x in _cells(dataset).items() if x is not None}
+    pair = ImpactPair(first["d"], first.get("kappa"), first["r"], first["gamma"])
+    check_plane(pair, {name: (float(dataset[name].min()), float(dataset[name].max())) for name in dims})
+    return one, other
+
+
+def _cells(dataset: "xr.Dataset", like: "xr.DataArray | None" = None) -> dict[str, Any]:
+    """Give d, kappa (None at rigid walls), r, gamma, u0 and v0 of the cells of a map."""
+    cells: dict[str, Any] = {"kappa": None}
+    rigid = dataset.attrs.get("wall") == "rigid"
+    for name in (*_PAIR, "u0", "v0"):
+        # A map of rigid walls has a kappa, too, for its energies.
+        if name in dataset.coords and not (rigid and name == "kappa"):
+            values = dataset[name]
+            cells[name] = (values if like is None else values.broadcast_like(like).transpose(*like.dims)).values
+    return cells
 
 
 @dataclass(frozen=True)
@@ -89,6 +136,21 @@ class Borders:
         """Give the places of the borders in cells, a row each."""
         return self.cell + 0.5 * np.eye(2)[self.axis]
 
+    @property
+    def beyond(self) -> np.ndarray:
+        """Give the cells behind the borders, a row each."""
+        return self.cell + np.eye(2, dtype=int)[self.axis]
+
+    @property
+    def number(self) -> np.ndarray:
+        """Number the borders of a map: no two have one number."""
+        return (self.cell[:, 0] << 32) + 2 * self.cell[:, 1] + self.axis
+
+    def places(self, plane: LabelledPlane) -> np.ndarray:
+        """Give both parameters half way between the cells, a row each."""
+        middle = self.middle
+        return np.stack([np.interp(middle[:, i], np.arange(len(x)), x) for i, x in enumerate(plane.axes)], axis=1)
+
     def __getitem__(self, index: Any) -> "Borders":
         """Pick some."""
         return Borders(self.cell[index], self.axis[index])
@@ -98,15 +160,46 @@ class Borders:
 
 
 def borders(plane: LabelledPlane) -> Borders:
-    """Find every border between periodic cells."""
-    cells, axes = [], []
+    """Find every border between periodic cells with different labels."""
+    return _parted(plane, plane.names)
+
+
+def limit_borders(plane: LabelledPlane) -> Borders:
+    """Find every border between periodic cells of which one is admissible and the other is not.
+
+    Raises:
+        ValueError: The map does not tell.
+    """
+    if plane.admissible is None:
+        raise ValueError("limits must be those of a map with admissible, over its two axes alone; got one without it")
+    return _parted(plane, plane.admissible)
+
+
+def _parted(plane: LabelledPlane, by: np.ndarray) -> Borders:
+    """Find the pairs of neighbouring periodic cells in which something differs."""
+    cells, axes, periodic = [], [], plane.names != ""
     for axis in (0, 1):
         last = plane.names.shape[axis] - 1
-        here, there = (plane.names.take(np.arange(last) + shift, axis=axis) for shift in (0, 1))
-        found = np.argwhere((here != there) & (here != "") & (there != ""))
+        (here, there), both = (
+            [values.take(np.arange(last) + shift, axis=axis) for shift in (0, 1)] for values in (by, periodic)
+        )
+        found = np.argwhere((here != there) & both[0] & both[1])
         cells.append(found)
         axes.append(np.full(len(found), axis))
     return Borders(np.concatenate(cells), np.concatenate(axes))
+
+
+def largest_piece(found: Borders) -> Borders:
+    """Find the longest chain of borders of which each is next to another one."""
+    from scipy.sparse import csr_array  # here, as importing vijax must not load it
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    if not len(found):
+        return found
+    rows, columns = cKDTree(found.middle).query_pairs(1.0, output_type="ndarray").T
+    _, piece = connected_components(csr_array((np.ones(len(rows)), (rows, columns)), shape=2 * (len(found),)))
+    return found[piece == np.bincount(piece).argmax()]
 
 
 def near(found: Borders, curve: np.ndarray, plane: LabelledPlane, cells: float = 1.0) -> np.ndarray:

@@ -1,10 +1,12 @@
 """What the orbits of some cells of a map meet along one of its axes: where curves over the map begin."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 import numpy as np
 
+from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
@@ -14,6 +16,7 @@ from vijax.orbits.continuation import arcs_from, heading
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start
 from vijax.orbits.events import Point, changed, happenings, locate
+from vijax.orbits.limits import near_limits
 from vijax.orbits.map_borders import LabelledPlane
 from vijax.orbits.parameter import tilts
 from vijax.orbits.periodic import Orbit
@@ -21,6 +24,7 @@ from vijax.runtime import tiles
 
 _SETTLE = 200  # forcing periods that a cell's ball is flown before Newton looks for its orbit
 _MOST_PERIOD, _MOST_IMPACTS = 4, 8  # of the orbits that seed curves; others are rare, and each width is a program
+_NEAR_LIMIT = 0.3  # parts of a limit within which an orbit of a cell beside it is looked at
 _KINDS = {"speed": "grazing impact", "flight": "grazing flight", "fold": "fold", "minus": "flip"}
 
 
@@ -32,8 +36,8 @@ def seeds(
     steepest: float,
     max_points: int,
     settings: ContinuationSettings,
-) -> list[CurveStart]:
-    """Find the bifurcations that the orbits of some cells meet, each along an axis of the map.
+) -> Iterator[list[CurveStart]]:
+    """Find the bifurcations that the orbits of some cells meet, each along an axis of the map, in several parts.
 
     Args:
         plane: The map.
@@ -53,11 +57,21 @@ def seeds(
                 if some.any():
                     key = way, orbit.knots.shape[1]
                     groups.setdefault(key, []).append((orbit[np.flatnonzero(some)], mine[rows[some]]))
-    found = []
+        yield []  # Whoever counts the seconds may stop here.
     for (way, _), parts in groups.items():
         orbit = periodic.concatenate([part for part, _ in parts])
         where = cells[np.concatenate([rows for _, rows in parts])]
-        found += _met(plane, orbit, where, way, reach, steepest, max_points, settings)
+        yield _met(plane, orbit, where, way, reach, steepest, max_points, settings)
+
+
+def limit_seeds(plane: LabelledPlane, cells: np.ndarray, device: Harvester) -> list[CurveStart]:
+    """Find the orbits of some cells that are near a limit of the device."""
+    period, found = plane.period[tuple(cells.T)], []
+    for number in np.unique(period[period <= _MOST_PERIOD]):
+        mine = cells[period == number]
+        for orbit, rows in _orbits(plane, mine, int(number)):
+            places = np.stack([plane.axes[i][mine[rows, i]] for i in (0, 1)], axis=1)
+            found += near_limits(orbit, device, plane.along, places, _NEAR_LIMIT)
     return found
 
 

@@ -153,7 +153,7 @@ def response(
     knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)
     knots = shared_slopes(_follows(pair, sequence, knots))
     valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    depth, harvested, work = (valid * x for x in _impacts(device, pair, sequence, knots, deepest))
+    depth, harvested, work = (valid * x for x in yields(device, pair, sequence, knots, deepest))
     P = jnp.where(sequence.real, harvested, 0.0).sum() / sequence.span
     left, right = ((sequence.side == wall).sum(dtype=jnp.int32) for wall in (-1, 1))
     # Closed half way, the mirror image of the orbit is the rest of it.
@@ -180,9 +180,10 @@ def response(
 _HARMLESS = (0.0, 1.0, 0.5)  # a knot
 
 
-def _impacts(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):
+def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):
     """Compute depth [m], harvested energy [J] and energy given to the membrane [J] of every impact.
 
+    Padded impacts have none of the first two and infinitely much of the last.
     Where several results need a derivative XLA would compute it for each of them: sharing them halves what it compiles.
     """
     real = sequence.real

@@ -1,6 +1,7 @@
 """Pictures of curves of bifurcations in their plane, alone or over a map."""
 
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,66 +9,94 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
-from vijax.plots.figure import styled
+from vijax.orbits.curve_rows import NEEDED, numbered_points
+from vijax.plots.figure import label_logs, styled
 from vijax.plots.kind_maps import label_map
-from vijax.plots.number_maps import power_map
+from vijax.plots.number_maps import power_map, variable_map
 from vijax.plots.style import axis_label, title
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
     import xarray as xr
 
-Ground = Literal["label", "P"]
-_NEEDED = ("kind", "stable", "event", "end_first")
-_COLOURS = {"fold": "tab:red", "flip": "tab:blue", "pitchfork": "black", "grazing": "tab:green"}
-_EDGE: list[Any] = [Stroke(linewidth=2.6, foreground="white"), Normal()]
-_POINT: dict[str, Any] = {"marker": "o", "markersize": 4, "color": "white", "mec": "black", "linestyle": "none"}
+# Kinds of curves: told apart by their dashes too, as a paper may be printed in black.
+_KINDS: dict[str, dict[str, Any]] = {
+    "fold": {"color": "tab:red"},
+    "flip": {"color": "tab:blue", "dashes": (5, 1.2)},
+    "pitchfork": {"color": "black"},
+    "grazing": {"color": "tab:green", "dashes": (1.6, 1.0)},
+    "penetration limit": {"color": "tab:purple", "dashes": (6, 1.2, 1.2, 1.2)},
+    "energy limit": {"color": "tab:orange", "dashes": (6, 1.2, 1.2, 1.2)},
+}
+_EDGE: dict[str, Any] = {"color": "white", "linewidth": 2.4, "solid_capstyle": "butt"}
+_POINT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "color": "white", "mec": "black", "linestyle": "none"}
+_NUMBER: dict[str, Any] = {
+    "textcoords": "offset points",
+    "ha": "center",
+    "va": "center",
+    "fontsize": "small",
+    "path_effects": [Stroke(linewidth=1.8, foreground="white"), Normal()],
+    "zorder": 7,
+}
+# Where a number may stand beside its point, in points: where there is most room, the first of these at equal room.
+_BESIDE = ((6, 5), (-6, 5), (6, -5), (-6, -5), (0, 8), (0, -8), (11, 0), (-11, 0))
 _MOST_LISTED = 24  # points beside a picture; all of them stand in the dataset
-_FAINT = 0.25
+_FAINT = 0.35
 # Columns of the legend; the height of a line and the width of the list, in inches.
 _COLUMNS, _LINE_HEIGHT, _LIST_WIDTH = 3, 0.17, 2.2
 
 
 @styled
 def curves(
-    dataset: "xr.Dataset", over: "xr.Dataset | None" = None, *, ground: Ground = "label", unstable: bool = False
+    dataset: "xr.Dataset", over: "xr.Dataset | None" = None, *, ground: str = "label", unstable: bool = False
 ) -> Figure:
     """Draw curves of bifurcations in their plane, with numbered points of codimension 2, alone or over a map.
 
     Args:
         dataset: What `vijax.curve_dataset` returned.
         over: The map that they are drawn over, with the same two axes and no others.
-        ground: What the map shows: its labels, or P as `power_map` does.
-        unstable: Whether grazings of unstable orbits are drawn too, faintly.
+        ground: What the map shows: "label", "P" as `power_map` draws it, or another variable of it.
+        unstable: Whether what is met by unstable orbits alone is drawn too, faintly: grazings and limits.
 
     Raises:
-        ValueError: A map with other axes.
+        ValueError: A map with other axes, or without such a variable.
     """
-    checks.variables("dataset", dataset, _NEEDED, "vijax.curve_dataset")
-    checks.choice("ground", ground, ("label", "P"))
+    checks.variables("dataset", dataset, NEEDED, "vijax.curve_dataset")
     names = dataset.attrs["along"].split()
     if over is None:
         figure, x, y = _bare(dataset, names), names[0], names[1]
     else:
-        checks.variables("over", over, ("period",), "vijax.sweep")
-        x, y = map(str, over["period"].dims) if over["period"].ndim == 2 else ("", "")
-        if {x, y} != set(names):
-            got = ", ".join(map(str, over["period"].dims))
-            raise ValueError(f"over must be a map over {names[0]} and {names[1]} alone; got one over {got}")
-        figure = label_map(over) if ground == "label" else power_map(over)
+        figure, x, y = _ground(over, names, ground)
     axes = figure.axes[0]
-    kinds = _draw(axes, dataset, x, y, unstable)
-    handles = [Line2D([], [], color=_COLOURS[kind], label=kind) for kind in _COLOURS if kind in kinds]
-    handles += [Line2D([], [], **_POINT, label=text) for text in _number(axes, dataset, x, y)]
-    # A map of labels has its legend beside it, one of P below.
-    beside = over is not None and ground == "P"
-    columns = 1 if beside else _COLUMNS
+    kinds = draw_curves(axes, dataset, x, y, unstable)
+    handles = kind_handles(kinds)
+    listed = _number(axes, dataset, x, y)
+    handles += [Line2D([], [], label=text, **_listed(number)) for number, text in listed[:_MOST_LISTED]]
+    if len(listed) > _MOST_LISTED:
+        handles.append(Line2D([], [], label=f"and {len(listed) - _MOST_LISTED} more", linestyle="none"))
+    # A map of labels has its legend beside it, one of numbers below.
+    beside = over is not None and ground != "label"
+    columns = 1 if beside else _COLUMNS - (over is None)
     width, height = figure.get_size_inches()
     more = _LINE_HEIGHT * -(-len(handles) // columns)
     figure.set_size_inches((width + _LIST_WIDTH, max(height, more)) if beside else (width, height + more))
-    style: dict[str, Any] = {"ncols": columns, "frameon": False, "fontsize": "x-small"}
+    style: dict[str, Any] = {"ncols": columns, "frameon": False, "fontsize": "small", "handlelength": 2.4}
     figure.legend(handles=handles, loc="outside right upper" if beside else "outside lower center", **style)
     return figure
+
+
+def _ground(over: "xr.Dataset", names: list[str], ground: str) -> tuple[Figure, str, str]:
+    """Draw the map below curves in a plane of two parameters, and say which of them is across, which is up."""
+    checks.variables("over", over, ("period",), "vijax.sweep")
+    checks.choice("ground", ground, ["label", *map(str, over)])
+    over = over.squeeze()
+    dims = [str(dim) for dim in over["period" if ground == "label" else ground].dims]
+    if set(dims) != set(names):
+        got = ", ".join(dims) or "none"
+        raise ValueError(f"over must be a map over {names[0]} and {names[1]} alone; got one over {got}")
+    if ground in ("label", "P"):
+        return (label_map if ground == "label" else power_map)(over), dims[0], dims[1]
+    return variable_map(over, ground), dims[0], dims[1]
 
 
 def _bare(dataset: "xr.Dataset", names: list[str]) -> Figure:
@@ -78,41 +107,51 @@ def _bare(dataset: "xr.Dataset", names: list[str]) -> Figure:
     scales = ["log" if low > 0 and high > 10 * low else "linear" for low, high in limits]
     axes.set(xscale=scales[0], yscale=scales[1], xlim=limits[0], ylim=limits[1])
     axes.set(xlabel=axis_label(dataset[names[0]]), ylabel=axis_label(dataset[names[1]]))
+    label_logs(axes)
     figure.suptitle(title(dataset), fontsize="medium")
     return figure
 
 
-def _draw(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> set[str]:
+def kind_handles(kinds: Collection[str]) -> list[Line2D]:
+    """Give the entries of a legend for kinds of curves."""
+    return [Line2D([], [], label=kind, **style) for kind, style in _KINDS.items() if kind in kinds]
+
+
+def draw_curves(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> set[str]:
     """Draw every curve, and say which kinds there are."""
     drawn = set()
     for index in range(dataset.sizes["curve"]):
         one = dataset.isel(curve=index)
         kind, stable = str(one["kind"].item()), one["stable"].values == 1
         across, up = one[x].values, one[y].values
-        parts: list[tuple[np.ndarray, dict[str, Any]]] = [(stable, {"path_effects": _EDGE, "linewidth": 1.2})]
-        if unstable:
-            parts.append((~stable, {"alpha": _FAINT, "linewidth": 0.8}))
-        for shown, style in parts:
+        faint: dict[str, Any] = {"linewidth": 0.8, "alpha": _FAINT}
+        strong: dict[str, Any] = {"linewidth": 1.2}
+        for shown, style in ((stable, strong), (~stable & unstable, faint)):
             if (shown & np.isfinite(across)).any():
-                axes.plot(np.where(shown, across, np.nan), up, color=_COLOURS[kind], **style)
+                line = np.where(shown, across, np.nan)
+                if shown is stable:
+                    axes.plot(line, up, **_EDGE)
+                axes.plot(line, up, **_KINDS[kind], **style)
                 drawn.add(kind)
     return drawn
 
 
-def _number(axes: Axes, dataset: "xr.Dataset", x: str, y: str) -> list[str]:
+def _number(axes: Axes, dataset: "xr.Dataset", x: str, y: str) -> list[tuple[int, str]]:
     """Mark and number the points of codimension 2, each place once, and tell what they are."""
-    rows = zip(
-        dataset["event"].values.flat,
-        dataset[f"event_{x}"].values.flat,
-        dataset[f"event_{y}"].values.flat,
-        strict=True,
-    )
-    listed: list[str] = []
-    for kind, across, up in rows:
-        text = f"{kind} ({across:.4g}, {up:.4g})"
-        if not kind or any(text == known.partition(" ")[2] for known in listed):
-            continue
-        listed.append(f"{len(listed) + 1} {text}")
-        axes.plot(across, up, **_POINT, zorder=6)
-        axes.annotate(str(len(listed)), (across, up), xytext=(3, 3), textcoords="offset points", fontsize="x-small")
-    return listed[:_MOST_LISTED] + ([f"and {len(listed) - _MOST_LISTED} more"] if len(listed) > _MOST_LISTED else [])
+    turned = dataset.attrs["along"].split() != [x, y]
+    numbered = [(one, one.place[::-1] if turned else one.place) for one in numbered_points(dataset)]
+    taken = [axes.transData.transform(place) * 72 / axes.figure.dpi for _, place in numbered]
+    points = list(taken)
+    for (one, place), at in zip(numbered, points, strict=True):
+        axes.plot(*place, **_POINT, zorder=6)
+        room = [min(np.abs(at + beside - other).max() for other in taken) for beside in _BESIDE]
+        best = _BESIDE[int(np.argmax(np.minimum(room, 8)))]
+        taken.append(at + best)
+        axes.annotate(str(one.number), place, xytext=best, **_NUMBER)
+    return [(one.number, f"{one.kind} ({place[0]:.4g}, {place[1]:.4g})") for one, place in numbered]
+
+
+def _listed(number: int) -> dict[str, Any]:
+    """Give the handle of a point in the legend: its number."""
+    size = 5.5 if number < 10 else 7.0
+    return {"marker": f"${number}$", "markersize": size, "color": "black", "mew": 0, "linestyle": "none"}

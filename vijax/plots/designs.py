@@ -5,11 +5,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from vijax.design.report import factors
 from vijax.design.report_lines import amount
+from vijax.design.tolerance_plane import TolerancePlane
 from vijax.design.variables import LINEAR, constant
+from vijax.model.quantities import AXES
 from vijax.model.units import UNITS
+from vijax.orbits.curve_dataset import curve_dataset
+from vijax.plots.curve_maps import draw_curves, kind_handles
 from vijax.plots.figure import label_logs, styled
 from vijax.plots.style import axis_label, symbol
 from vijax.runtime import checks
@@ -31,6 +37,7 @@ _PATH: dict[str, Any] = {
     "markerfacecolor": "white",
 }
 _NAIVE: dict[str, Any] = {"marker": "X", "markersize": 8, "color": "#d62728", "linestyle": "none", "mew": 0}
+_TIP: dict[str, Any] = {"marker": "D", "markersize": 4.5, "color": "white", "markeredgecolor": "black", "mew": 0.8}
 _EDGE: dict[str, Any] = {"color": "black", "linestyle": ":", "linewidth": 0.9}
 _WIDE = 4.0  # ratio of the bounds from which on an axis is logarithmic
 _DECADES = 6  # P is shown down to so many decades below the largest
@@ -42,19 +49,25 @@ _ERRORS = 3  # standard errors, half the height of the band of an average
 
 
 @styled
-def design(diagram: "xr.Dataset", report: dict[str, Any]) -> Figure:
+def design(diagram: "xr.Dataset", report: dict[str, Any], plane: TolerancePlane | None = None) -> Figure:
     """Draw P along an axis, falling and rising, under the ascent, the optimum, its tolerances and what is not physical.
 
     Args:
         diagram: `vijax.orbit_diagram` in both directions, at the optimum.
         report: What `vijax.design.report.describe` returned, with the same diagram.
+        plane: What `vijax.design_plane` returned of the optimum: a panel shows it among its curves, with the box of
+            both tolerances.
     """
     checks.record("report", report, ("best",), "vijax.design.report.describe")
     checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
     along, best = str(diagram.attrs["along"]), report["best"]
     near = None if best is None else close_view(along, _here(best, along))
-    figure = Figure(figsize=(6.4, 4.2 if near is None else 6.6), layout="constrained")
-    panels = figure.subplots(1 if near is None else 2, squeeze=False)[:, 0]
+    count = 1 + (near is not None) + (plane is not None)
+    figure = Figure(figsize=(6.4, 1.8 + 2.4 * count), layout="constrained")
+    panels = figure.subplots(count, squeeze=False)[:, 0]
+    extra: list[Any] = []
+    if plane is not None:
+        extra, panels = _in_plane(panels[-1], plane), panels[:-1]
     for axes in panels:
         _draw(axes, diagram, report)
     _whole(panels[0], diagram)
@@ -64,8 +77,29 @@ def design(diagram: "xr.Dataset", report: dict[str, Any]) -> Figure:
         panels[1].ticklabel_format(axis="y", scilimits=(0, 0))
     panels[-1].set_xlabel(axis_label(diagram[along]))
     handles, texts = panels[0].get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.4)
+    handles, texts = [*handles, *extra], [*texts, *(handle.get_label() for handle in extra)]
+    wide = 2.2 if extra else 1.4  # the dashes of a curve want room
+    figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=wide)
     return figure
+
+
+def _in_plane(axes: Axes, plane: TolerancePlane) -> list[Any]:
+    """Draw the optimum among the curves of a plane, with the box of its tolerances; give the legend's entries."""
+    (x, y), (across, up) = plane.within, plane.here
+    one, other = plane.tolerances
+    kinds: set[str] = set()
+    if plane.curves:
+        dataset = curve_dataset(plane.curves)
+        kinds = draw_curves(axes, dataset, x, y, unstable=True)
+    corner = across * (1 - one.spread), up * (1 - other.spread)
+    axes.add_patch(Rectangle(corner, 2 * across * one.spread, 2 * up * other.spread, **_BAND))
+    for found in (plane.nearest, plane.limit):
+        if found is not None:
+            axes.plot(*found.values, zorder=5, linestyle="none", **_TIP)
+    axes.plot(across, up, zorder=6, linestyle="none", **_STAR)
+    axes.set(xlim=plane.within[x], ylim=plane.within[y], xlabel=_symbol(x), ylabel=_symbol(y))
+    tip = Line2D([], [], linestyle="none", label="nearest bifurcation, limit", **_TIP)
+    return [*kind_handles(kinds), *([tip] if plane.nearest or plane.limit else [])]
 
 
 def close_view(along: str, here: float) -> tuple[float, float]:
@@ -236,6 +270,11 @@ def _holding(best: dict[str, Any]) -> str:
     if best["active"]:
         return best["active"][0].split()[0]
     return "" if best["stopped"] == "maximum" else "unsettled"
+
+
+def _symbol(name: str) -> str:
+    about = AXES[name].attributes
+    return f"${about['symbol']}$" + (f" [{UNITS[name]}]" if name in UNITS else "")
 
 
 def _named(name: str) -> str:
