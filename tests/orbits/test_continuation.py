@@ -15,6 +15,7 @@ from vijax.orbits.shooting import Sequence
 SPAN = (0.1, 0.3)
 # Of the issue's reference: where the symmetric orbit breaks, and where two left and one right impact fold.
 PITCHFORK, FOLD = 0.2634316, 0.20158
+Q = 1.5 / (0.5 * np.pi)  # (1 + r)/(pi (1 - r)) at r = 0.5: the pitchfork is known in closed form
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +40,18 @@ def test_symmetry_breaks_where_it_is_known_to(family):
     for point in broken:
         assert point.value == pytest.approx(PITCHFORK, abs=5e-8)
         assert abs(largest(point) - 1) < 1e-6
+
+
+def test_a_branch_of_mirror_images_knows_the_pitchfork_as_well_as_the_symmetric_one(family):
+    """Newton is singular there, and came to 1e-8 before the place was sought on orbits closed half way."""
+    pair = family[1].orbit
+    index = int(np.abs(family[1].values - 0.2).argmin())
+    (branch,) = continuation.follow(pair[index : index + 1], "d", SPAN)
+    for one in (branch, family[0]):
+        (point,) = points([one], "pitchfork")
+        assert point.value == pytest.approx((1 - 4 / np.pi**2) * Q / np.sqrt(1 + 4 * Q**2), abs=1e-13)
+        assert point.orbit.status[0] == Status.OK
+        assert abs(largest(point) - 1) < 1e-9
 
 
 def test_the_branch_of_mirror_images_flips_alike(family):

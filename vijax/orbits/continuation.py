@@ -11,10 +11,11 @@ import numpy as np
 
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
+from vijax.orbits import symmetry
 from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
 from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
-from vijax.orbits.events import BranchEvent, Point, events, happenings, kind_of, orbits_at
+from vijax.orbits.events import BranchEvent, Point, events, happenings, kind_of, locate, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
 from vijax.orbits.periodic import Orbit, check_orbit
 from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
@@ -25,6 +26,7 @@ from vijax.runtime.pages import see
 
 MOST_POINTS = 10**6  # of a branch: beyond, a number was mistyped, and is refused before memory is taken
 Direction = Literal["up", "down", "both"]
+_NEAR = 1e-4  # arclength on either side of a pitchfork, known to 1e-8, in which it is located once more
 _WAYS: dict[Direction, tuple[float, ...]] = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
 
 
@@ -176,7 +178,7 @@ def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool
             beyond = _beyond(arc, event, y, tests)
             kind, orbit = (kind, orbit) if beyond is None else (f"grazing {beyond.touches}", beyond.orbit)
         if kind not in ("low", "high"):
-            met.append(Point(kind, float(event.y[-1] * unit), orbit))
+            met.append(_point(arc, kind, event.y, orbit, settings))
         if ends:
             end, last, ending = kind, event.place + 1, [orbit]
             values = np.append(y[:last, -1], event.y[-1])
@@ -195,6 +197,30 @@ def _beyond(arc: Arc, event: BranchEvent, y: np.ndarray, tests: np.ndarray) -> P
     if not np.abs(rises) > 0:  # unknown at the very beginning of a branch that was switched to
         rises = event.y[-1] - y[event.place, -1]
     return branch_passage(arc, event.y, event.test, float(np.sign(rises)))
+
+
+def _point(arc: Arc, kind: str, y: np.ndarray, orbit: Orbit, settings: ContinuationSettings) -> Point:
+    """Make a point of what was met; of a pitchfork at the orbit closed half way, if that can be found.
+
+    In full two branches of orbits cross there, Newton is singular, and the place is known to 1e-8 only.
+    """
+    value = float(y[-1] * (arc.high - arc.low))
+    plain = Point(kind, value, orbit)
+    if kind != "pitchfork" or bool(arc.sequence.mirrored) or tilts(arc.along):
+        return plain
+    half, row = symmetry.halved(orbit, settings.asymmetry), jax.tree.map(np.atleast_1d, arc)
+    arcs, known = arcs_from(half, arc.along, np.array([value]), row.steepest, (row.low, row.high), settings)
+    ahead = np.zeros_like(known)
+    ahead[:, -1] = 1.0
+    first, reach = advance(arcs, known, ahead, np.zeros(1)), np.array([_NEAR])
+    before = advance(arcs, first.y, first.tangent, -reach)
+    test = np.array([Tests._fields.index("minus")])
+    _, there, sure = locate(arcs, before.y, before.tangent, 2 * reach, test, before.tests[0, test], settings)
+    if not sure[0]:
+        return plain
+    arc = jax.tree.map(lambda leaf: leaf[0], arcs)
+    full = symmetry.unfolded(orbits_at(arc, there))
+    return Point(kind, float(there[0, -1] * (arc.high - arc.low)), full)
 
 
 def _joined(down: Branch, up: Branch) -> Branch:
