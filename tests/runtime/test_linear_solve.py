@@ -21,6 +21,15 @@ def test_systems_are_solved(size):
     assert (backward < 1e-14 * scale).all()
 
 
+def test_several_right_sides_are_solved_as_each_alone():
+    draw = np.random.default_rng(2)
+    matrix, right = draw.normal(size=(5, 5)), draw.normal(size=(5, 3))
+    each = np.stack([linear_solve.solve(matrix, right[:, k]) for k in range(3)], axis=1)
+    np.testing.assert_allclose(linear_solve.solve(matrix, right), each, rtol=1e-14)
+    slope = jax.jacfwd(lambda b: linear_solve.solve(matrix, b))(right)
+    np.testing.assert_allclose(slope, np.einsum("ij,kl->ikjl", np.linalg.inv(matrix), np.eye(3)), rtol=0, atol=1e-12)
+
+
 def test_derivatives_are_those_of_lapack():
     draw = np.random.default_rng(0)
     matrix, right = jnp.asarray(draw.normal(size=(5, 5))), jnp.asarray(draw.normal(size=5))

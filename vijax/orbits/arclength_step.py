@@ -154,7 +154,7 @@ def _correct(path: Path, guess, former) -> _Corrected:
         gap, slope = path.equations(at.y)
         slope = jnp.concatenate([slope, former[None]])
         miss = jnp.append(gap, former @ (at.y - guess))
-        step, tangent = jax.vmap(linear_solve.solve, in_axes=(None, 0))(slope, jnp.stack([miss, ahead]))
+        step, tangent = linear_solve.solve(slope, jnp.stack([miss, ahead], axis=1)).T
         return _Corrected(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.corrections + 1)
 
     def going(at: _Corrected):

@@ -9,23 +9,23 @@ from jax import lax
 from jaxtyping import Array, Float
 
 
-def solve(matrix: Float[Array, "row row"], right: Float[Array, "row"]) -> Float[Array, "row"]:
-    """Solve matrix x = right; differentiable in both, every order, forward and reverse.
+def solve(matrix: Float[Array, "row row"], right: Float[Array, "row *side"]) -> Float[Array, "row *side"]:
+    """Solve matrix x = right for one right side, or a column each; differentiable in both, every order, both ways.
 
     Gauss and Jordan's elimination with partial pivoting; not finite where the matrix is singular.
     """
     return lax.custom_linear_solve(
-        lambda x: (matrix * x).sum(axis=1),
+        lambda x: (matrix[..., None] * x.reshape(x.shape[0], -1)).sum(axis=1).reshape(x.shape),
         right,
         lambda _, b: _eliminated(matrix, b),
         lambda _, b: _eliminated(matrix.T, b),
     )
 
 
-def _eliminated(matrix: Float[Array, "row row"], right: Float[Array, "row"]) -> Float[Array, "row"]:
+def _eliminated(matrix: Float[Array, "row row"], right: Float[Array, "row *side"]) -> Float[Array, "row *side"]:
     size = right.shape[0]
     index = jnp.arange(size, dtype=jnp.int32)
-    wide = jnp.concatenate([matrix, right[:, None]], axis=1)
+    wide = jnp.concatenate([matrix, right.reshape(size, -1)], axis=1)
 
     def clear(k, carry):
         """Clear column k from all rows but the one that becomes its pivot; rows stay where they are."""
@@ -38,4 +38,5 @@ def _eliminated(matrix: Float[Array, "row row"], right: Float[Array, "row"]) -> 
         return wide, jnp.where(chosen, k, pivots)
 
     wide, pivots = lax.fori_loop(0, size, clear, (wide, jnp.full(size, -1, jnp.int32)))
-    return jnp.where(pivots == index[:, None], wide[:, -1], 0.0).sum(axis=1)
+    mine = (pivots == index[:, None])[..., None]
+    return jnp.where(mine, wide[:, size:], 0.0).sum(axis=1).reshape(right.shape)
