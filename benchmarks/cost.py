@@ -6,20 +6,21 @@
 The planes: d 0.05..0.3 by kappa 3..400 (log), and d by v0 -0.6..0.6 at kappa 400, where rigid walls have as many cells
 to simulate as soft ones; r 0.5, start (0, 0.4), over a window. Microseconds are of whole warm calls of `vijax.sweep`
 for each cell of the plane and period, medians; ratios are against another row of the same round, median and range.
-Printout for 64 x 64 cells and 50 periods, two cores, on a busy machine:
+Printout for 128 x 128 cells and 100 periods, two quiet cores:
 
-    counts             0.4350 us per cell-period
-    counts, again      0.3783 us per cell-period     0.85 times counts (0.70 to 1.00)
-    lyapunov           0.4351 us per cell-period     1.02 times counts (0.73 to 1.15)
-    P                  0.4858 us per cell-period     1.00 times counts (0.91 to 1.29)
-    P at 8 omega       0.8966 us per cell-period     1.85 times P (1.53 to 2.10)
-    gamma = 0 given    0.4191 us per cell-period     0.96 times counts (0.78 to 1.04)
-    gamma = 0.1        0.5837 us per cell-period     1.39 times counts (1.05 to 1.68)
-    gamma = 0.5        0.8554 us per cell-period     1.96 times counts (1.62 to 2.27)
-    soft, starts       0.5903 us per cell-period
-    rigid, starts      0.4612 us per cell-period     0.75 times soft, starts (0.58 to 0.89)
-    rigid map          0.2564 us per cell-period     0.54 times P (0.44 to 0.74)
-
+    counts             0.0565 us per cell-period
+    counts, again      0.0556 us per cell-period     1.00 times counts (0.95 to 1.03)
+    lyapunov           0.0653 us per cell-period     1.15 times counts (1.10 to 1.24)
+    P                  0.0698 us per cell-period     1.22 times counts (1.21 to 1.28)
+    P at 8 omega       0.0933 us per cell-period     1.36 times P (1.29 to 1.39)
+    gamma = 0 given    0.0565 us per cell-period     1.00 times counts (0.93 to 1.06)
+    gamma = 0.1        0.0767 us per cell-period     1.37 times counts (1.30 to 1.42)
+    gamma = 0.5        0.1230 us per cell-period     2.18 times counts (2.15 to 2.30)
+    P, gamma = 0.1     0.1016 us per cell-period     1.48 times P (1.44 to 1.54)
+    P, gamma = 0.5     0.1594 us per cell-period     2.34 times P (2.23 to 2.47)
+    soft, starts       0.0746 us per cell-period
+    rigid, starts      0.0514 us per cell-period     0.69 times soft, starts (0.66 to 0.84)
+    rigid map          0.0225 us per cell-period     0.32 times P (0.30 to 0.39)
 """
 
 import argparse
@@ -67,6 +68,7 @@ def contenders(side: int, periods: int) -> dict[str, Contender]:
         f"P at {FREQUENCIES} omega": Contender(partial(plane, omega=omega, outputs=power), "P"),
         "gamma = 0 given": Contender(partial(plane, gamma=LEVEL, outputs=counts), "counts"),
         **{f"gamma = {slope}": Contender(partial(plane, gamma=slope, outputs=counts), "counts") for slope in INCLINED},
+        **{f"P, gamma = {slope}": Contender(partial(plane, gamma=slope, outputs=power), "P") for slope in INCLINED},
         "soft, starts": Contender(partial(starts, outputs=power), None),
         "rigid, starts": Contender(partial(starts, wall="rigid", outputs=power), "soft, starts"),
         # All kappa of a rigid wall are one simulation, so its whole map is.
