@@ -220,7 +220,7 @@ SHAPES = (
     ("grid", ("map.zarr",), "map.zarr"),
     ("grid", ("--d", "0.1:0.2:3", "--s", "0.3"), "s"),
     ("grid", ("--gamma", "0.1", "--beta", "0.1"), "beta"),
-    ("grid", ("--d", "0.1", "--kappa", "30"), "plot"),
+    ("grid", ("--d", "0.1", "--kappa", "30", "--plot", "one.png"), "plot"),
     ("grid", ("--omega", "3:12:50"), "omega"),
     ("grid", ("--workers", "2", "--scheduler", "tcp://127.0.0.1:1"), "workers"),
     ("grid", ("--workers", "2", "--plot", "map.png"), "workers"),

@@ -214,10 +214,8 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     if long is not None:
         ebbs = wall.kappa * jnp.abs(duration - when) < 0.5
         certain = jnp.where(long, ebbs & crest.first & present(crest.highest) if deep else ebbs, certain)
-    depth = None
-    if deep:
-        depth, exact = _deepest(wall, entry, crest.s)
-        certain = certain & exact
+    depth, exact = _deepest(wall, entry, crest.s) if deep else (None, jnp.ones_like(certain))
+    certain = certain & exact
     sure = wall.usable & converged & (out > 0) & certain
     turn = wall.omega1 * step
     twist = turn * turn
@@ -263,7 +261,7 @@ def _snap(wall: SoftWall, at: ContactState) -> Lane:
     return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
 
 
-class _Crest(eqx.Module):
+class _FirstCrest(eqx.Module):
     """Where w' is zero for the first time, and what is certain of it."""
 
     s: Lane  # from the free contact's
@@ -298,7 +296,7 @@ def _stays_below(wall: SoftWall, at: ContactState) -> Bool[Array, "lane"]:
 
 
 @shared
-def _rough_crest(wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]) -> _Crest:
+def _rough_crest(wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, Lane, Lane]) -> _FirstCrest:
     """Find when w is largest, from the free contact's time, and whether it has no other extremum before the exit.
 
     In single precision, with what is close called uncertain. `end` holds the duration and f' and f at the exit.
@@ -354,7 +352,7 @@ def _rough_crest(wall: SoftWall, entry: _Entry, guess: _Guess, end: tuple[Lane, 
     inside = (wall.omega1 * way > DOUBT) & (way < (1 - DOUBT) * wall.span)
     highest = None if wall.ebb is None else _stays_below(wall, at)
     first = converged & first & (wall.omega1 * when > DOUBT)
-    return _Crest(jnp.where(reached, s, 0.0), first, only & inside, highest)
+    return _FirstCrest(jnp.where(reached, s, 0.0), first, only & inside, highest)
 
 
 def _deepest(wall: SoftWall, entry: _Entry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:

@@ -186,7 +186,7 @@ def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool
     rows = slice(0 if begun else 1, last)
     orbits = ([orbits_at(arc, y[rows])] if last > rows.start else []) + ending
     # At a bound the last orbit is there; at a grazing rounding decides whether it is one.
-    if orbits and int(orbits[-1].status[-1]) != Status.OK:
+    if orbits and int(np.asarray(orbits[-1].status)[-1]) != Status.OK:
         values, orbits = values[:-1], [*orbits[:-1], orbits[-1][:-1]]
     return Piece(values[rows.start :] * unit, orbits, met, end, beyond)
 
