@@ -264,7 +264,7 @@ def _snap(wall: SoftWall, at: ContactState) -> Lane:
 class _FirstCrest(eqx.Module):
     """Where w' is zero for the first time, and what is certain of it."""
 
-    s: Lane  # from the free contact's
+    s: Lane  # The time, counted from that of the free contact's crest.
     first: Bool[Array, "lane"]  # It is found, and w rises until then.
     only: Bool[Array, "lane"]  # w has no other extremum before the exit.
     highest: Bool[Array, "lane"] | None  # None where gravity prolongs no contact: w does not come back to this height.
