@@ -57,7 +57,7 @@ class Touch(eqx.Module):
 
     impact: Int[AnyArray, "*orbit"]
     wall: Float[AnyArray, "*orbit"]
-    alike: Bool[AnyArray, "*orbit impact"] | None = None  # at a limit, the impacts that are there with it by symmetry
+    alike: Bool[AnyArray, "*orbit impact"] | None = None  # At a limit: which impacts are there with it, by symmetry.
 
 
 class CurvePath(eqx.Module):

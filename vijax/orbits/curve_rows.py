@@ -69,7 +69,7 @@ def curve_rows(dataset: "xr.Dataset") -> "pd.DataFrame":
     """
     import pandas as pd
 
-    numbered_points(dataset)
+    checks.variables("dataset", dataset, NEEDED, "vijax.curve_dataset")
     names = dataset.attrs["along"].split()
     tables = []
     for index in range(dataset.sizes["curve"]):
