@@ -1,11 +1,13 @@
 """A function is a program of its own, or a part of one; its traced form is kept where its name tells what it does."""
 
+import time
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import monitoring
 
 from vijax.runtime import cache_folder, programs, xla
 
@@ -93,3 +95,53 @@ def test_within_another_program_it_is_a_part_of_that():
     np.testing.assert_array_equal(jax.jit(lambda x: x + square(np.arange(3.0)))(1.0), [1, 2, 5])
     assert jax.grad(square)(3.0) == 6
     np.testing.assert_array_equal(jax.vmap(jax.grad(square))(np.arange(3.0)), [0, 2, 4])
+
+
+@pytest.fixture
+def compiled():
+    """The names of what is compiled meanwhile."""
+    names: list[str] = []
+
+    def count(event, *_, fun_name="", **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(fun_name)
+
+    monitoring.register_event_duration_secs_listener(count)
+    yield names
+    monitoring.unregister_event_duration_listener(count)
+
+
+def test_what_is_begun_compiles_in_the_background_and_once(compiled):
+    def ripple(x):
+        return jnp.sin(jnp.cos(x))
+
+    program = programs.jitted(ripple)
+    programs.begin(program, X)
+    deadline = time.monotonic() + 30
+    while "jit(ripple)" not in compiled and time.monotonic() < deadline:
+        time.sleep(0.01)
+    np.testing.assert_allclose(program(X), np.sin(np.cos(X)), rtol=1e-15)
+    programs.begin(program, X + 1)
+    assert compiled.count("jit(ripple)") == 1
+
+
+def test_what_is_begun_is_called_once_for_a_shape_and_its_errors_are_dropped():
+    called = []
+
+    def fails(x):
+        called.append(x.size)
+        raise ValueError
+
+    for size in (3, 3, 4):
+        programs.begin(fails, np.zeros(size))
+    deadline = time.monotonic() + 30
+    while len(called) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert sorted(called) == [3, 4]
+
+
+def test_nothing_is_begun_where_arguments_are_traced():
+    called = []
+    jax.jit(lambda x: programs.begin(called.append, x) or x)(X)
+    time.sleep(0.05)
+    assert not called

@@ -6,7 +6,7 @@ marks a bifurcation, are smooth functions along the curve: its test functions.
 
 from collections.abc import Iterable
 from functools import partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import linear_solve, tiles
 from vijax.runtime.arrays import AnyArray
-from vijax.runtime.programs import jitted
+from vijax.runtime.programs import begin, jitted
 
 _BATCHES = (8, 64, 512)  # lanes of one compiled call
 
@@ -177,15 +177,27 @@ class BranchPlace(NamedTuple):
 
 
 @partial(jitted, often=True)
-def _compiled(paths: Path, y, tangent, length):
-    def one(path, y, tangent, length):
-        at = _correct(path, y + length * tangent, tangent)
-        tests = jnp.stack([*path.tests(at.y, at.tangent, tangent)])
-        return BranchPlace(at.y, at.tangent, tests, at.size, at.corrections)
+def _corrected(paths: Path, y, tangent, length) -> _Corrected:
+    """Go on from points of paths by an arclength each."""
+    guess = y + length[:, None] * tangent
+    return jax.vmap(_correct)(paths, guess, tangent)
 
-    return jax.vmap(one)(paths, y, tangent, length)
+
+@partial(jitted, often=True)
+def _tested(paths: Path, y, tangent, former) -> Array:
+    """Compute the test functions at points of paths, in columns."""
+    return jnp.stack([*jax.vmap(lambda path, *at: path.tests(*at))(paths, y, tangent, former)], axis=1)
+
+
+def _advanced(rows: tuple[Path, Any, Any, Any]) -> BranchPlace:
+    paths, y, tangent, length = rows
+    # Two programs, compiled at the same time. Both are given NumPy's arrays: of JAX's the second would be another one.
+    begin(_tested, paths, y, tangent, tangent)
+    at = jax.tree.map(np.asarray, _corrected(paths, y, tangent, length))
+    tests = np.asarray(_tested(paths, at.y, at.tangent, tangent))
+    return BranchPlace(at.y, at.tangent, tests, at.size, at.corrections)
 
 
 def advance(paths: Path, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
-    """Go on from points of paths by an arclength each: the compiled program behind every step and every search."""
-    return tiles.map_tiles(lambda rows: _compiled(*rows), (paths, y, tangent, length), _BATCHES)
+    """Go on from points of paths by an arclength each: the compiled programs behind every step and every search."""
+    return tiles.map_tiles(_advanced, (paths, y, tangent, length), _BATCHES)

@@ -17,7 +17,7 @@ from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import BranchEvent, Point, events, happenings, kind_of, locate, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
-from vijax.orbits.periodic import Orbit, check_orbit
+from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit
 from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
 from vijax.orbits.soft_graze import Passage, branch_passage
 from vijax.runtime import checks, tiles
@@ -92,6 +92,7 @@ def follow(
     arcs, y = set_out(orbit, along, within, device, settings)
     ahead = np.zeros_like(y)
     ahead[:, -1] = 1.0
+    begin_proofs(orbit.pair, orbit.sequence, orbit.knots)
     first = advance(arcs, y, ahead, np.zeros(len(orbit)))
     found = [follow_arcs(arcs, heading(first, sign), along, points, settings) for sign in _WAYS[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]

@@ -13,7 +13,7 @@ from vijax.batch.trajectory import trajectory
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
-from vijax.orbits.periodic import SAME, Orbit, check_orbit, concatenate, guessed, judged, shot, solved
+from vijax.orbits.periodic import SAME, Orbit, begin_judgement, check_orbit, concatenate, guessed, judged, shot, solved
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
@@ -156,6 +156,7 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     wide = jax.tree.map(lambda x: np.broadcast_to(x, guesses), pair)
     side = np.broadcast_to(np.asarray(walls, np.int32), (guesses, count))
     sequence, near = guessed(side, np.full(guesses, 2.0 * period), np.zeros(guesses, bool), knots)
+    begin_judgement(wide, sequence, near)
     claim = shot(wide, sequence, near)
     # Most guesses lead to the same few orbits, of which each is proved once.
     first = _each_once(side, claim.knots, np.flatnonzero(np.isfinite(claim.residual)))

@@ -20,7 +20,7 @@ from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks, context, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
-from vijax.runtime.programs import jitted
+from vijax.runtime.programs import begin, jitted
 
 _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
 # How closely the impact map must meet the next impact of a real orbit, in time, speed and duration together; marks of
@@ -121,6 +121,24 @@ def guessed(side: np.ndarray, span: np.ndarray, mirrored: np.ndarray, knots: np.
 def proven(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Orbit:
     """Make orbits of knots that solve the equations already, even where Newton is singular: points of a branch."""
     return judged(pair, sequence, _by_tiles(lambda rows: _measured(*rows), (pair, sequence, knots)))
+
+
+def begin_judgement(pair: ImpactPair, sequence: Sequence, knots: Any) -> None:
+    """Begin to compile what judges a few claims of orbits like these: their numbers do not matter."""
+    pair, sequence, knots = _first_row(pair, sequence, knots)
+    t = knots[..., 0]
+    departure = shooting.Departure(*[np.ones_like(t)] * len(shooting.Departure._fields))
+    multipliers: Any = np.zeros((1, 2), complex)
+    begin(judged, pair, sequence, Claim(knots, t[:, 0], multipliers, departure, t, t))
+
+
+def begin_proofs(pair: ImpactPair, sequence: Sequence, knots: Any) -> None:
+    """Begin to compile what `proven` needs for a few orbits like these."""
+    begin(proven, *_first_row(pair, sequence, knots))
+
+
+def _first_row(*rows: Any) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:1], rows)
 
 
 def judged(pair: ImpactPair, sequence: Sequence, claim: "Claim") -> Orbit:

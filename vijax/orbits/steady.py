@@ -4,7 +4,7 @@ The orbit follows its parameters by the implicit function theorem on the shootin
 with every impact's own unknowns kept. Where that derivative means nothing, values and derivatives are NaN.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,10 @@ from vijax.model.device import Harvester, check_device
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.orbits import shooting
-from vijax.orbits.grazing import Clearance
+from vijax.orbits.grazing import Between, Clearance
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.shooting import Knots, Sequence
-from vijax.orbits.validity import validity
+from vijax.orbits.validity import Validity, validity
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
 from vijax.runtime.derivatives import differentiable, shared_slopes
@@ -109,17 +109,51 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
     return _near((device, pair), (orbit.sequence, orbit.knots), kind=wall)
 
 
-@differentiable
-def _near(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], *, kind: str) -> Steady:
-    """Find the steady state near a guess.
+class Found(NamedTuple):
+    """An orbit, which is found and judged before anything is computed of it: constants of differentiation.
 
-    Compiled once, and so are its derivatives and batches: as one call they are known by its identity, while loops run
-    one by one would be compiled for every call, as each makes their bodies anew.
+    Attributes:
+        knots: Of the orbit.
+        residual: Largest violation of the equations.
+        validity: Whether it is one that attracts, and by how much.
     """
-    (device, pair), (sequence, guess) = moved, about
-    pair = device.pair(kind) if pair is None else pair
-    guess = jnp.where(sequence.real[:, None], guess, 0.0)
-    return response(device, pair, sequence, *find(pair, sequence, guess))
+
+    knots: Knots
+    residual: Float[Array, ""]
+    validity: Validity
+
+
+def _pair_of(moved: tuple[Harvester, ImpactPair | None], kind: str) -> ImpactPair:
+    device, pair = moved
+    return device.pair(kind) if pair is None else pair
+
+
+def _found(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], *, kind: str) -> Found:
+    """Find the orbit near a guess."""
+    (sequence, guess), pair = about, _pair_of(moved, kind)
+    knots, residual = find(pair, sequence, jnp.where(sequence.real[:, None], guess, 0.0))
+    return judged(pair, sequence, knots, residual)
+
+
+def _like_found(about: tuple[Sequence, Knots]) -> Found:
+    """Make what has the shapes of an orbit that is found near a guess."""
+    guess: Any = np.asarray(about[1])
+    zero: Any = np.zeros((), guess.dtype)
+    status: Any = np.int32(Status.OK)
+    motion = Between(Clearance(zero, zero, zero, zero), guess[:, 0])
+    return Found(guess, zero, Validity(status, zero, zero, motion))
+
+
+def _respond(
+    moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], found: Found, *, kind: str
+) -> Steady:
+    """Compute what the orbit yields that was found."""
+    return _response(moved[0], _pair_of(moved, kind), about[0], found)
+
+
+# Compiled once, and so are its derivatives and batches: as one call it is known by its identity, while loops run one by
+# one would be compiled for every call, as each makes their bodies anew.
+_near = differentiable(_respond, _found, _like_found)
 
 
 def _check(device: Any, orbit: Any, pair: Any) -> None:
@@ -142,12 +176,21 @@ def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Flo
     return lax.stop_gradient(knots[0]), lax.stop_gradient(residual[0])
 
 
+def judged(pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]) -> Found:
+    """Judge the orbit with the given knots, a constant of differentiation."""
+    frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
+    return Found(frozen[2], frozen[3], validity(*frozen))
+
+
 def response(
     device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]
 ) -> Steady:
     """Compute what the orbit with the given knots yields; these follow device and pair under differentiation."""
-    frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
-    status, multiplier, condition, (room, deepest) = validity(*frozen)
+    return _response(device, pair, sequence, judged(pair, sequence, knots, residual))
+
+
+def _response(device: Harvester, pair: ImpactPair, sequence: Sequence, found: Found) -> Steady:
+    knots, residual, (status, multiplier, condition, (room, deepest)) = found
     # Harmless numbers where there is no orbit: what is computed from them is thrown away.
     absent = (status == Status.NO_ORBIT) | ~sequence.real
     knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)

@@ -13,7 +13,7 @@ from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, 
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
 from vijax.orbits.parameter import check_bounds, tilts
-from vijax.orbits.periodic import Orbit
+from vijax.orbits.periodic import Orbit, begin_proofs
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.programs import jitted
@@ -59,6 +59,7 @@ def switch(
     check_bounds(point.orbit.pair, along, within, one_device(device))
     doubled = symmetry.doubled(point.orbit)
     arcs, y = set_out(doubled, along, within, device, settings)
+    begin_proofs(doubled.pair, doubled.sequence, doubled.knots)
     knots = y[0, :-1].reshape(-1, 3)
     pair, sequence = jax.tree.map(lambda x: x[0], (doubled.pair, doubled.sequence))
     slope = np.asarray(_linearised(pair, sequence, knots).slope)

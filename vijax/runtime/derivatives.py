@@ -13,46 +13,62 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
-from vijax.runtime import context
-from vijax.runtime.programs import jitted
+from vijax.runtime import context, tiles
+from vijax.runtime.programs import begin, jitted
 from vijax.runtime.xla import share
 
 T = TypeVar("T")
 
 
-def differentiable(work: Callable[..., T]) -> Callable[..., T]:
+def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Callable[[Any], Any]) -> Callable[..., T]:
     """Compile a function, and its derivatives where its arguments are numbers.
 
+    It comes in two parts, programs of their own that are compiled at the same time: what is found first, of which no
+    derivative is taken, and what is made of that.
+
     Args:
-        work: Function of a module, of variables and of what is not varied (two pytrees of arrays), and of a `kind` that
-            can be hashed, to a pytree of arrays. Its derivative in what is not varied must be zero.
+        work: Function of a module, of variables, of what is not varied, and of what was found first (pytrees of
+            arrays), and of a `kind` that can be hashed, to a pytree of arrays. Its derivatives in all but the variables
+            must be zero.
+        first: Function of a module, of the variables, of what is not varied, and of the `kind`, to what is found first.
+        like: Makes arrays of the shapes of what is found first, out of what is not varied.
     """
-    program = jitted(work, static=("kind",))
+    finding, program = jitted(first, static=("kind",)), jitted(work, static=("kind",))
 
     @partial(jitted, static=("kind",), name=f"slopes of {work.__module__}.{work.__qualname__}")
-    def slopes(variables: Any, fixed: Any, *, kind: Hashable) -> tuple[list[jax.Array], T]:
+    def slopes(variables: Any, fixed: Any, found: Any, *, kind: Hashable) -> tuple[list[jax.Array], T]:
         def numbers(variables):
-            result = work(variables, fixed, kind=kind)
+            result = work(variables, fixed, found, kind=kind)
             return [leaf for leaf in jax.tree.leaves(result) if _varies(leaf)], result
 
         return jax.jacfwd(numbers, has_aux=True)(variables)
 
+    def both(then: Callable[..., Any], variables: Any, fixed: Any, kind: Hashable) -> Any:
+        numbers = tiles.library((variables, fixed)) is np
+        if numbers:
+            begin(then, variables, fixed, like(fixed), kind=kind)
+        found = finding(jax.tree.map(lax.stop_gradient, variables), fixed, kind=kind)
+        # As `like` makes them: of JAX's arrays it would be another program.
+        found = jax.tree.map(np.asarray, found) if numbers else found
+        return then(variables, fixed, found, kind=kind)
+
     @partial(jax.custom_jvp, nondiff_argnums=(2,))
     def call(variables: Any, fixed: Any, kind: Hashable) -> T:
-        return program(variables, fixed, kind=kind)
+        return both(program, variables, fixed, kind)
 
     @partial(call.defjvp, symbolic_zeros=True)
     def derivative(kind: Hashable, primals: Any, tangents: Any) -> tuple[T, T]:
         variables, fixed = primals
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(primals)):
             moved = jax.tree.map(_dense, tangents[0], is_leaf=_is_zero)
-            return jax.jvp(lambda variables: program(variables, fixed, kind=kind), (variables,), (moved,))
+            return jax.jvp(lambda variables: both(program, variables, fixed, kind), (variables,), (moved,))
         # Within a derivative JAX takes a program apart before it compiles it, and what is to be shared is shared no
         # longer: twice the operations. No other thread is within one.
         with context.pool(1) as elsewhere:
-            columns, result = elsewhere.submit(slopes, variables, fixed, kind=kind).result()
+            columns, result = elsewhere.submit(both, slopes, variables, fixed, kind).result()
         moved = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
         rows = iter(columns)
         return result, jax.tree.map(lambda leaf: _along(leaf, rows, moved), result)

@@ -1,4 +1,4 @@
-"""Functions as programs of their own: compiled with our options, traced once for all processes."""
+"""Functions as programs of their own: compiled with our options, traced once for all processes, begun ahead of need."""
 
 from collections.abc import Callable
 from functools import cache, lru_cache, partial, wraps
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax.runtime import cache_folder, xla
+from vijax.runtime import cache_folder, context, xla
 from vijax.runtime.export_cache import TracedProgram
 
 P = ParamSpec("P")
@@ -57,6 +57,32 @@ def jitted(
         return program(brief)(*args, **kwargs)
 
     return call
+
+
+_begun: set[Any] = set()
+
+
+def begin(work: Callable[..., Any], *args: Any, **static: Any) -> None:
+    """Call a function in another thread, for the programs that it compiles, which will be needed next.
+
+    XLA compiles on one core for most of its time, so that on two cores two programs take the time of one. The function
+    is called once for every shape of its arguments; what it returns, or raises, is dropped.
+
+    Args:
+        work: A function of a module; it must be quick but for what it compiles.
+        args: Pytrees of arrays; where they are traced nothing is begun.
+        static: Arguments that are no arrays.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return
+    shapes = tuple((np.shape(x), getattr(x, "dtype", type(x))) for x in leaves)
+    key = work, tree, shapes, tuple(static.items())
+    if key not in _begun:
+        _begun.add(key)
+        elsewhere = context.pool(1)
+        elsewhere.submit(work, *args, **static)
+        elsewhere.shutdown(wait=False)
 
 
 def _place(work: Callable[..., Any]) -> str | None:
