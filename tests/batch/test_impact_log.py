@@ -1,5 +1,6 @@
 """Records of many balls at once, against the same balls followed one by one."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -61,3 +62,30 @@ def test_balls_that_are_not_wanted_hold_nothing(runs):
     nothing = record(pair, start, PERIODS, np.zeros(6, bool))
     assert np.isnan(nothing.u).all()
     assert nothing.impacts["v_in"].shape == (6, 0)
+
+
+def drawn(count, gamma, rigid):
+    """Balls of random cells, some of which begin in a contact, some before the first period."""
+    draw = np.random.default_rng(11)
+    d, kappa = draw.uniform(0.08, 0.25, count), np.exp(draw.uniform(np.log(4.0), np.log(300.0), count))
+    pair = vijax.impact_pair(d, None if rigid else kappa, draw.uniform(0.3, 0.8, count), gamma)
+    held = np.zeros(count) if rigid else draw.choice([-1, 0, 0, 0, 1], count)
+    u = np.where(held == 0, draw.uniform(-0.45, 0.45, count) * d, held * (0.5 * d + 0.1 / kappa))
+    return pair, begun(pair, u, draw.uniform(-0.5, 0.5, count), n=draw.choice([-2, 0], count), mode=held.astype(int))
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.3])
+@pytest.mark.parametrize("rigid", [False, True])
+def test_many_balls_have_the_record_that_each_has_alone(gamma, rigid):
+    """Many take the quick step; few the careful one, which each has here in parts of 100."""
+    pair, start = drawn(300, gamma, rigid)
+    many = record(pair, start, 3, np.ones(300, bool))
+    for first in (0, 100, 200):
+        rows = slice(first, first + 100)
+        own, at = (jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], tree) for tree in (pair, start))
+        few = record(own, at, 3, np.ones(100, bool))
+        assert np.array_equal(few.filled, many.filled[rows])
+        for name, values in few.impacts.items():
+            np.testing.assert_allclose(many.impacts[name][rows, : values.shape[1]], values, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(many.u[rows], few.u, atol=1e-9)
+        np.testing.assert_allclose(many.v[rows], few.v, atol=1e-9)

@@ -1,5 +1,6 @@
 """Every impact of a stretch of periods, and the ball at phase 0 in between, of many balls at once."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -8,15 +9,20 @@ import numpy as np
 from jax import lax
 
 from vijax.batch.exact_run import balls_at
-from vijax.engine import exact
+from vijax.engine import exact, quick, quick_wall
+from vijax.engine.ground import Ground, ground_of
+from vijax.engine.impact import Ball
 from vijax.model.pair import ImpactPair
-from vijax.model.records import State
+from vijax.model.records import Impact, State
 from vijax.runtime import tiles
+from vijax.runtime.arrays import present
 from vijax.runtime.programs import jitted
 
 # No result depends on these: how many balls fly together, how many at phase 0 are found together, and after how many
 # impacts of each those that have arrived make room. Fewer are more calls, more are more rows that nobody needs.
 _TILE, _STROBES, _STEPS = 256, 4096, 16
+# So many balls at most take the careful step alone, which costs less than to compile another.
+_FEW = _TILE
 
 
 class Record(NamedTuple):
@@ -46,7 +52,7 @@ class _Step(NamedTuple):
 
 
 def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) -> Record:
-    """Fly balls to the end of some periods, by the careful step.
+    """Fly balls to the end of some periods: many by the quick step, and what it declines by the careful one.
 
     Args:
         pair: Cells [ball]; `kappa=None` for rigid walls.
@@ -60,14 +66,23 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     pair, starts = jax.tree.map(np.asarray, (pair, starts))
     count = starts.u.size
     live, states = np.flatnonzero(wanted), jax.tree.map(lambda x: x[wanted], starts)
+    many = ground_of(pair.gamma) if live.size > _FEW else None
     balls: list[np.ndarray] = [np.zeros(0, int)]
     parts: list[_Step] = []
+
+    def onward(some: np.ndarray, at: State, steps: int, ground: Ground | None) -> _Reached:
+        reached, taken, real = _advance(jax.tree.map(lambda x: x[some], pair), at, periods, steps, ground)
+        balls.append(np.repeat(some, steps)[real.ravel()])
+        parts.append(jax.tree.map(lambda x: x[real], taken))
+        return reached
+
     while live.size:
-        taken = jax.tree.map(lambda x, live=live: x[live], pair)
-        after, over, steps, real = _advance(taken, states, periods)
-        balls.append(np.repeat(live, _STEPS)[real.ravel()])
-        parts.append(jax.tree.map(lambda x, real=real: x[real], steps))
-        live, states = live[~over], jax.tree.map(lambda x, over=over: x[~over], after)
+        states, over, waits = onward(live, states, _STEPS, many)
+        if waits.any():
+            served = onward(live[waits], jax.tree.map(lambda x, waits=waits: x[waits], states), 1, None)
+            states = jax.tree.map(partial(tiles.replaced, waits), states, served.state)
+            over = tiles.replaced(waits, over, served.over)
+        live, states = live[~over], jax.tree.map(lambda x, over=over: x[~over], states)
     ball = np.concatenate(balls)
     order = np.argsort(ball, kind="stable")
     ball = ball[order]
@@ -75,30 +90,71 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     return Record(*_impacts(ball, flown, count, periods), *_strobes(pair, ball, flown, count, periods))
 
 
-@jitted
-def _some_steps(pair: ImpactPair, states: State, over: Any, periods: Any):
-    """Take a tile of balls some steps on: where they are, which have arrived, the steps, which of these are real."""
+class _Reached(NamedTuple):
+    """Where balls are, which of them have arrived, and which wait for the careful step."""
 
-    def one(carry, _):
-        state, over = carry
+    state: State
+    over: Any
+    waits: Any
+
+
+@partial(jitted, often=True, static=("steps", "ground"))
+def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int, ground: Ground | None):
+    """Take a tile of balls some steps on: the `_Reached`, the steps, which of these are real.
+
+    Args:
+        steps: How many.
+        ground: For the quick step on such ground; by the careful one where it is None.
+    """
+    wall = None if ground is None else quick_wall.prepare(pair, ground=ground)
+
+    def one(reached: _Reached, _):
+        state, over, waits = reached
         left = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(state.t.dtype) - state.t)
-        out = jax.vmap(exact.step)(pair, state, left)
-        ends = over | out.quiet | out.permanent | (left <= 0) | (out.impact.n >= periods)
-        after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
-        return (after, ends), (_Step(state, out), ~over & (left > 0))
+        wanted = ~over & (left > 0)
+        if wall is None:
+            out, sure = jax.vmap(exact.step)(pair, state, left), jnp.ones_like(over)
+        else:
+            out, sure = _quick_outcome(wall, pair, state)
+        waits = waits | (wanted & ~sure)
+        ends = ~waits & (~wanted | out.quiet | out.permanent | (out.impact.n >= periods))
+        stays = over | ends | waits
+        after = jax.tree.map(lambda new, old: jnp.where(stays, old, new), out.state, state)
+        return _Reached(after, over | ends, waits), (_Step(state, out), wanted & ~waits)
 
-    return lax.scan(one, (states, over), None, length=_STEPS)
+    return lax.scan(one, _Reached(states, over, jnp.zeros_like(over)), None, length=steps)
 
 
-def _advance(pair: ImpactPair, states: State, periods: int) -> tuple[State, np.ndarray, _Step, np.ndarray]:
-    """Take balls some steps on: where they are, which have arrived, the steps [ball, step], which of these are real."""
+def _quick_outcome(wall: quick_wall.Wall, pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
+    """Take balls one impact on by the quick step; say of which it is sure."""
+    ball = Ball(state.u, state.v, state.t, state.n.astype(state.t.dtype))
+    impact, _, sure, _ = quick.quick_step(wall, pair.gamma, ball, deep=True)
+    after, whole, no = impact.after, state.n.dtype, jnp.zeros_like(sure)
+    told = Impact(
+        n=impact.onset_n.astype(whole),
+        t=impact.onset_t,
+        side=impact.side.astype(whole),
+        v_in=impact.v_in,
+        v_out=impact.v_out,
+        depth=present(impact.depth),
+        duration=impact.duration,
+        work=present(impact.work),
+    )
+    then = State(after.u, after.v, after.t, after.n.astype(whole), jnp.zeros_like(state.mode))
+    return exact.Outcome(then, told, impact.flight, impact.duration, no, no, no), sure & (state.mode == 0)
+
+
+def _advance(
+    pair: ImpactPair, states: State, periods: int, steps: int, ground: Ground | None
+) -> tuple[_Reached, _Step, np.ndarray]:
+    """Take balls some steps on: the `_Reached`, the steps [ball, step], which of these are real."""
     parts = []
     for tile in tiles.tiles(states.u.size, (_TILE,)):
         own, begun = jax.tree.map(lambda x, rows=tile.rows: x[rows], (pair, states))
         idle = np.arange(_TILE) >= tile.real
-        (after, over), (steps, real) = _some_steps(own, begun, idle, np.int32(periods))
-        steps, real = jax.tree.map(lambda x: np.asarray(x).swapaxes(0, 1), (steps, real))
-        parts.append(jax.tree.map(lambda x, real=tile.real: np.asarray(x)[:real], (after, over, steps, real)))
+        reached, taken = _fly(own, begun, idle, np.int32(periods), steps=steps, ground=ground)
+        taken = jax.tree.map(lambda x: np.asarray(x).swapaxes(0, 1), taken)
+        parts.append(jax.tree.map(lambda x, real=tile.real: np.asarray(x)[:real], (reached, *taken)))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 

@@ -109,12 +109,6 @@ def next_impacts(
         rest = np.flatnonzero(~sure)
         if rest.size:
             again, certain = _answered(_compiled(step, plan), jax.tree.map(partial(np.take, indices=rest), requests))
-            found = jax.tree.map(partial(_put, rest), found, again)
-            sure = _put(rest, sure, certain)
+            found = jax.tree.map(partial(tiles.replaced, rest), found, again)
+            sure = tiles.replaced(rest, sure, certain)
     return found
-
-
-def _put(rows: np.ndarray, table: np.ndarray, values: np.ndarray) -> np.ndarray:
-    table = table.copy()
-    table[rows] = values
-    return table

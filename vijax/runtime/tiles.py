@@ -48,6 +48,13 @@ def padded(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
+def replaced(rows: np.ndarray, table: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Copy a table with other values in some rows, given by index or mask."""
+    table = table.copy()
+    table[rows] = values
+    return table
+
+
 def library(tree: Any) -> Any:
     """Choose what cuts and joins arrays: NumPy, as JAX compiles for every size; JAX where something is traced."""
     return jnp if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)) else np
