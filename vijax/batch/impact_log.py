@@ -70,7 +70,7 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     balls: list[np.ndarray] = [np.zeros(0, int)]
     parts: list[_Step] = []
 
-    def onward(some: np.ndarray, at: State, steps: int, ground: Ground | None) -> _Reached:
+    def onward(some: np.ndarray, at: State, steps: int, ground: Ground | None) -> _Underway:
         reached, taken, real = _advance(jax.tree.map(lambda x: x[some], pair), at, periods, steps, ground)
         balls.append(np.repeat(some, steps)[real.ravel()])
         parts.append(jax.tree.map(lambda x: x[real], taken))
@@ -90,7 +90,7 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     return Record(*_impacts(ball, flown, count, periods), *_strobes(pair, ball, flown, count, periods))
 
 
-class _Reached(NamedTuple):
+class _Underway(NamedTuple):
     """Where balls are, which of them have arrived, and which wait for the careful step."""
 
     state: State
@@ -100,7 +100,7 @@ class _Reached(NamedTuple):
 
 @partial(jitted, often=True, static=("steps", "ground"))
 def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int, ground: Ground | None):
-    """Take a tile of balls some steps on: the `_Reached`, the steps, which of these are real.
+    """Take a tile of balls some steps on: the `_Underway`, the steps, which of these are real.
 
     Args:
         steps: How many.
@@ -108,7 +108,7 @@ def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int
     """
     wall = None if ground is None else quick_wall.prepare(pair, ground=ground)
 
-    def one(reached: _Reached, _):
+    def one(reached: _Underway, _):
         state, over, waits = reached
         left = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(state.t.dtype) - state.t)
         wanted = ~over & (left > 0)
@@ -120,9 +120,9 @@ def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int
         ends = ~waits & (~wanted | out.quiet | out.permanent | (out.impact.n >= periods))
         stays = over | ends | waits
         after = jax.tree.map(lambda new, old: jnp.where(stays, old, new), out.state, state)
-        return _Reached(after, over | ends, waits), (_Step(state, out), wanted & ~waits)
+        return _Underway(after, over | ends, waits), (_Step(state, out), wanted & ~waits)
 
-    return lax.scan(one, _Reached(states, over, jnp.zeros_like(over)), None, length=steps)
+    return lax.scan(one, _Underway(states, over, jnp.zeros_like(over)), None, length=steps)
 
 
 def _quick_outcome(wall: quick_wall.Wall, pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
@@ -146,8 +146,8 @@ def _quick_outcome(wall: quick_wall.Wall, pair: ImpactPair, state: State) -> tup
 
 def _advance(
     pair: ImpactPair, states: State, periods: int, steps: int, ground: Ground | None
-) -> tuple[_Reached, _Step, np.ndarray]:
-    """Take balls some steps on: the `_Reached`, the steps [ball, step], which of these are real."""
+) -> tuple[_Underway, _Step, np.ndarray]:
+    """Take balls some steps on: the `_Underway`, the steps [ball, step], which of these are real."""
     parts = []
     for tile in tiles.tiles(states.u.size, (_TILE,)):
         own, begun = jax.tree.map(lambda x, rows=tile.rows: x[rows], (pair, states))
