@@ -26,9 +26,8 @@ Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
 
 # Quick steps between two rounds of serving, reviewing and refilling: with fewer, the rounds cost more than the steps,
-# with more, lanes that wait stand idle. Of chains there are few lanes, and one that waits holds up its chain. No result
-# depends on them.
-STEPS, _CHAIN_STEPS = 8, 4
+# with more, lanes that wait stand idle. No result depends on it.
+STEPS = 8
 _SHARE, _FEWEST = 32, 16  # one lane in so many is served or refilled together: a larger batch keeps slow cells waiting
 
 
@@ -127,16 +126,15 @@ def _able(program: Program, at: _AtWork) -> Int[Array, ""]:
     return ((at.cell >= 0) & ~_declined(program, at) & ~program.stopped(at.carry)).sum()
 
 
-def _round(program: Program, width: int, steps: int, at: _AtWork) -> Carry:
+def _round(program: Program, width: int, at: _AtWork) -> Carry:
     """Run one round of the lanes that have a cell: steps, service, review.
 
     Args:
         program: What a cell is.
         width: How many lanes are served together.
-        steps: Most steps of a round.
         at: The lanes.
     """
-    carry = program.kernel(partial(_steps, program, steps))(*at)
+    carry = program.kernel(partial(_steps, program))(*at)
     if service := program.service:
         due = program.kernel(partial(_service_due, program, service, width))
         serve = partial(_serve, program, service, width)
@@ -144,15 +142,15 @@ def _round(program: Program, width: int, steps: int, at: _AtWork) -> Carry:
     return program.kernel(program.review)(carry)
 
 
-def _steps(program: Program, most: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
-    """Take up to so many steps; fewer once half the lanes that set out wait for something else."""
+def _steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+    """Take up to `STEPS` steps; fewer once half the lanes that set out wait for something else."""
 
     def some_steps(at: _AtWork) -> _AtWork:
         at_first = _able(program, at)
 
         def goes_on(state):
             step, at = state
-            return (step < most) & (2 * _able(program, at) > at_first)
+            return (step < STEPS) & (2 * _able(program, at) > at_first)
 
         def one(state):
             step, at = state
@@ -233,7 +231,7 @@ def run(
 
     def refill_and_round(queue: _Queue) -> _Queue:
         queue = _refill(program, table, width, queue)
-        return queue._replace(at=queue.at._replace(carry=_round(program, width, STEPS, queue.at)))
+        return queue._replace(at=queue.at._replace(carry=_round(program, width, queue.at)))
 
     def goes_on(queue: _Queue) -> Bool[Array, ""]:
         return (queue.at.cell >= 0).any() | (queue.waiting < count)
@@ -311,30 +309,39 @@ def chain(
         count, length: How many lanes and links are real; the others come back as zeros.
         outputs: Length of a result row.
 
-    No lane waits for another's link to end. Lanes being few, what an operation costs hardly depends on how many work
-    at it: all that decline are served together, and at once.
+    A lane whose link has ended waits for a few others at most, which are passed on with it: to load a cell costs as
+    much as many steps.
     """
     lanes, most, _ = links.shape
+    width, enough = min(max(lanes // _SHARE, _FEWEST), lanes), max(lanes // _SHARE, 1)
     lane = jnp.arange(lanes, dtype=jnp.int32)
 
-    def ended(state: _Chains) -> Bool[Array, "lane"]:
-        return (state.link >= 0) & program.done(state.carry)
+    def ended(carry: Carry, link: Int[Array, "lane"]) -> Bool[Array, "lane"]:
+        return (link >= 0) & program.done(carry)
+
+    def due(carry: Carry, link: Int[Array, "lane"]) -> Bool[Array, ""]:
+        number = ended(carry, link).sum()
+        return (number >= enough) | ((number > 0) & (number >= _able(program, _AtWork(link, carry))))
+
+    def exchange(carry: Carry, link: Int[Array, "lane"]):
+        """Pass a batch on; give rows of the result table, and where they belong: no link, past the last one."""
+        batch = _first(ended(carry, link), width)
+        rows, some = batch.members, _take(carry, batch.members)
+        before = link[rows]
+        goes_on = before + 1 < length
+        fresh = program.load(succeed(some, links[rows, jnp.minimum(before + 1, most - 1)]))
+        new = choose(goes_on, fresh, some), jnp.where(goes_on, before + 1, -1)
+        place = jnp.where(jnp.arange(width, dtype=jnp.int32) < batch.real, before, most)
+        return *put((carry, link), new, rows, batch.real), rows, place, program.unload(some)
 
     def pass_on(state: _Chains) -> _Chains:
-        done = ended(state)
-        results = state.results.at[lane, jnp.where(done, state.link, most)].set(
-            program.unload(state.carry), mode="drop"
-        )
-        after = state.link + 1
-        goes_on = done & (after < length)
-        fresh = program.load(succeed(state.carry, links[lane, jnp.minimum(after, most - 1)]))
-        carry = choose(goes_on, fresh, state.carry)
-        return _Chains(carry, jnp.where(goes_on, after, jnp.where(done, -1, state.link)), results)
+        carry, link, rows, place, found = program.kernel(exchange)(state.carry, state.link)
+        return _Chains(carry, link, state.results.at[rows, place].set(found, mode="drop"))
 
     def advance(state: _Chains) -> _Chains:
-        due = ended(state).any()
-        state = lax.cond(due, pass_on, lambda state: state, state)
-        return state._replace(carry=_round(program, lanes, _CHAIN_STEPS, _AtWork(state.link, state.carry)))
+        is_due = program.kernel(due)
+        state = lax.while_loop(lambda state: is_due(state.carry, state.link), pass_on, state)
+        return state._replace(carry=_round(program, width, _AtWork(state.link, state.carry)))
 
     start = _Chains(
         carry=program.load(links[:, 0]),
