@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import vijax
@@ -39,7 +40,7 @@ START = {"d": 0.2, "r": 0.5}  # and orbits on them begin
 LINES = 200
 SOFT = {"d": (0.05, 0.3), "kappa": (3.0, 400.0)}
 DEVICE = vijax.Harvester(s=0.2)  # whose omega moves d and kappa
-COARSE, FINE = vijax.ContinuationSettings(), vijax.ContinuationSettings(max_step=1e-3)
+PLAIN, FINE = vijax.ContinuationSettings(max_grazings=0), vijax.ContinuationSettings(max_step=1e-3)
 SAME = 1e-6  # two crossings nearer than this are one
 _FOLLOWED = ("fold", "flip", "pitchfork", "grazing flight", "grazing impact")
 
@@ -63,7 +64,7 @@ def even(d: float, kappa: float) -> vijax.Orbit:
 
 def met(start: vijax.Orbit, line: "Line", within: tuple[float, float]) -> list[Point]:
     """Find what orbits, and those that bifurcate from them, meet along a line."""
-    branches = vijax.follow_families(start, line.along, within, device=line.device)
+    branches = vijax.follow_families(start, line.along, within, device=line.device, settings=PLAIN)
     return [point for branch in branches for point in branch.points if point.kind in _FOLLOWED]
 
 
@@ -71,7 +72,7 @@ def curves_of(
     points: list[Point],
     along: str,
     plane: dict[str, tuple[float, float]],
-    settings: vijax.ContinuationSettings = COARSE,
+    settings: vijax.ContinuationSettings = PLAIN,
 ) -> list[BifurcationCurve]:
     """Follow points without a word about those from which nothing begins."""
     with warnings.catch_warnings():
@@ -201,13 +202,13 @@ def cubic() -> None:
     (point, *_) = (
         point for point in met(symmetric(0.2, 0.5), Line("d", "r", 0.5), (0.1, 0.32)) if point.kind == "flip"
     )
-    knots = np.where(point.orbit.sequence.real[..., None], point.orbit.knots, 0.0)
+    knots = jnp.where(point.orbit.sequence.real[..., None], point.orbit.knots, 0.0)
     coefficient = float(jax.vmap(cubic_coefficient)(point.orbit.pair, point.orbit.sequence, knots)[0])
     away, ratio = [], []
     for branch in switching.switch(point, "d", (0.1, 0.32), settings=FINE, points=40):
         count, near = int(point.orbit.count[0]), np.abs(branch.values - point.value) < 2e-4
         for d, orbit in zip(branch.values[near], np.asarray(branch.orbit.knots)[near], strict=True):
-            pair = dataclasses.replace(point.orbit.pair, d=np.array([d]))
+            pair = dataclasses.replace(point.orbit.pair, d=jnp.array([d]))
             simple = periodic.solve(pair, point.orbit.sequence, knots)
             turns = np.stack([orbit[:count], orbit[count : 2 * count]])
             turns[1, :, 0] -= float(point.orbit.sequence.span[0])
@@ -278,10 +279,10 @@ def nearest(crossing: Crossing, points: list[Point]) -> float:
 def beside(crossing: Crossing, line: Line, within: tuple[float, float]) -> list[Point]:
     """Find what a branch meets that begins at an orbit near one that bifurcates, and so passes that."""
     points = []
-    told: Any = {"device": line.device}
+    told: Any = {"device": line.device, "settings": PLAIN}
     for branch in vijax.follow_orbits(crossing.orbit, line.along, within, points=12, **told):
         for orbit in (branch.orbit[:1], branch.orbit[-1:]):
-            if np.asarray(orbit.status)[0] == 0:
+            if len(orbit) and np.asarray(orbit.status)[0] == 0:
                 points += [p for one in vijax.follow_orbits(orbit, line.along, within, **told) for p in one.points]
     return [point for point in points if point.kind in _FOLLOWED]
 
