@@ -296,7 +296,9 @@ def crossed(curve: BifurcationCurve, line: Line, plane: dict[str, tuple[float, f
         orbit = curve.orbit[inside : inside + 1]
         guess = line.place(orbit.pair)
         high = plane[line.still][1] if line.still in plane else 2 * line.value
-        bounds = {line.still: (line.value, high), line.along: plane.get(line.along, (guess / 2, guess * 2))}
+        # A curve may end a rounding beyond the bound of its plane.
+        low, top = plane.get(line.along, (guess / 2, guess * 2))
+        bounds = {line.still: (line.value, high), line.along: (low - SAME**2, top + SAME**2)}
         there = (
             dataclasses.replace(line.device, omega0=line.value + float(across[inside]))
             if line.still == "omega0"
