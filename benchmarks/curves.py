@@ -10,27 +10,37 @@ locate by themselves, and against the product of both multipliers, which is know
 """
 
 import argparse
+import dataclasses
 import sys
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import vijax
 from benchmarks.orbits import say
 from vijax.model import flow
+from vijax.orbits import periodic, switching, symmetry
+from vijax.orbits.criticality import cubic_coefficient
 from vijax.orbits.curves import BifurcationCurve
 from vijax.orbits.events import Point
 from vijax.orbits.limits import LIMITS, loads
+from vijax.orbits.map_borders import labelled_plane
 
 R = (0.02, 0.98)
 PLANE = {"d": (0.05, 0.32), "r": (0.15, 0.9)}
 INNER = {"d": (0.15, 0.3), "r": (0.2, 0.85)}  # where lines lie
 START = {"d": 0.2, "r": 0.5}  # and orbits on them begin
 LINES = 200
+SOFT = {"d": (0.05, 0.3), "kappa": (3.0, 400.0)}
+DEVICE = vijax.Harvester(s=0.2)  # whose omega moves d and kappa
+PLAIN, FINE = vijax.ContinuationSettings(max_grazings=0), vijax.ContinuationSettings(max_step=1e-3)
 SAME = 1e-6  # two crossings nearer than this are one
 _FOLLOWED = ("fold", "flip", "pitchfork", "grazing flight", "grazing impact")
 
@@ -46,22 +56,33 @@ def symmetric(d: float, r: float) -> vijax.Orbit:
     return vijax.find_orbits(vijax.impact_pair(d, None, r), "RL", guesses=64)
 
 
-def met(d: float, r: float, along: str, within: tuple[float, float]) -> list[Point]:
-    """Find what these orbits, and those that bifurcate from them, meet along a line."""
-    branches = vijax.follow_families(symmetric(d, r), along, within)
+def even(d: float, kappa: float) -> vijax.Orbit:
+    """Find the symmetric period-1 orbits of soft walls with an impact on each."""
+    found = vijax.find_orbits(vijax.impact_pair(d, kappa, 0.5), "1:1", guesses=64)
+    return found[symmetry.symmetric(found)]
+
+
+def met(start: vijax.Orbit, line: "Line", within: tuple[float, float]) -> list[Point]:
+    """Find what orbits, and those that bifurcate from them, meet along a line."""
+    branches = vijax.follow_families(start, line.along, within, device=line.device, settings=PLAIN)
     return [point for branch in branches for point in branch.points if point.kind in _FOLLOWED]
 
 
-def curves_of(points: list[Point], along: str, plane: dict[str, tuple[float, float]]) -> list[BifurcationCurve]:
+def curves_of(
+    points: list[Point],
+    along: str,
+    plane: dict[str, tuple[float, float]],
+    settings: vijax.ContinuationSettings = PLAIN,
+) -> list[BifurcationCurve]:
     """Follow points without a word about those from which nothing begins."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return vijax.follow_curves(points, along, plane)
+        return vijax.follow_curves(points, along, plane, settings=settings)
 
 
 def known() -> None:
     """Compare the pitchfork with its closed form, products of multipliers with theirs, and a cusp with its exponent."""
-    points = met(0.2, 0.5, "d", (0.1, 0.32))
+    points = met(symmetric(0.2, 0.5), Line("d", "r", 0.5), (0.1, 0.32))
     curves = curves_of(points, "d", {"d": (0.02, 0.4), "r": R})
     (broken,) = (curve for curve in curves if curve.kind == "pitchfork")
     d, r = broken.values.T
@@ -87,7 +108,7 @@ def soft_curves() -> list[BifurcationCurve]:
     pair = vijax.impact_pair(0.2, 40.0, 0.5)
     branches = vijax.follow_families(vijax.find_orbits(pair, "1:1", guesses=512), "kappa", (3.0, 400.0))
     points = [point for branch in branches for point in branch.points if point.kind in _FOLLOWED]
-    return curves_of(points, "kappa", {"d": (0.05, 0.3), "kappa": (3.0, 400.0)})
+    return curves_of(points, "kappa", SOFT)
 
 
 def products(what: str, curves: list[BifurcationCurve]) -> None:
@@ -119,50 +140,178 @@ def cusp() -> None:
         near = (sign * gamma > 1e-8) & (sign * gamma < 1e-4)
         power = np.polyfit(np.log(pitchfork(0.5) - d[near]), np.log(np.abs(gamma[near])), 1)[0]
         say(f"exponent of gamma over the distance from it, gamma {side} 0", f"{power:.5f}")
+        inner = (sign * gamma > 1e-7) & (sign * gamma < 2e-4)
+        away = pitchfork(0.5) - d[inner]
+        say(f"coefficient of that power, gamma {side} 0", f"{at_zero(away, np.abs(gamma[inner]) / away**1.5):.8f}")
 
 
-def lines() -> None:
-    """Follow branches along random lines through a plane, and compare what they locate with where curves cross."""
-    draw = np.random.default_rng(0)
-    seeds = [point for r in (0.3, 0.5, 0.7) for point in met(0.2, r, "d", PLANE["d"])]
-    curves = curves_of(seeds, "d", PLANE)
-    found, missing, extra, worst = 0, 0, 0, 0.0
-    for index in range(LINES):
-        along, still = ("d", "r") if index % 2 else ("r", "d")
-        value = float(draw.uniform(*INNER[still]))
-        start = {still: value, along: START[along]}
-        located = {
-            (point.kind.split()[0], round(point.value, 9)): point.value
-            for point in met(start["d"], start["r"], along, PLANE[along])
-        }
-        crossings = [one for curve in curves for one in crossed(curve, still, value)]
-        for (kind, _), x in located.items():
-            off = [abs(x - y) for k, y in crossings if k == kind]
-            found, missing = found + 1, missing + (min(off, default=1.0) > SAME)
-            worst = max(worst, min((one for one in off if one <= SAME), default=0.0))
-        for kind, y in crossings:
-            extra += min((abs(x - y) for (k, _), x in located.items() if k == kind), default=1.0) > SAME
-    say(f"points that branches locate along {LINES} lines", f"{found}")
-    say("of these without a curve that crosses there; crossings without a point", f"{missing}; {extra}")
-    say("largest distance between the two", f"{worst:.1e}")
+def at_zero(x: np.ndarray, y: np.ndarray) -> float:
+    """Extrapolate a smooth function to 0 by a polynomial, in x over its range."""
+    return float(np.polyfit(x / x.max(), y, 4)[-1])
 
 
-def crossed(curve: BifurcationCurve, still: str, value: float) -> list[tuple[str, float]]:
+class Line(NamedTuple):
+    """A line through a plane: the parameter that moves along it, the one that stays, and its value.
+
+    Of omega at a value of omega0 it is a slanted line through the plane of d and kappa: d kappa^2 stays.
+    """
+
+    along: str
+    still: str
+    value: float
+
+    @property
+    def device(self) -> vijax.Harvester:
+        """Give the device whose omega moves along the line."""
+        return dataclasses.replace(DEVICE, omega0=self.value) if self.still == "omega0" else DEVICE
+
+    def within(self, plane: dict[str, tuple[float, float]]) -> tuple[float, float]:
+        """Give the bounds of the parameter that moves."""
+        if self.along in plane:
+            return plane[self.along]
+        by_d = np.pi * np.sqrt(np.array(plane["d"]) * DEVICE.A / DEVICE.s)
+        by_kappa = np.pi * self.value / np.array(plane["kappa"])[::-1]
+        return float(max(by_d[0], by_kappa[0])), float(min(by_d[1], by_kappa[1]))
+
+    def off(self, pair: vijax.ImpactPair) -> np.ndarray:
+        """Say how far pairs are from the line."""
+        if self.still != "omega0":
+            return np.asarray(getattr(pair, self.still)) - self.value
+        return np.asarray(pair.kappa * np.sqrt(pair.d * DEVICE.A / DEVICE.s)) - self.value
+
+    def place(self, pair: vijax.ImpactPair) -> float:
+        """Give the parameter that moves, of a pair that is alone."""
+        if self.along != "omega":
+            return float(np.asarray(getattr(pair, self.along))[0])
+        return float(np.pi * np.sqrt(np.asarray(pair.d)[0] * DEVICE.A / DEVICE.s))
+
+
+class Crossing(NamedTuple):
+    """Where a curve crosses a line: what bifurcates, the place on the line, the orbit."""
+
+    kind: str
+    place: float
+    orbit: vijax.Orbit
+
+
+def cubic() -> None:
+    """Compare the cubic coefficient of a flip with how far apart the turns of doubled orbits are beyond it.
+
+    With the multiplier -1 - m of the simple orbit, orbits of x -> -(1 + m) x + b x^3 with two turns have x^2 = m/b.
+    """
+    (point, *_) = (
+        point for point in met(symmetric(0.2, 0.5), Line("d", "r", 0.5), (0.1, 0.32)) if point.kind == "flip"
+    )
+    knots = jnp.where(point.orbit.sequence.real[..., None], point.orbit.knots, 0.0)
+    coefficient = float(jax.vmap(cubic_coefficient)(point.orbit.pair, point.orbit.sequence, knots)[0])
+    away, ratio = [], []
+    for branch in switching.switch(point, "d", (0.1, 0.32), settings=FINE, points=40):
+        count, near = int(point.orbit.count[0]), np.abs(branch.values - point.value) < 2e-4
+        for d, orbit in zip(branch.values[near], np.asarray(branch.orbit.knots)[near], strict=True):
+            pair = dataclasses.replace(point.orbit.pair, d=jnp.array([d]))
+            simple = periodic.solve(pair, point.orbit.sequence, knots)
+            turns = np.stack([orbit[:count], orbit[count : 2 * count]])
+            turns[1, :, 0] -= float(point.orbit.sequence.span[0])
+            excess = -1 - float(np.asarray(simple.multipliers)[0, 0].real)
+            if abs(d - point.value) > 1e-6:
+                away.append(abs(d - point.value))
+                ratio.append(coefficient * float(((turns[0] - turns[1]) ** 2).sum()) / 4 / excess)
+    order = np.argsort(away)
+    fitted = at_zero(np.array(away)[order], np.array(ratio)[order])
+    say("cubic coefficient of a rigid flip; doubled orbits beyond it", f"{coefficient:.6f}; {len(away)}")
+    say("square of their amplitude over m/b, at the flip: off 1 by", f"{fitted - 1:.1e}")
+
+
+def lines(number: int = LINES) -> None:
+    """Follow branches along random lines through planes, and compare what they locate with where curves cross."""
+    seeds = [point for r in (0.3, 0.5, 0.7) for point in met(symmetric(0.2, r), Line("d", "r", r), PLANE["d"])]
+    draw, half = np.random.default_rng(0), number // 2
+    ways = [("d", "r") if index % 2 else ("r", "d") for index in range(half)]
+    told = [Line(*way, float(draw.uniform(*INNER[way[1]]))) for way in ways]
+    starts = [symmetric(**{line.still: line.value, line.along: START[line.along]}) for line in told]
+    compared("rigid, d x r", curves_of(seeds, "d", PLANE), told, starts, PLANE)
+    seeds = met(even(0.2, 40.0), Line("kappa", "d", 0.2), SOFT["kappa"])
+    d, kappa = draw.uniform(0.15, 0.25, number - half), np.exp(draw.uniform(np.log(20), np.log(100), number - half))
+    omega0 = kappa * np.sqrt(d * DEVICE.A / DEVICE.s)
+    told = [
+        (Line("d", "kappa", kappa[i]), Line("kappa", "d", d[i]), Line("omega", "omega0", omega0[i]))[i % 3]
+        for i in range(number - half)
+    ]
+    starts = [even(*place) for place in zip(d, kappa, strict=True)]
+    compared("soft, d x kappa, a third slanted", curves_of(seeds, "kappa", SOFT), told, starts, SOFT)
+
+
+def compared(
+    what: str,
+    curves: list[BifurcationCurve],
+    told: list[Line],
+    starts: list[vijax.Orbit],
+    plane: dict[str, tuple[float, float]],
+) -> None:
+    """Compare crossings with points that branches locate: from orbits on each line, and from those beside crossings."""
+    found, missing, beyond, extra, worst = 0, 0, 0, 0, 0.0
+    for line, start in zip(told, starts, strict=True):
+        within = line.within(plane)
+        located = met(start, line, within)
+        crossings = [one for curve in curves for one in crossed(curve, line, plane)]
+        for one in crossings:
+            if nearest(one, located) > SAME:
+                # The branches from the start do not come there, but one of the orbits that bifurcate must.
+                beyond += 1
+                located += beside(one, line, within)
+            extra += nearest(one, located) > SAME
+        for point in located:
+            off = min((nearest(one, [point]) for one in crossings), default=np.inf)
+            found, missing = found + 1, missing + (off > SAME)
+            worst = max(worst, off if off <= SAME else 0.0)
+    say(f"{what}: points that branches locate along {len(told)} lines", f"{found}")
+    say(f"{what}: points at which no curve crosses; crossings without a point", f"{missing}; {extra}")
+    say(f"{what}: crossings that only a branch from an orbit beside them locates", f"{beyond}")
+    say(f"{what}: largest distance between the two", f"{worst:.1e}")
+
+
+def nearest(crossing: Crossing, points: list[Point]) -> float:
+    """Find how far the nearest point of the same kind is."""
+    kind = crossing.kind
+    return min((abs(p.value - crossing.place) for p in points if p.kind.split()[0] == kind), default=np.inf)
+
+
+def beside(crossing: Crossing, line: Line, within: tuple[float, float]) -> list[Point]:
+    """Find what a branch meets that begins at an orbit near one that bifurcates, and so passes that."""
+    points = []
+    told: Any = {"device": line.device, "settings": PLAIN}
+    for branch in vijax.follow_orbits(crossing.orbit, line.along, within, points=12, **told):
+        for orbit in (branch.orbit[:1], branch.orbit[-1:]):
+            if len(orbit) and np.asarray(orbit.status)[0] == 0:
+                points += [p for one in vijax.follow_orbits(orbit, line.along, within, **told) for p in one.points]
+    return [point for point in points if point.kind in _FOLLOWED]
+
+
+def crossed(curve: BifurcationCurve, line: Line, plane: dict[str, tuple[float, float]]) -> list[Crossing]:
     """Find where a curve crosses a line: from a point beside it the curve is followed to the line as its bound."""
-    index = curve.along.index(still)
-    across, along = curve.values[:, index] - value, curve.along[1 - index]
-    found = []
+    across, found = line.off(curve.orbit.pair), []
     for place in np.flatnonzero(np.sign(across[:-1]) * np.sign(across[1:]) < 0):
         inside = place if across[place] > 0 else place + 1
         kind = "grazing flight" if curve.kind == "grazing" else curve.kind
-        beside = Point(kind, float(curve.values[inside, 1 - index]), curve.orbit[inside : inside + 1])
-        plane = {still: (value, PLANE[still][1]), along: PLANE[along]}
+        orbit = curve.orbit[inside : inside + 1]
+        guess = line.place(orbit.pair)
+        high = plane[line.still][1] if line.still in plane else 2 * line.value
+        # A curve may end a rounding beyond the bound of its plane.
+        low, top = plane.get(line.along, (guess / 2, guess * 2))
+        bounds = {line.still: (line.value, high), line.along: (low - SAME**2, top + SAME**2)}
+        there = (
+            dataclasses.replace(line.device, omega0=line.value + float(across[inside]))
+            if line.still == "omega0"
+            else line.device
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            followed = vijax.follow_curves([beside], along, plane, max_points=40)
-        ends = [row for one in followed for row in one.values[[0, -1]] if abs(row[0] - value) < SAME**2]
-        guess = curve.values[inside, 1 - index]
-        found += [(curve.kind, float(min((row[1] for row in ends), key=lambda x: abs(x - guess))))] if ends else []
+            followed = vijax.follow_curves([Point(kind, guess, orbit)], line.along, bounds, device=there, max_points=40)
+        ends = [one.orbit[at : at + 1] if at == 0 else one.orbit[-1:] for one in followed for at in (0, -1)]
+        ends = [end for end in ends if abs(line.off(end.pair)[0]) < SAME**2 * max(1.0, line.value)]
+        if ends:
+            orbit = min(ends, key=lambda end: abs(line.place(end.pair) - guess))
+            found.append(Crossing(curve.kind, line.place(orbit.pair), orbit))
     return found
 
 
@@ -171,12 +320,11 @@ def speed() -> None:
     pair = vijax.impact_pair(0.2, 40.0, 0.5)
     branches = vijax.follow_families(vijax.find_orbits(pair, "1:1", guesses=512), "kappa", (3.0, 400.0))
     points = [point for branch in branches for point in branch.points if point.kind in _FOLLOWED]
-    plane, fine = {"d": (0.05, 0.3), "kappa": (3.0, 400.0)}, vijax.ContinuationSettings(max_step=1e-3)
     for _ in range(2):
         begun = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            curves = vijax.follow_curves(points, "kappa", plane, settings=fine)
+            curves = vijax.follow_curves(points, "kappa", SOFT, settings=FINE)
         seconds = time.perf_counter() - begun
     count = sum(len(curve.values) for curve in curves)
     say(
@@ -227,13 +375,27 @@ def explained(charts: Path | None = None) -> None:
         points = sum(len(curve.values) for curve in found.curves)
         say(f"{name}: curves, points, seconds once compiled", f"{len(found.curves)}, {points}, {seconds:.0f}")
         say(f"{name}: largest piece that no curve explains, in borders; ended", f"{len(found.largest)}; {found.ended}")
+        if len(found.largest):
+            say(f"{name}: what that piece parts", described(found.largest, dataset))
         if charts is not None:
             figure = vijax.plots.curves(vijax.curve_dataset(found), dataset)
             vijax.plots.save(figure, charts / f"curves_{'_'.join(found.along)}.png")
 
 
+def described(where: np.ndarray, dataset: Any) -> str:
+    """Say which labels part most often at places half way between cells, and where the first of them is."""
+    plane = labelled_plane(dataset)
+    index = np.stack([np.interp(x, axis, np.arange(len(axis))) for x, axis in zip(where.T, plane.axes, strict=True)])
+    low, high = (np.round(index + shift).astype(int) for shift in (-0.25, 0.25))
+    sides = zip(plane.names[tuple(low)], plane.names[tuple(high)], strict=True)
+    (names, _), *_ = Counter(" | ".join(sorted(map(str, pair))) for pair in sides).most_common(1)
+    place = ", ".join(f"{name} {x:.4g}" for name, x in zip(plane.along, where[0], strict=True))
+    return f"{names} near {place}"
+
+
 PARTS: dict[str, Callable[..., None]] = {
     "known": known,
+    "cubic": cubic,
     "lines": lines,
     "speed": speed,
     "limits": limits,
@@ -246,10 +408,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--only", choices=PARTS)
     parser.add_argument("--charts", type=Path, metavar="FOLDER", help="where to draw the planes that are explained")
+    parser.add_argument("--lines", type=int, default=LINES, help="how many lines are drawn")
     given = parser.parse_args()
     for name, part in PARTS.items():
         if given.only in (None, name):
-            part(given.charts) if part is explained else part()
+            told: dict[Callable[..., None], Any] = {explained: given.charts, lines: given.lines}
+            part(*([told[part]] if part in told else []))
     return 0
 
 

@@ -160,3 +160,18 @@ def test_a_fold_goes_on_through_its_graze():
             near = vijax.follow_orbits(other, "d", (d - 0.01, d + 0.01), settings=plain)
             met += [point.value for one in near for point in one.points if point.kind == "fold"]
     assert np.abs(np.array(met) - d).min() < 1e-10
+
+
+def test_a_curve_of_parting_contacts_is_where_branches_meet_them(orbits):
+    half, low = symmetry.halved(orbits[0]), (0.02, 0.3)
+    (down,) = vijax.follow_orbits(half, "d", low, direction="down")
+    (graze, *_) = [point for point in down.points if point.kind == "grazing contact"]
+    (curve,) = vijax.follow_curves([graze], "d", {"d": low, "kappa": (38.0, 42.0)})
+    assert (curve.kind, curve.ends) == ("grazing contact", ("kappa low", "kappa high"))
+    assert np.asarray(curve.orbit.residual).max() < 1e-13
+    # Rounding decides whether a contact that just touches its wall from inside has ended: either orbit is flown.
+    assert (np.asarray(curve.orbit.status) == Status.OK).mean() > 0.8
+    # A branch at the end of the curve meets the graze there.
+    (other,) = vijax.follow_orbits(curve.orbit[-2:-1], "d", low, points=40)
+    d = [point.value for point in other.points if point.kind == "grazing contact"]
+    assert min(abs(value - curve.values[-2, 0]) for value in d) < 1e-11

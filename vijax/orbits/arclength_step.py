@@ -19,11 +19,12 @@ from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting
 from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
-from vijax.runtime import linear_solve, tiles
+from vijax.runtime import ring_solve, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.programs import begin, jitted
+from vijax.runtime.ring_solve import Ring
 
-_BATCHES = (8, 64, 512)  # lanes of one compiled call
+BATCHES = (8, 64, 512)  # lanes of one compiled call
 
 
 class Tests(NamedTuple):
@@ -42,6 +43,14 @@ class Tests(NamedTuple):
 
 FOLD, PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
 FIRST_END = Tests._fields.index("speed")
+
+
+class PathEquations(NamedTuple):
+    """The equations of a path: what is missing to an orbit and to what holds besides, with all derivatives."""
+
+    gap: Float[Array, "equation"]
+    condition: Float[Array, "condition"]
+    ring: Ring
 
 
 class Arc(eqx.Module):
@@ -79,11 +88,12 @@ class Arc(eqx.Module):
         knots, x = self.unpack(y)
         return self.at(x), knots
 
-    def equations(self, y) -> shooting.LinearisedEquations:
+    def equations(self, y) -> PathEquations:
         """Compute the gap and its derivatives in knots and parameter."""
         knots, x = self.unpack(y)
         pair, moved = jax.jvp(self.at, (x,), (self.high - self.low,))
-        return shooting.linearise(pair, self.sequence, knots, moved)
+        gap, ring = shooting.linearise(pair, self.sequence, knots, moved)
+        return PathEquations(gap, jnp.zeros(0, y.dtype), ring)
 
     def tests(self, y, tangent, former) -> Tests:
         """Compute the test functions; which way the step was that led here does not matter to them."""
@@ -130,7 +140,7 @@ class Path(Protocol):
     def pair_and_knots(self, y) -> tuple[ImpactPair, Float[AnyArray, "*orbit impact 3"]]:
         """Give the orbits of points, many along a leading axis."""
 
-    def equations(self, y) -> shooting.LinearisedEquations:
+    def equations(self, y) -> PathEquations:
         """Compute what is missing to a point, and the derivatives in all unknowns."""
 
     def tests(self, y, tangent, former) -> Iterable[Array]:
@@ -148,13 +158,15 @@ class _Corrected(NamedTuple):
 
 def _correct(path: Path, guess, former) -> _Corrected:
     """Correct by Newton in the plane across the former tangent, and find the tangent there."""
-    ahead = jnp.zeros_like(guess).at[-1].set(1.0)
 
     def once(at: _Corrected) -> _Corrected:
-        gap, slope = path.equations(at.y)
-        slope = jnp.concatenate([slope, former[None]])
-        miss = jnp.append(gap, former @ (at.y - guess))
-        step, tangent = linear_solve.solve(slope, jnp.stack([miss, ahead], axis=1)).T
+        gap, condition, ring = path.equations(at.y)
+        miss = jnp.append(condition, former @ (at.y - guess))
+        # Two right sides: what is missing, and a unit of the way ahead with nothing missing.
+        right = jnp.stack([gap, jnp.zeros_like(gap)], axis=1).reshape(-1, 3, 2)
+        ahead = jnp.zeros_like(miss).at[-1].set(1.0)
+        inner, outer = ring_solve.solve(ring.bordered(former[None]), right, jnp.stack([miss, ahead], axis=1))
+        step, tangent = jnp.concatenate([inner.reshape(-1, 2), outer]).T
         return _Corrected(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.corrections + 1)
 
     def going(at: _Corrected):
@@ -200,4 +212,4 @@ def _advanced(rows: tuple[Path, Any, Any, Any]) -> BranchPlace:
 
 def advance(paths: Path, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
     """Go on from points of paths by an arclength each: the compiled programs behind every step and every search."""
-    return tiles.map_tiles(_advanced, (paths, y, tangent, length), _BATCHES)
+    return tiles.map_tiles(_advanced, (paths, y, tangent, length), BATCHES)

@@ -23,23 +23,29 @@ class Walked(NamedTuple):
     end: str
 
 
-def walk(
-    paths: Path,
-    first: BranchPlace,
-    points: int | np.ndarray,
-    settings: ContinuationSettings,
-    happenings: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    first_end: int,
-) -> list[Walked]:
+class WalkRules(NamedTuple):
+    """How paths of one kind are followed.
+
+    Attributes:
+        settings: Of the steps.
+        happenings: Counts what happens between two rows of test functions.
+        first_end: The column from which on test functions are positive on real orbits.
+    """
+
+    settings: ContinuationSettings
+    happenings: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    first_end: int
+
+
+def walk(paths: Path, first: BranchPlace, points: int | np.ndarray, rules: WalkRules) -> list[Walked]:
     """Follow one way from every start: all lanes together until none goes on; a step that does not do is halved.
 
     Args:
         paths, first: What is followed, a lane a row, and where from.
         points: Most points of a path, or of each.
-        settings: Of the steps.
-        happenings: Counts what happens between two rows of test functions.
-        first_end: The column from which on test functions are positive on real orbits.
+        rules: Of steps, and what they may pass.
     """
+    settings, happenings, first_end = rules
     lanes, bend = first.y.shape[0], 1 - settings.min_cosine
     passed = [[(first.y[lane], first.tangent[lane], first.tests[lane], 0.0)] for lane in range(lanes)]
     y, tangent, tests = first.y, first.tangent, first.tests

@@ -13,7 +13,7 @@ from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import symmetry
 from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
-from vijax.orbits.arclength_walk import Walked
+from vijax.orbits.arclength_walk import Walked, WalkRules
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import BranchEvent, Point, events, happenings, kind_of, locate, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
@@ -158,10 +158,11 @@ def heading(place: BranchPlace, sign: float) -> BranchPlace:
 def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
     """Follow one way from every start, at soft walls through grazes, after which orbits have other impacts."""
 
-    def making(_: int, arc: Arc, walked: Walked, begun: bool) -> Piece:
-        return _piece(arc, walked, settings, begun)
+    def making(_: list[int], arcs: Arc, walked: list[Walked], begun: list[bool]) -> list[Piece]:
+        each = [jax.tree.map(lambda leaf, i=lane: leaf[i], arcs) for lane in range(len(walked))]
+        return [_piece(arc, one, settings, first) for arc, one, first in zip(each, walked, begun, strict=True)]
 
-    followed = follow_pieces(arcs, first, making, points, settings, happenings, FIRST_END)
+    followed = follow_pieces(arcs, first, making, points, WalkRules(settings, happenings, FIRST_END))
     return [Branch(along, *one) for one in followed]
 
 

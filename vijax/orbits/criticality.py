@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 from vijax.model.pair import ImpactPair
 from vijax.orbits import shooting
 from vijax.orbits.shooting import Knots, Sequence
-from vijax.runtime import linear_solve
+from vijax.runtime import ring_solve
+from vijax.runtime.ring_solve import Ring
 
 
 def cubic_coefficient(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, ""]:
@@ -20,28 +21,36 @@ def cubic_coefficient(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Flo
 
     Two turns x + e q + e^2 h, x - e q + e^2 h are put into the equations F(turn, next turn) of one. To the second order
     that gives h. To the third, what is left along the left null vector p is what x^3 has to make up for:
-    b = -p F_3 / (p F_next q).
+    b = -p F_3 / (p F_next q). Bordered by the column F_next q the equations of q are regular, and what they give that
+    column for F_3 is that quotient, so that p need not be known.
     Source: Kuznetsov, Elements of Applied Bifurcation Theory, Eq. (5.45), written for equations in place of a map.
     """
-    shape = knots.shape
+    shape, whole = knots.shape, shooting.linearise(pair, sequence, knots).ring
 
-    def turn(here: Float[Array, "n"], after: Float[Array, "n"]) -> Float[Array, "3*impact"]:
-        return shooting.gap(pair, sequence, here.reshape(shape), after.reshape(shape))
+    def turn(here: Knots, after: Knots) -> Float[Array, "impact 3"]:
+        return shooting.gap(pair, sequence, here, after).reshape(shape)
 
-    x = knots.reshape(-1)
-    onward = jax.jacfwd(lambda after: turn(x, after))(x)
-    whole = shooting.linearise(pair, sequence, knots).slope
-    p, q = _null_vectors(whole - 2 * onward)
+    def onward(q: Knots) -> Float[Array, "impact 3"]:
+        return jax.jvp(lambda after: turn(knots, after), (knots,), (q,))[1]
 
-    def leaning(h: Float[Array, "n"]) -> Callable[[Float[Array, ""]], Float[Array, "3*impact"]]:
-        return lambda e: turn(x + e * q + e * e * h, x - e * q + e * e * h)
+    def leaning(h: Knots) -> Callable[[Float[Array, ""]], Float[Array, "impact 3"]]:
+        return lambda e: turn(knots + e * q + e * e * h, knots - e * q + e * e * h)
 
-    h = linear_solve.solve(whole, -0.5 * _derivative(leaning(jnp.zeros_like(x)), 2))
-    third = _derivative(leaning(h), 3) / 6
-    return -(p @ third) / (p @ (onward @ q))
+    # The next turn leans the other way.
+    opposite = whole._replace(there=jnp.where(whole.closes[:, None, None], -whole.there, whole.there))
+    none, one = jnp.zeros_like(knots), jnp.ones((1, 1), knots.dtype)
+    # Any row and column border a singular matrix to a regular one, unless orthogonal to its null vectors; then those
+    # that were found do it better.
+    begin = jnp.where(sequence.real[:, None], jnp.cos(jnp.arange(knots.size)).reshape(shape), 0.0)
+    q = _unit(_bordered(opposite, begin, begin, none, one)[0])
+    q = _unit(_bordered(opposite, onward(q), q, none, one)[0])
+    second = _derivative(leaning(none), 2)
+    h, _ = ring_solve.solve(whole, -0.5 * second[..., None], jnp.zeros((0, 1), knots.dtype))
+    _, left = _bordered(opposite, onward(q), q, _derivative(leaning(h[..., 0]), 3) / 6, 0 * one)
+    return -left
 
 
-def _derivative(of: Callable, order: int) -> Float[Array, "n"]:
+def _derivative(of: Callable, order: int) -> Float[Array, "impact 3"]:
     """Compute the derivative of an order at zero."""
     for _ in range(order):
         of = _once(of)
@@ -52,20 +61,15 @@ def _once(of: Callable) -> Callable:
     return lambda e: jax.jvp(of, (e,), (jnp.ones_like(e),))[1]
 
 
-def _null_vectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Find the left and the right null vector of a matrix that has one each, of length 1.
-
-    Bordered by a row and a column the matrix is regular, unless these happen to be orthogonal to what is sought. So
-    they are any at first, and then what was found.
-    """
-    size = matrix.shape[0]
-    left = right = jnp.cos(jnp.arange(size, dtype=matrix.dtype))
-    for _ in range(2):
-        left, right = _bordered(matrix.T, right, left), _bordered(matrix, left, right)
-    return left, right
+def _bordered(
+    ring: Ring, column: Knots, row: Knots, right: Knots, bottom: Float[Array, "1 1"]
+) -> tuple[Knots, Float[Array, ""]]:
+    """Solve equations with one unknown more, by its column, and one equation more, by its row."""
+    none = jnp.zeros((1, 1), column.dtype)
+    wide = ring._replace(beside=column[..., None], below=row[None], corner=none)
+    found, more = ring_solve.solve(wide, right[..., None], bottom)
+    return found[..., 0], more[0, 0]
 
 
-def _bordered(matrix: Float[Array, "n n"], column, row) -> Float[Array, "n"]:
-    wide = jnp.block([[matrix, column[:, None]], [row[None], jnp.zeros((1, 1), matrix.dtype)]])
-    found = linear_solve.solve(wide, jnp.zeros_like(wide[0]).at[-1].set(1.0))[:-1]
-    return found / jnp.linalg.norm(found)
+def _unit(q: Knots) -> Knots:
+    return q / jnp.linalg.norm(q)

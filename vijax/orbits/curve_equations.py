@@ -1,8 +1,8 @@
 """A curve of bifurcations in a plane of two parameters as a path in the space of knots and both parameters.
 
 To the equations of the orbit come those of what it is that happens: a multiplier is 1 or -1, the ball just touches a
-wall in flight, or an impact is as deep, or harvests as much of what it gives to the membrane, as may be. Past the end
-of real orbits the equations go on, as those of orbits do; test functions say where.
+wall, in flight or from inside in a contact, or an impact is as deep, or harvests as much of what it gives to the
+membrane, as may be. Past the end of real orbits the equations go on, as those of orbits do; test functions say where.
 """
 
 import dataclasses
@@ -19,13 +19,18 @@ from vijax.model import flow
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting, steady
-from vijax.orbits.criticality import cubic_coefficient
+from vijax.orbits.arclength_step import PathEquations
 from vijax.orbits.parameter import moved_together
-from vijax.orbits.shooting import LinearisedEquations, Sequence
+from vijax.orbits.shooting import Sequence
 from vijax.runtime.arrays import AnyArray
 
-Condition = Literal["multiplier", "touch", "depth", "energy"]
-CONDITIONS: dict[str, Condition] = {"grazing": "touch", "penetration limit": "depth", "energy limit": "energy"}
+Condition = Literal["multiplier", "touch", "split", "depth", "energy"]
+CONDITIONS: dict[str, Condition] = {
+    "grazing": "touch",
+    "grazing contact": "split",
+    "penetration limit": "depth",
+    "energy limit": "energy",
+}
 """What holds on curves of a kind; on those of all other kinds a multiplier is given."""
 
 
@@ -33,7 +38,7 @@ class CurveTests(NamedTuple):
     """Functions whose sign changes mark what happens on a curve; those from `push` on are positive on real orbits."""
 
     turn: Float[Array, ""]  # how far a step goes on in the plane the way that it came: it turns back at a cusp
-    cubic: Float[Array, ""]  # the cubic coefficient of a flip: on which side the doubled orbits lie
+    cubic: Float[Array, ""]  # that of a flip, on which side doubled orbits lie; 1 until `curve_events` asks for it
     plus: Float[Array, ""]  # A multiplier of a grazing orbit passes +1 where it changes sign.
     minus: Float[Array, ""]  # One passes -1 here.
     # At a graze the acceleration away from the wall that is touched; at a limit how far off all other impacts are.
@@ -53,7 +58,7 @@ FIRST_CURVE_END = CurveTests._fields.index("push")
 
 
 class Touch(eqx.Module):
-    """Where the ball touches a wall: after which impact, and which wall; at a limit, which impact is there."""
+    """Where the ball touches a wall: after, or in, which impact, and which wall; at a limit, which impact is there."""
 
     impact: Int[AnyArray, "*orbit"]
     wall: Float[AnyArray, "*orbit"]
@@ -61,8 +66,9 @@ class Touch(eqx.Module):
 
 
 class CurvePath(eqx.Module):
-    """What a lane follows: unknowns are all knots, at a graze how long after a contact it is, and both parameters.
+    """What a lane follows: unknowns are all knots, at a graze when it is, and both parameters.
 
+    A graze is so long after the end of a contact, or after its onset where the ball touches from inside.
     Parameters count over their range, so that the plane is a square of side 1; one whose bounds are more than a decade
     apart counts in its logarithm.
 
@@ -77,7 +83,7 @@ class CurvePath(eqx.Module):
         device: Whose limits they are, with its `penetration_limit`; None on curves of bifurcations.
         along: Which parameters move.
         logarithmic: Which of them count in their logarithms.
-        condition: Whether a multiplier is given, a wall touched, or an impact at a limit.
+        condition: Whether a multiplier is given, a wall touched in flight or from inside, or an impact at a limit.
         newton_tolerance, max_corrections: See `ContinuationSettings`.
     """
 
@@ -129,6 +135,10 @@ class CurvePath(eqx.Module):
             return jnp.where(self.multiplier > 0, both.plus, both.minus)[None]
         if self.device is not None:
             return self._loads(self.device, y[-2:], pair, knots)[self.touch.impact][None] - 1
+        if self.condition == "split":
+            t, speed, _ = knots[self.touch.impact]
+            force = flow.contact_force(pair.gamma, self.touch.wall, t)
+            return jnp.stack(flow.oscillate(flow.membrane(pair, rolled=True), force, 0.0 * t, speed, y[-3]))
         leave = jax.tree.map(lambda leaf: leaf[self.touch.impact], shooting.departures(pair, self.sequence, knots))
         rise, v = flow.flight(flow.flight_force(pair.gamma, leave.t), -leave.side * leave.speed, y[-3])
         return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])
@@ -143,41 +153,46 @@ class CurvePath(eqx.Module):
         depth, energy, work = steady.yields(device, pair, self.sequence, knots, grazing.between(*frozen).deepest)
         return depth / device.depth_limit if self.condition == "depth" else energy / work
 
-    def equations(self, y) -> LinearisedEquations:
+    def equations(self, y) -> PathEquations:
         """Compute the gap and the condition, and their derivatives in all unknowns."""
         pair, knots = self.pair_and_knots(y)
-        orbit = shooting.linearise(pair, self.sequence, knots)
-        tilt = jax.jacfwd(lambda z: shooting.gap(self.at(z), self.sequence, knots))(y[-2:])
-        idle = jnp.zeros((orbit.gap.size, y.size - orbit.gap.size - 2), y.dtype)
-        slope = jax.jacfwd(self.condition_at)(y)
-        return LinearisedEquations(
-            jnp.concatenate([orbit.gap, self.condition_at(y)]),
-            jnp.concatenate([jnp.concatenate([orbit.slope, idle, tilt], axis=1), slope]),
+        moved = [jax.jvp(self.at, (y[-2:],), (unit,))[1] for unit in jnp.eye(2, dtype=y.dtype)]
+        gap, ring = shooting.linearise(pair, self.sequence, knots, *moved)
+        waits = y.size - gap.size - 2
+        idle = jnp.zeros((*ring.beside.shape[:2], waits), y.dtype)
+        ring = ring._replace(
+            beside=jnp.concatenate([idle, ring.beside], axis=2), corner=jnp.zeros((0, waits + 2), y.dtype)
         )
+        # Backwards: of one number, or two, all derivatives at once.
+        return PathEquations(gap, self.condition_at(y), ring.bordered(jax.jacrev(self.condition_at)(y)))
+
+    def _push(self, pair: ImpactPair, knots, wait) -> Float[Array, ""]:
+        """Compute the acceleration away from where the ball touches: off the wall in flight, into it in a contact."""
+        if self.condition == "split":
+            return self.touch.wall * flow.acceleration(pair.gamma, knots[self.touch.impact, 0] + wait)
+        leave = shooting.departures(pair, self.sequence, knots).t[self.touch.impact]
+        return -self.touch.wall * flow.acceleration(pair.gamma, leave + wait)
 
     def tests(self, y, tangent, former) -> CurveTests:
         """Compute the test functions at a point with its tangent, reached along a former tangent."""
         pair, knots = self.pair_and_knots(y)
         one = jnp.ones_like(pair.d)
-        cubic, plus, minus, push, touch = one, one, one, one, None
-        if self.condition == "touch":
+        plus, minus, push, touches = one, one, one, {}
+        if self.condition in ("touch", "split"):
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
             here = jnp.arange(knots.shape[0], dtype=jnp.int32) == self.touch.impact
-            touch = jnp.where(here, y[-3], jnp.nan)
-            leave = shooting.departures(pair, self.sequence, knots).t[self.touch.impact]
-            push = -self.touch.wall * flow.acceleration(pair.gamma, leave + y[-3])
+            touches = {self.condition: jnp.where(here, y[-3], jnp.nan)}
+            push = self._push(pair, knots, y[-3])
         elif self.device is not None and self.touch.alike is not None:
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
             loads = self._loads(self.device, y[-2:], pair, knots)
             push = jnp.where(self.touch.alike, 1.0, loads[self.touch.impact] - loads).min()
-        else:
-            cubic = jnp.where(self.multiplier > 0, one, cubic_coefficient(pair, self.sequence, knots))
-        room = grazing.between(pair, self.sequence, knots, touch).clearance
+        room = grazing.between(pair, self.sequence, knots, **touches).clearance
         z = y[-2:]
         return CurveTests(
             # Where a limit turns back its orbit has met its mirror image or has doubled, which `push` says.
             turn=(tangent[-2:] @ former[-2:]) / jnp.linalg.norm(former[-2:]) if self.device is None else one,
-            cubic=cubic,
+            cubic=one,
             plus=plus,
             minus=minus,
             push=push,

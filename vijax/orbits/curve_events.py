@@ -9,14 +9,20 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
+from vijax.model.pair import ImpactPair
 from vijax.orbits import orbit_properties, symmetry
-from vijax.orbits.arclength_step import advance
+from vijax.orbits.arclength_step import BATCHES, BranchPlace, advance
 from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import ContinuationSettings
+from vijax.orbits.criticality import cubic_coefficient
 from vijax.orbits.curve_equations import CUBIC, TURN, CurvePath, CurveTests, passed
 from vijax.orbits.events import locate, onward, orbits_at
 from vijax.orbits.periodic import Orbit
+from vijax.orbits.shooting import Sequence
+from vijax.runtime import tiles
+from vijax.runtime.programs import jitted
 
 # Part of a tangent that lies in the plane at which a curve stands still there: beside a cusp it is the distance from
 # it, along a curve that only bends it is what it was.
@@ -63,27 +69,73 @@ class CurveEvent(NamedTuple):
     ends: bool
 
 
-def curve_events(path: CurvePath, walked: Walked, kind: str, settings: ContinuationSettings) -> list[CurveEvent]:
-    """Find what happens between neighbours of a curve in order, up to the first thing that ends it."""
-    index, test = np.nonzero(passed(walked.tests[:-1], walked.tests[1:]))
-    if not index.size:
-        return []
-    y, tangent, lengths = walked.y[index], walked.tangent[index], walked.lengths[index + 1]
-    begun = np.where(test == TURN, np.linalg.norm(tangent[:, -2:], axis=1), walked.tests[index, test])
-    paths = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (test.size, *leaf.shape)), path)
-    s, there, zero = locate(paths, y, tangent, lengths, test, begun, settings)
-    still = np.linalg.norm(advance(paths, y, tangent, s).tangent[:, -2:], axis=1) < _STILL
-    found = []
-    for number in np.lexsort((s, index)):
-        which = int(test[number])
-        if not zero[number] or (which == TURN and not still[number]):
+def curve_events(
+    paths: CurvePath, walked: list[Walked], kinds: list[str], settings: ContinuationSettings
+) -> list[list[CurveEvent]]:
+    """Find what happens between neighbours of curves in order, up to the first thing that ends each; all at once."""
+    tests = _with_cubics(paths, walked)
+    steps = [passed(one[:-1], one[1:]) for one in tests]
+    lane = np.repeat(np.arange(len(walked)), [len(one) for one in steps])
+    place = np.concatenate([np.arange(len(one)) for one in steps])
+    step, test = np.nonzero(np.concatenate(steps))
+    lane, place = lane[step], place[step]
+    found: list[list[CurveEvent]] = [[] for _ in walked]
+    if not step.size:
+        return found
+    y, tangent, length, begun = (
+        np.array([rows[i][k + shift] for i, k in zip(lane, place, strict=True)])
+        for rows, shift in (
+            ([one.y for one in walked], 0),
+            ([one.tangent for one in walked], 0),
+            ([one.lengths for one in walked], 1),
+            (tests, 0),
+        )
+    )
+    begun = np.where(test == TURN, np.linalg.norm(tangent[:, -2:], axis=1), begun[np.arange(test.size), test])
+    own = jax.tree.map(lambda leaf: np.asarray(leaf)[lane], paths)
+
+    def read(rows: np.ndarray, at: BranchPlace) -> np.ndarray:
+        values = at.tests[np.arange(rows.size), test[rows]].copy()
+        if (asked := np.flatnonzero(test[rows] == CUBIC)).size:
+            values[asked] = _cubics(jax.tree.map(lambda leaf: leaf[rows[asked]], own), at.y[asked])
+        return values
+
+    s, there, zero = locate(own, y, tangent, length, test, begun, settings, read)
+    still = np.linalg.norm(advance(own, y, tangent, s).tangent[:, -2:], axis=1) < _STILL
+    for number in np.lexsort((s, place, lane)):
+        which, events = int(test[number]), found[lane[number]]
+        if not zero[number] or (which == TURN and not still[number]) or (events and events[-1].ends):
             continue
-        name, ends = _named(path, which, there[number], kind, settings)
+        path = jax.tree.map(lambda leaf, i=number: leaf[i], own)
+        name, ends = _named(path, which, there[number], kinds[lane[number]], settings)
         what = _TEST.get(CurveTests._fields[which], "")
-        found.append(CurveEvent(int(index[number]), float(s[number]), name, what, there[number], ends))
-        if ends:
-            break
+        events.append(CurveEvent(int(place[number]), float(s[number]), name, what, there[number], ends))
     return found
+
+
+@jitted
+def _coefficients(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Float[Array, "orbit"]:
+    return jax.vmap(cubic_coefficient)(pair, sequence, knots)
+
+
+def _cubics(paths: CurvePath, ys: np.ndarray) -> np.ndarray:
+    """Compute the cubic coefficients of points of flips, a path each."""
+    pair, knots = paths.pair_and_knots(ys)
+    return tiles.map_tiles(lambda rows: _coefficients(*rows), (pair, paths.sequence, knots), BATCHES)
+
+
+def _with_cubics(paths: CurvePath, walked: list[Walked]) -> list[np.ndarray]:
+    """Give the test functions of all points, with the coefficients of flips, which no step needs to know."""
+    tests = [one.tests for one in walked]
+    flips = np.flatnonzero(paths.multiplier < 0) if paths.condition == "multiplier" else np.zeros(0, int)
+    if flips.size:
+        sizes = [len(tests[lane]) for lane in flips]
+        rows = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[flips], sizes, axis=0), paths)
+        values = np.split(_cubics(rows, np.concatenate([walked[lane].y for lane in flips])), np.cumsum(sizes)[:-1])
+        for lane, cubics in zip(flips, values, strict=True):
+            tests[lane] = tests[lane].copy()
+            tests[lane][:, CUBIC] = cubics
+    return tests
 
 
 def _named(path: CurvePath, test: int, y: np.ndarray, kind: str, settings: ContinuationSettings) -> tuple[str, bool]:
@@ -102,7 +154,7 @@ def _named(path: CurvePath, test: int, y: np.ndarray, kind: str, settings: Conti
     if name in _TEST and limit:
         return "graze at a limit", True
     if name in _TEST:
-        return ("double graze" if kind == "grazing" else f"{kind}-graze"), True
+        return ("double graze" if kind.startswith("grazing") else f"{kind}-graze"), True
     bound, _, which = name.partition("_")
     return f"{path.along[which == 'second']} {bound}", True
 

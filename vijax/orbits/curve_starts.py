@@ -21,11 +21,11 @@ class CurveStart(NamedTuple):
     """A bifurcation from which a curve is to be followed.
 
     Attributes:
-        kind: "fold", "flip", "pitchfork" or "grazing".
+        kind: "fold", "flip", "pitchfork", "grazing" (of a flight) or "grazing contact".
         orbit: The orbit there, alone: closed half way at a pitchfork; at a graze without the impact that fades.
         place: Both parameters of the plane.
-        impact, wait, wall: At a graze, how long after the end of which contact the ball touches which wall; else of no
-            meaning.
+        impact, wait, wall: At a graze, how long after the end of which contact the ball touches which wall, or after
+            the onset of which contact it comes back to it from inside; else of no meaning.
     """
 
     kind: str
@@ -58,11 +58,12 @@ def curve_start(point: Point, place: tuple[float, float], asymmetry: float) -> C
         asymmetry: How far from its mirror image an orbit at a pitchfork may be.
     """
     kind, orbit = point.kind, point.orbit
-    if kind in ("grazing contact", "grazing exit"):
-        return f"curves of {kind} are not followed"
-    if kind == "grazing flight":
-        index, wait, wall = _closest(*_only(orbit))
-        return CurveStart("grazing", orbit, place, int(index), float(wait), float(wall))
+    if kind == "grazing exit":
+        return "the graze of an exit is that of an impact, or of a contact, which begin curves"
+    if kind in ("grazing flight", "grazing contact"):
+        inside = kind == "grazing contact"
+        index, wait, wall = (_shallowest if inside else _closest)(*_only(orbit))
+        return CurveStart(kind if inside else "grazing", orbit, place, int(index), float(wait), float(wall))
     if kind == "grazing impact":
         return _without_impact(orbit, place)
     if int(orbit.status[0]) != Status.OK:
@@ -72,7 +73,7 @@ def curve_start(point: Point, place: tuple[float, float], asymmetry: float) -> C
     return CurveStart(kind, orbit, place)
 
 
-_closest = jitted(grazing.closest_turn)
+_closest, _shallowest = jitted(grazing.closest_turn), jitted(grazing.shallowest_turn)
 
 
 def _only(orbit: Orbit):
@@ -81,14 +82,18 @@ def _only(orbit: Orbit):
 
 
 def _without_impact(orbit: Orbit, place: tuple[float, float]) -> CurveStart | str:
-    """Leave out the impact whose speed has come to zero: what is left is an orbit that touches a wall in flight."""
+    """Leave out the impact whose speed has come to zero: what is left touches a wall in flight, or from inside.
+
+    From inside where the forcing holds the ball on its wall: the contact before goes on through the impact.
+    """
     pair, sequence, knots = _only(orbit)
     count = int(sequence.real.sum())
     index = int(np.where(sequence.real, knots[:, 1], np.inf).argmin())
-    side, t = int(sequence.side[index]), knots[index, 0]
+    side, (t, _, stay) = int(sequence.side[index]), knots[index]
     if count == 1:
         return "no impact would be left"
-    if side * float(flow.acceleration(pair.gamma, t)) > 0:
+    inside = side * float(flow.acceleration(pair.gamma, t)) > 0
+    if inside and pair.rigid:
         return "the forcing holds the ball on its wall"
     rest = np.delete(np.arange(len(knots)), index)
     rest = np.append(rest, rest[-1:])  # The row keeps its width: the last impact stands twice, as padding.
@@ -96,19 +101,26 @@ def _without_impact(orbit: Orbit, place: tuple[float, float]) -> CurveStart | st
     # The impact before it; of the first one that is the last, a turn earlier.
     before, again = (index - 1, False) if index else (count - 2, True)
     wall = -side if again and sequence.mirrored else side
-    given = guessed(walls[None], np.atleast_1d(sequence.span), np.atleast_1d(sequence.mirrored), knots[rest][None])
+    onset, knots = t + (float(sequence.span) if again else 0.0), knots[rest]
+    began, _, held = knots[before]
+    wait = onset - began - (0.0 if inside else held)
+    if inside:
+        knots[before, 2] = onset + stay - began
+    given = guessed(walls[None], np.atleast_1d(sequence.span), np.atleast_1d(sequence.mirrored), knots[None])
     kept = proven(orbit.pair, *given)
-    leave = knots[rest[before], 0] + knots[rest[before], 2]
-    wait = t + (float(sequence.span) if again else 0.0) - leave
-    return CurveStart("grazing", kept, place, before, float(wait), float(wall))
+    return CurveStart("grazing contact" if inside else "grazing", kept, place, before, float(wait), float(wall))
 
 
-def with_touch(pair: ImpactPair, knots, sequence: Sequence, touch: Touch, wait: np.ndarray) -> Orbit:
-    """Make orbits of some that touch a wall in flight: with an impact of speed 0 there."""
-    place = int(touch.impact) + 1
-    more = np.stack(
-        [knots[:, place - 1, 0] + knots[:, place - 1, 2] + wait, np.zeros_like(wait), np.zeros_like(wait)], axis=1
-    )
+def with_touch(
+    pair: ImpactPair, knots, sequence: Sequence, touch: Touch, wait: np.ndarray, *, inside: bool = False
+) -> Orbit:
+    """Make orbits of some that touch a wall, in flight or from inside: with an impact of speed 0 there."""
+    place, knots = int(touch.impact) + 1, np.array(knots)
+    onset, _, stay = knots[:, place - 1].T
+    begin, rest = (onset + wait, stay - wait) if inside else (onset + stay + wait, 0.0 * wait)
+    if inside:
+        knots[:, place - 1, 2] = wait
+    more = np.stack([begin, 0.0 * wait, rest], axis=1)
     ways = np.asarray(sequence.span), np.asarray(sequence.mirrored)
     side = np.insert(sequence.side, place, touch.wall.astype(np.int32), axis=1)
     return proven(pair, *guessed(side, *ways, np.insert(knots, place, more, axis=1)))

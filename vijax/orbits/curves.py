@@ -7,6 +7,7 @@ located afterwards (`curve_events`).
 import dataclasses
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,7 +18,7 @@ from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.arclength_step import BranchPlace, advance
-from vijax.orbits.arclength_walk import Walked
+from vijax.orbits.arclength_walk import Walked, WalkRules
 from vijax.orbits.continuation import MOST_POINTS
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.curve_equations import (
@@ -28,7 +29,7 @@ from vijax.orbits.curve_equations import (
     Touch,
     happenings_on_curves,
 )
-from vijax.orbits.curve_events import CurvePoint, curve_events
+from vijax.orbits.curve_events import CurveEvent, CurvePoint, curve_events
 from vijax.orbits.curve_graze import curve_passage
 from vijax.orbits.curve_plane import Plane, check_plane, logarithmic, place_of, units
 from vijax.orbits.curve_starts import CurveStart, check_points, curve_start, with_touch
@@ -37,7 +38,7 @@ from vijax.orbits.limits import LIMITS, alike, limit_start
 from vijax.orbits.parameter import MOVED
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.pieces import Piece, follow_pieces, joined
-from vijax.runtime import checks, tiles
+from vijax.runtime import checks, context, tiles
 from vijax.runtime.context import door
 
 _AT_ONCE = 4  # starts of one family that are followed at once, though they may turn out to lie on one curve
@@ -51,8 +52,9 @@ class BifurcationCurve(NamedTuple):
     """A curve of one bifurcation in a plane, in the order in which it was followed.
 
     Attributes:
-        kind: "fold", "flip", "pitchfork", "grazing" (the ball touches a wall in flight), "penetration limit" or "energy
-            limit" (an impact is as deep, or harvests as much of what it gives to the membrane, as is admissible).
+        kind: "fold", "flip", "pitchfork", "grazing" (the ball touches a wall in flight), "grazing contact" (it touches
+            one from inside, where a contact parts in two), "penetration limit" or "energy limit" (an impact is as deep,
+            or harvests as much of what it gives to the membrane, as is admissible).
         along: Both parameters of the plane.
         values: Of both, a row an orbit.
         orbit: The orbits, with multipliers; those of a graze without the impact that begins there.
@@ -92,8 +94,8 @@ def follow_curves(
     """Follow bifurcations, as branches met them, in a plane of two parameters.
 
     Args:
-        points: What branches met. From folds, flips, pitchforks and grazings of flights and impacts curves are
-            followed, and from where limits are met (`limit_points`); of others a warning says so.
+        points: What branches met. From folds, flips, pitchforks and grazings of flights, contacts and impacts curves
+            are followed, and from where limits are met (`limit_points`); of others a warning says so.
         along: The parameter of these branches.
         within: The two parameters of the plane with their bounds, as in {"d": (0.05, 0.3), "kappa": (3, 400)}. Bounds
             more than a decade apart are gone through in logarithms.
@@ -157,10 +159,17 @@ def curves_from(
         for lane in (lane for family in chosen.values() for lane in family):
             batches.setdefault((lane.path.condition, lane.first.y.size), []).append(lane)
         new: list[BifurcationCurve] = []
-        for batch in batches.values():
-            some = _followed(batch, plane, max_points, settings, new)
-            new += some
-            yield some
+        # The widest first, for it may take as long as all others.
+        listed = sorted(batches.values(), key=lambda batch: -batch[0].first.y.size)
+        follow = partial(_followed, max_points=max_points, settings=settings)
+        with context.pool(tiles.workers()) as pool:
+            for batch, paths in zip(listed, pool.map(follow, listed), strict=True):
+                some: list[BifurcationCurve] = []
+                for lane, curve in zip(batch, paths, strict=True):
+                    # Of several starts on one curve, or on one that is known, one is kept.
+                    some += [curve] if unmet([lane], [*new, *some], plane) else []
+                new += some
+                yield some
         taken = {id(lane) for batch in batches.values() for lane in batch}
         left = unmet([lane for lane in left if id(lane) not in taken], new, plane)
 
@@ -313,7 +322,7 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
     )
     paths = jax.tree.map(np.asarray, paths)
     knots = np.where(paths.sequence.real[..., None], orbit.knots, 0.0).reshape(size, -1)
-    waits = np.array([[start.wait] for start in starts])[:, : int(condition == "touch")]
+    waits = np.array([[start.wait] for start in starts])[:, : int(condition in ("touch", "split"))]
     return paths, np.concatenate([knots, waits, units(place, plane)], axis=1)
 
 
@@ -323,35 +332,34 @@ def _broadcast(device: Harvester, size: int) -> Harvester:
     return jax.tree.map(lambda x: np.full(size, float(x)), whole)
 
 
-def _followed(
-    batch: list[_Lane], plane: Plane, max_points: int, settings: ContinuationSettings, known: list[BifurcationCurve]
-) -> list[BifurcationCurve]:
-    """Follow some starts both ways, all at once; of several on one curve, or on one that is known, one is kept."""
+def _followed(batch: list[_Lane], max_points: int, settings: ContinuationSettings) -> list[BifurcationCurve]:
+    """Follow some starts both ways, all at once."""
     twice = [*batch, *batch]
     paths = jax.tree.map(lambda *leaves: np.stack(leaves), *(lane.path for lane in twice))
     first = jax.tree.map(lambda *leaves: np.stack(leaves), *(lane.first for lane in twice))
     sign = np.repeat([-1.0, 1.0], len(batch))[:, None]
     first = first._replace(tangent=sign * first.tangent)
 
-    def making(lane: int, path: CurvePath, walked: Walked, begun: bool) -> Piece:
-        return _piece(path, walked, twice[lane].start.kind, settings, begun)
+    def making(lanes: list[int], paths: CurvePath, walked: list[Walked], begun: list[bool]) -> list[Piece]:
+        events = curve_events(paths, walked, [twice[lane].start.kind for lane in lanes], settings)
+        each = [jax.tree.map(lambda leaf, i=row: leaf[i], paths) for row in range(len(lanes))]
+        return [_piece(*one) for one in zip(each, walked, events, begun, strict=True)]
 
-    ways = follow_pieces(paths, first, making, max_points, settings, happenings_on_curves, FIRST_CURVE_END)
+    rules = WalkRules(settings, happenings_on_curves, FIRST_CURVE_END)
+    ways = follow_pieces(paths, first, making, max_points, rules)
     found: list[BifurcationCurve] = []
     for number, lane in enumerate(batch):
-        if unmet([lane], [*known, *found], plane):
-            both = joined(ways[number], ways[number + len(batch)])
-            closed = both.ends[1] == "closed"
-            ends = ("closed", "closed") if closed else both.ends
-            found.append(BifurcationCurve(lane.start.kind, lane.path.along, *both._replace(ends=ends)))
+        both = joined(ways[number], ways[number + len(batch)])
+        ends = ("closed", "closed") if both.ends[1] == "closed" else both.ends
+        found.append(BifurcationCurve(lane.start.kind, lane.path.along, *both._replace(ends=ends)))
     return found
 
 
-def _piece(path: CurvePath, walked: Walked, kind: str, settings: ContinuationSettings, begun: bool) -> Piece:
+def _piece(path: CurvePath, walked: Walked, events: list[CurveEvent], begun: bool) -> Piece:
     """Put what happened between the points of a path among them, and end it where it ends; see `pieces.Making`."""
     rows, points, end, begin = [], [], walked.end, 0
     last, beyond = len(walked.y), None
-    for event in curve_events(path, walked, kind, settings):
+    for event in events:
         rows += [walked.y[begin : event.place + 1], event.y[None]]
         begin = event.place + 1
         test, orbit = event.test, orbits_of(path, event.y[None])
@@ -377,11 +385,11 @@ def orbits_of(path: CurvePath, ys: np.ndarray) -> Orbit:
     real as it is, or with an impact of speed 0 there.
     """
     found = orbits_at(path, ys)
-    if path.condition != "touch" or (np.asarray(found.status) == Status.OK).all():
+    if path.condition not in ("touch", "split") or (np.asarray(found.status) == Status.OK).all():
         return found
     wide = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(ys), *leaf.shape)), path)
     pair, knots = wide.pair_and_knots(ys)
-    touching = with_touch(pair, knots, wide.sequence, path.touch, ys[:, -3])
+    touching = with_touch(pair, knots, wide.sequence, path.touch, ys[:, -3], inside=path.condition == "split")
     real = np.asarray(touching.status) == Status.OK
     status = np.where(real, Status.OK, found.status).astype(np.int32)
     return eqx.tree_at(lambda orbit: orbit.status, found, tiles.arrays(status))

@@ -3,16 +3,18 @@
 A sign change of a test function is located on the arc, and says what it was: a bifurcation, or why the branch ends.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from vijax.orbits import periodic, symmetry
-from vijax.orbits.arclength_step import FIRST_END, FOLD, PLUS, Arc, Path, Tests, advance
+from vijax.orbits.arclength_step import FIRST_END, FOLD, PLUS, Arc, BranchPlace, Path, Tests, advance
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.periodic import Orbit
 
+_ROUNDING = 4 * np.finfo(float).eps
 _GRAZING = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
 
@@ -103,32 +105,42 @@ def locate(
     test: np.ndarray,
     low_f: np.ndarray,
     settings: ContinuationSettings,
+    read: Callable[[np.ndarray, BranchPlace], np.ndarray] | None = None,
 ):
-    """Find arclengths from points of paths at which test functions vanish, the points, and which are no poles."""
-    rows = np.arange(test.size)
+    """Find arclengths from points of paths at which test functions vanish, the points, and which are no poles.
 
-    def look(s):
-        at = advance(paths, y, tangent, s)
-        return at.tests[rows, test], at.y
+    Args:
+        paths, y, tangent, length: Where the steps begin, and how long they are, a row each.
+        test: Column of the test function.
+        low_f: Its value there.
+        settings: Of events.
+        read: Takes its value from places of some of the rows, where that is no column.
+    """
 
-    low, high = np.zeros_like(length), length
-    high_f, best_y = look(high)
-    scale, best, best_f = np.abs(low_f) + np.abs(high_f), high, high_f
+    def look(rows, s):
+        at = advance(*jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (paths, y, tangent)), s)
+        return (at.tests[np.arange(rows.size), test[rows]] if read is None else read(rows, at)), at.y
+
+    low, high = np.zeros_like(length), length.copy()
+    high_f, best_y = look(np.arange(test.size), high)
+    low_f = low_f.copy()
+    scale, best, best_f = np.abs(low_f) + np.abs(high_f), high.copy(), high_f.copy()
     for iteration in range(settings.max_narrowings):
-        chord = low - low_f * (high - low) / np.where(high_f == low_f, 1.0, high_f - low_f)
-        inside = (chord > low) & (chord < high) & (iteration % 3 != 2)
-        s = np.where(inside, chord, 0.5 * (low + high))
-        f, there = look(s)
-        closer = np.abs(f) < np.abs(best_f)
-        best, best_f, best_y = (
-            np.where(closer, s, best),
-            np.where(closer, f, best_f),
-            np.where(closer[:, None], there, best_y),
-        )
-        left = np.sign(f) == np.sign(low_f)
+        # Where rounding leaves nothing between both ends there is nothing more to be found.
+        rows = np.flatnonzero((high - low > _ROUNDING * high) & (best_f != 0))
+        if not rows.size:
+            break
+        begin, end, begin_f, end_f = low[rows], high[rows], low_f[rows], high_f[rows]
+        chord = begin - begin_f * (end - begin) / np.where(end_f == begin_f, 1.0, end_f - begin_f)
+        inside = (chord > begin) & (chord < end) & (iteration % 3 != 2)
+        s = np.where(inside, chord, 0.5 * (begin + end))
+        f, there = look(rows, s)
+        closer = np.abs(f) < np.abs(best_f[rows])
+        best[rows[closer]], best_f[rows[closer]], best_y[rows[closer]] = s[closer], f[closer], there[closer]
+        left = np.sign(f) == np.sign(begin_f)
         # Illinois: the value at the end that stays counts half.
-        low, high = np.where(left, s, low), np.where(left, high, s)
-        low_f, high_f = np.where(left, f, 0.5 * low_f), np.where(left, 0.5 * high_f, f)
+        low[rows], high[rows] = np.where(left, s, begin), np.where(left, end, s)
+        low_f[rows], high_f[rows] = np.where(left, f, 0.5 * begin_f), np.where(left, 0.5 * end_f, f)
     return best, best_y, np.abs(best_f) <= settings.zero_share * scale
 
 

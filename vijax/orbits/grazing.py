@@ -83,7 +83,13 @@ def _contacts(pair: ImpactPair, departure: shooting.Departure, knots: Knots, rea
     return deepest, jnp.where(turns.lost, jnp.nan, shallow), turns.trough
 
 
-def between(pair: ImpactPair, sequence: Sequence, knots: Knots, touch: Float[Array, "impact"] | None = None) -> Between:
+def between(
+    pair: ImpactPair,
+    sequence: Sequence,
+    knots: Knots,
+    touch: Float[Array, "impact"] | None = None,
+    split: Float[Array, "impact"] | None = None,
+) -> Between:
     """Find the motion of an orbit between its onsets; clearances are the least of all impacts, NaN if not known.
 
     Every turning point is visited, as the engine does it: of the hundreds in a long contact samples would miss the one
@@ -91,6 +97,8 @@ def between(pair: ImpactPair, sequence: Sequence, knots: Knots, touch: Float[Arr
 
     Args:
         touch: How long after the end of each contact the ball is known to touch a wall; NaN where it is not.
+        split: How long after its onset each contact is known to come back to its wall; NaN where none is. None is
+            deepest then.
     """
     real = sequence.real
     # Padded impacts are given harmless knots.
@@ -108,6 +116,8 @@ def between(pair: ImpactPair, sequence: Sequence, knots: Knots, touch: Float[Arr
         contact = leaves = jnp.full_like(pair.d, _NOTHING)
     else:
         deepest, shallow, _ = _contacts(pair, departure, knots, real)
+        if split is not None:
+            shallow = _halves(pair, departure, knots, real, split)
         contact, leaves = least(shallow), least(departure.speed / knots[:, 1])
     return Between(Clearance(least(knots[:, 1]), least(flight), contact, leaves), deepest)
 
@@ -116,6 +126,20 @@ def _flights(pair: ImpactPair, departure: shooting.Departure, real, touch):
     """Find the least room in every flight, and how long after the contact it is."""
     each = jax.vmap(_flight_room, in_axes=(None, 0, 0, 0, 0, 0, 0))
     return each(pair, departure.side, departure.speed, departure.t, departure.next_t - departure.t, real, touch)
+
+
+def _halves(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real, split):
+    """Find the least penetration at a minimum inside each contact, where one is known to come back to the wall.
+
+    Before and after it apart: as a minimum of its own it would hide others, or come out below zero by rounding.
+    """
+    parted = real & jnp.isfinite(split)
+    split = jnp.where(parted, split, 0.0)
+    onset, speed, stay = knots.T
+    before = jnp.stack([onset, speed, jnp.where(parted, split - _SAME_TURN, stay)], axis=1)
+    after = jnp.stack([onset + split, 0.0 * speed, stay - split], axis=1)
+    shallow = [_contacts(pair, departure, half, there)[1] for half, there in ((before, real), (after, parted))]
+    return jnp.minimum(*shallow)
 
 
 class NearTurns(NamedTuple):
@@ -152,6 +176,16 @@ def closest_turn(
     pair: ImpactPair, sequence: Sequence, knots: Knots
 ) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Find where the ball turns closest to a wall in flight: after which impact, how long after it, and which wall."""
-    turns = flight_turns(pair, sequence, knots)
+    return _nearest(flight_turns(pair, sequence, knots))
+
+
+def shallowest_turn(
+    pair: ImpactPair, sequence: Sequence, knots: Knots
+) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Find where a contact is shallowest at a minimum inside: of which impact, how long after its onset, which wall."""
+    return _nearest(contact_turns(pair, sequence, knots))
+
+
+def _nearest(turns: NearTurns) -> tuple[Int[Array, ""], Float[Array, ""], Float[Array, ""]]:
     index = turns.room.argmin().astype(jnp.int32)
     return index, turns.when[index], turns.wall[index]

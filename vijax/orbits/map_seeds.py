@@ -12,7 +12,7 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
 from vijax.orbits.arclength_step import FIRST_END, Arc, Tests, advance
-from vijax.orbits.arclength_walk import Walked, walk
+from vijax.orbits.arclength_walk import Walked, WalkRules, walk
 from vijax.orbits.continuation import arcs_from, heading
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start
@@ -25,9 +25,15 @@ from vijax.runtime import tiles
 
 _SETTLE = 400  # forcing periods that a cell's ball is flown at most before Newton looks for its orbit, as in a sweep
 _TILE = 64  # cells that are flown together
-_MOST_PERIOD, _MOST_IMPACTS = 4, 8  # of the orbits that seed curves; others are rare, and each width is a program
+_MOST_PERIOD, _MOST_IMPACTS = 8, 24  # of the orbits that seed curves; others are rare, and each width is a program
 _NEAR_LIMIT = 0.3  # parts of a limit within which an orbit of a cell beside it is looked at
-_KINDS = {"speed": "grazing impact", "flight": "grazing flight", "fold": "fold", "minus": "flip"}
+_KINDS = {
+    "speed": "grazing impact",
+    "flight": "grazing flight",
+    "contact": "grazing contact",
+    "fold": "fold",
+    "minus": "flip",
+}
 
 
 def seeds(
@@ -163,7 +169,7 @@ def _met(
     twice = np.tile(np.arange(size), 2)
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), heading(first, -1.0), heading(first, 1.0))
     paths = jax.tree.map(lambda leaf: leaf[twice], arcs)
-    walked = walk(paths, both, max_points, settings, happenings, FIRST_END)
+    walked = walk(paths, both, max_points, WalkRules(settings, happenings, FIRST_END))
     still = plane.axes[1 - way][cells[twice, 1 - way]]
     return _starts(paths, walked, still, way, settings)
 

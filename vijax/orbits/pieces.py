@@ -12,7 +12,7 @@ import numpy as np
 from vijax.model.records import Status
 from vijax.orbits import periodic
 from vijax.orbits.arclength_step import BranchPlace, Path
-from vijax.orbits.arclength_walk import Walked, walk
+from vijax.orbits.arclength_walk import Walked, WalkRules, walk
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.orbit_properties import marks
 from vijax.orbits.periodic import Orbit
@@ -46,41 +46,35 @@ class Followed(NamedTuple):
     ends: tuple[str, str]
 
 
-Making = Callable[[int, Any, Walked, bool], Piece]
-"""Makes a piece of what was walked: which start, its path, the record, and whether the path begins with it.
+Making = Callable[[list[int], Any, list[Walked], list[bool]], list[Piece]]
+"""Makes pieces of what was walked: which starts, their paths, the records, and whether each path begins with its own.
 
 Of one that does not, the first point is the graze at which the piece before it ended.
 """
 
 
-def follow_pieces(
-    paths: Path,
-    first: BranchPlace,
-    making: Making,
-    points: int,
-    settings: ContinuationSettings,
-    happenings: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    first_end: int,
-) -> list[Followed]:
+def follow_pieces(paths: Path, first: BranchPlace, making: Making, points: int, rules: WalkRules) -> list[Followed]:
     """Follow one way from every start, through grazes at soft walls.
 
     Args:
         paths, first: What is followed, a lane a row, and where from.
         making: See `Making`.
         points: Most points of a path.
-        settings, happenings, first_end: See `walk`.
+        rules: See `walk`.
     """
+    settings = rules.settings
     ways: list[list[Piece]] = [[] for _ in first.y]
     going = [(lane, *jax.tree.map(lambda leaf, i=lane: leaf[i], (paths, first))) for lane in range(len(ways))]
     while going:
         # Orbits of as many impacts are followed together.
         for width in sorted({place.y.size for _, _, place in going}):
-            lanes, *rows = zip(*(one for one in going if one[2].y.size == width), strict=True)
+            chosen, *rows = zip(*(one for one in going if one[2].y.size == width), strict=True)
+            lanes = list(chosen)
             some, places = (jax.tree.map(lambda *leaves: np.stack(leaves), *row) for row in rows)
             left = np.array([points - _size(ways[lane]) for lane in lanes])
-            walked = walk(some, places, left, settings, happenings, first_end)
-            for lane, path, one in zip(lanes, rows[0], walked, strict=True):
-                ways[lane].append(making(lane, path, one, not ways[lane]))
+            walked = walk(some, places, left, rules)
+            for lane, piece in zip(lanes, making(lanes, some, walked, [not ways[i] for i in lanes]), strict=True):
+                ways[lane].append(piece)
         on = [(lane, ways[lane][-1].beyond) for lane, _, _ in going if _goes_on(ways[lane], points, settings)]
         going = [(lane, to.path, to.place) for lane, to in on if to is not None]
     return [_whole(way, settings) for way in ways]

@@ -16,8 +16,9 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.runtime import linear_solve
+from vijax.runtime import ring_solve
 from vijax.runtime.arrays import AnyArray
+from vijax.runtime.ring_solve import Ring
 
 Knots = Float[Array, "impact 3"]
 """Onset time, speed into the wall (> 0) and contact time of each impact."""
@@ -50,8 +51,13 @@ class Sequence(eqx.Module):
 class LinearisedEquations(NamedTuple):
     """The equations at a guess: what is missing, and how it changes with every knot (and a parameter, last)."""
 
-    gap: Float[Array, "3*impact"]
-    slope: Float[Array, "3*impact unknown"]
+    gap: Float[Array, "equation"]
+    ring: Ring
+
+    @property
+    def slope(self) -> Float[Array, "equation unknown"]:
+        """Give the derivatives as one matrix."""
+        return self.ring.dense
 
 
 class _ContactEnd(NamedTuple):
@@ -150,37 +156,30 @@ def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
 
-def linearise(
-    pair: ImpactPair, sequence: Sequence, knots: Knots, moved: ImpactPair | None = None
-) -> LinearisedEquations:
+def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: ImpactPair) -> LinearisedEquations:
     """Compute the equations and their derivatives in the knots, block by block: each involves two neighbours only.
 
     Args:
-        moved: Change of the pair along a parameter, whose derivative becomes the last column.
+        moved: Changes of the pair along parameters, whose derivatives become the last columns.
     """
     side, wall, joined = _joined(sequence, knots)
 
     def each(pair):
         return jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
 
-    if moved is None:
-        pieces, blocks = each(pair)
-    else:
-        pieces, change, blocks = jax.jvp(each, (pair,), (moved,), has_aux=True)
-    real, width = sequence.real, knots.shape[0]
-    here = jnp.eye(width, dtype=knots.dtype)
-    there = jax.nn.one_hot(_following(sequence)[0], width, dtype=knots.dtype)
-    # Entry (impact, equation, impact, knot).
-    full = here[:, None, :, None] * blocks[:, :, None, :3]
-    full = full.at[..., :2].add(there[:, None, :, None] * blocks[:, :, None, 3:5])
+    pieces, blocks = each(pair)
+    changes = [jax.jvp(lambda pair: each(pair)[0], (pair,), (change,))[1] for change in moved]
+    real, dtype = sequence.real[:, None, None], knots.dtype
     # Where there is no impact the identity keeps the matrix regular, and the step there zero.
-    idle = here[:, None, :, None] * jnp.eye(3, dtype=knots.dtype)[None, :, None, :]
-    full = jnp.where(real[:, None, None, None], full, idle)
-    slope, missing = full.reshape(3 * width, 3 * width), jnp.where(real[:, None], pieces, 0.0).reshape(-1)
-    if moved is not None:
-        change = jnp.where(real[:, None], change, 0.0)
-        slope = jnp.concatenate([slope, change.reshape(-1, 1)], axis=1)
-    return LinearisedEquations(missing, slope)
+    ring = Ring(
+        here=jnp.where(real, blocks[..., :3], jnp.eye(3, dtype=dtype)),
+        there=jnp.where(real, jnp.pad(blocks[..., 3:], ((0, 0), (0, 0), (0, 1))), 0.0),
+        closes=_following(sequence)[2],
+        beside=jnp.where(real, jnp.stack(changes, axis=-1), 0.0) if changes else jnp.zeros((*pieces.shape, 0), dtype),
+        below=jnp.zeros((0, *pieces.shape), dtype),
+        corner=jnp.zeros((0, len(changes)), dtype),
+    )
+    return LinearisedEquations(jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1), ring)
 
 
 class Departure(NamedTuple):
@@ -223,6 +222,12 @@ class _Descent(eqx.Module):
     iteration: Int[Array, ""]
 
 
+def _step(linear: LinearisedEquations) -> Knots:
+    """Compute Newton's step."""
+    step, _ = ring_solve.solve(linear.ring, linear.gap.reshape(-1, 3, 1), jnp.zeros((0, 1), linear.gap.dtype))
+    return step[..., 0]
+
+
 # optimistix in its place (`python benchmarks/newton.py`): Newton without damping takes 1.1 to 1.2 times as long near
 # orbits and finds a third fewer from random guesses; the dogleg finds about as many, in 1.3 to 3.4 times the time.
 def newton(
@@ -239,8 +244,7 @@ def newton(
 
     def look(knots):
         linear = jax.vmap(linearise)(pair, sequence, knots)
-        step = jax.vmap(linear_solve.solve)(linear.slope, linear.gap).reshape(knots.shape)
-        return step, jnp.abs(linear.gap).max(axis=1)
+        return jax.vmap(_step)(linear), jnp.abs(linear.gap).max(axis=1)
 
     def size(step):
         return jnp.abs(step).max(axis=(1, 2))

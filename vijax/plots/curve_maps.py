@@ -25,6 +25,7 @@ _KINDS: dict[str, dict[str, Any]] = {
     "flip": {"color": "tab:blue", "dashes": (5, 1.2)},
     "pitchfork": {"color": "black"},
     "grazing": {"color": "tab:green", "dashes": (1.6, 1.0)},
+    "grazing contact": {"color": "tab:olive", "dashes": (1.6, 1.0)},
     "penetration limit": {"color": "tab:purple", "dashes": (6, 1.2, 1.2, 1.2)},
     "energy limit": {"color": "tab:orange", "dashes": (6, 1.2, 1.2, 1.2)},
 }
