@@ -107,10 +107,12 @@ class Tab:
         return left + width * (pick[0] + 0.5) / columns, top + height * (1 - (pick[1] + 0.5) / rows)
 
     def click(self, pick: tuple[int, int]) -> "Tab":
+        """Click on a cell."""
         self.page.mouse.click(*self.place(pick))
         return self
 
     def heading(self) -> str:
+        """Read what the page says of the picked cell."""
         return self.page.inner_text("#heading")
 
     def view(self) -> dict[str, str]:
@@ -118,6 +120,7 @@ class Tab:
         return dict(parse_qsl(urlsplit(self.page.url).query))
 
     def compute(self, name: str) -> None:
+        """Ask for a panel."""
         self.page.click(f'.compute[data-name="{name}"]')
 
     def state(self, name: str, *states: str) -> str:

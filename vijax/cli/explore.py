@@ -22,9 +22,9 @@ def explored(store: str | None, address: str, port: int, allow_origin: tuple[str
         source = Source(store)
         if store is not None:
             source.plane()
-        server, page = serve(source, address, port, allow_origin)
+        server, crew, page = serve(source, address, port, allow_origin)
     try:
-        run(server, page, not no_browser)
+        run(server, crew, page, not no_browser)
     except KeyboardInterrupt:
         process.stop("the server is closed")
 

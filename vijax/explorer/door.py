@@ -51,8 +51,7 @@ def explore(
     if _in_notebook():
         import_module("vijax.explorer.notebook").show(given, origins)
         return
-    server, page = import_module("vijax.explorer.server").serve(given, address, port, origins)
-    run(server, page, browser)
+    run(*import_module("vijax.explorer.server").serve(given, address, port, origins), browser)
 
 
 def check_bokeh() -> None:
@@ -61,7 +60,7 @@ def check_bokeh() -> None:
         raise ModuleNotFoundError("bokeh must be installed for a page; got none; pip install 'vijax[explore]'")
 
 
-def run(server: Any, page: str, browser: bool) -> None:
+def run(server: Any, crew: Any, page: str, browser: bool) -> None:
     """Say where the page is, open it, and serve until Ctrl-C."""
     print(f"{page}\nstop it by Ctrl-C", flush=True)
     if browser:
@@ -70,6 +69,7 @@ def run(server: Any, page: str, browser: bool) -> None:
         server.io_loop.start()
     finally:
         server.stop()
+        crew.close()
 
 
 def _in_notebook() -> bool:

@@ -168,8 +168,8 @@ def _free_port(address: str) -> int:
         return int(one.getsockname()[1])
 
 
-def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> tuple[Server, str]:
-    """Make a server that listens, and give the address of its page.
+def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> tuple[Server, Crew, str]:
+    """Make a server that listens; give it, its threads, and the address of its page.
 
     Args:
         source: Where the map comes from.
@@ -204,4 +204,4 @@ def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> 
     crew.submit("warming", lambda: warm(source, crew, warmth))
     server.start()
     query = f"?{urlencode({'token': token})}" if token else ""
-    return server, f"http://{host}/{query}"
+    return server, crew, f"http://{host}/{query}"
