@@ -79,7 +79,7 @@ def test_every_cell_is_that_of_the_map(power, physical):
 
 def test_a_further_axis_and_what_is_fixed_can_be_moved(physical):
     plane = explored(physical)
-    assert set(plane.fixed) == {"s", "r", "gamma"} - {"gamma"} | {"beta"}
+    assert set(plane.fixed) == {"s", "r", "beta"}
     assert set(view.bounds(plane)) == {"s", "r", "beta", "u0", "v0", "A"}
     found = cell(plane, (0, 1), {"A": 2.0, "s": 0.1})
     assert float(found.pair.d) == pytest.approx(0.1 / (2.0 * np.pi**2) * np.pi**2)
@@ -89,16 +89,18 @@ def test_a_further_axis_and_what_is_fixed_can_be_moved(physical):
 
 
 @pytest.mark.parametrize(
-    ("made", "must"),
+    ("changed", "must"),
     [
-        (lambda: vijax.sweep(d=[0.1, 0.2, 0.3], kappa=40.0), "two axes of more than one value; got d"),
-        (lambda: vijax.sweep(d=[0.1, 0.2], kappa=[3.0, 40.0], until="window", periods=5), "until='attractor'"),
-        (lambda: 3, "dataset must be"),
+        (lambda power: power.isel(kappa=[0]), "two axes of more than one value; got d"),
+        (lambda power: power.assign_attrs(until="window"), "until='attractor'"),
+        (lambda power: power.assign_attrs(method="rk4"), "method='exact'"),
+        (lambda power: power.rename(kappa="pressure"), "must be a map that vijax.sweep made"),
+        (lambda power: 3, "dataset must be"),
     ],
 )
-def test_what_cannot_be_looked_into_is_said_at_the_door(made, must):
+def test_what_cannot_be_looked_into_is_said_at_the_door(power, changed, must):
     with pytest.raises(ValueError, match=must):
-        explored(made())
+        explored(changed(power))
 
 
 def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, monkeypatch):

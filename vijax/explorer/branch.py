@@ -10,6 +10,7 @@ from vijax.explorer.plane import Axis, ExploredCell
 from vijax.orbits.branch_dataset import dataset
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.switching import family
+from vijax.plots.branch_diagrams import pieces
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -69,9 +70,10 @@ def branch(cell: ExploredCell, motion: CellMotion, axis: Axis) -> CellBranch:
         one = found.isel(branch=index)
         values, stable, speeds = one[axis.name].values, one["stable"].values, one["v_in"].values
         lines += [
-            np.stack([values, speeds[:, hit], stable])
+            np.stack([values[piece], speeds[piece, hit], stable[piece]])
+            for piece in pieces(one, "v_in")
             for hit in range(speeds.shape[1])
-            if np.isfinite(speeds[:, hit]).any()
+            if np.isfinite(speeds[piece, hit]).any()
         ]
         for kind, value, place in zip(*(one[name].values for name in _MET), strict=True):
             if kind:

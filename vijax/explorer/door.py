@@ -26,7 +26,7 @@ def explore(
 ) -> None:
     """Look into a map: a page with the motion of each cell that is picked, and what surrounds it.
 
-    In a notebook the page is shown below the cell, and the kernel goes on. Elsewhere a server runs until it is stopped
+    In a notebook the page stands in a frame below the cell, and the kernel goes on. Elsewhere a server runs until it is stopped
     by Ctrl-C. Needs the extra `explore`, which brings bokeh.
 
     Args:
@@ -34,8 +34,7 @@ def explore(
         address: That the server binds: this machine alone unless given. Any other needs `allow_origin`, and a token in
             the address of the page.
         port: Of the server; 0 for any that is free.
-        allow_origin: HOST:PORT, one or several, as they stand in the browser of who may ask. In a notebook that of
-            Jupyter, localhost:8888 unless given.
+        allow_origin: HOST:PORT, one or several, as they stand in the browser of who may ask.
         browser: Whether the page is opened in a browser.
 
     Raises:
@@ -49,7 +48,7 @@ def explore(
     given = import_module("vijax.explorer.source").Source(source)
     given.plane()
     if _in_notebook():
-        import_module("vijax.explorer.notebook").show(given, origins)
+        import_module("vijax.explorer.notebook").show(given, address, port, origins)
         return
     run(*import_module("vijax.explorer.server").serve(given, address, port, origins), browser)
 

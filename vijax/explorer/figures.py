@@ -7,7 +7,6 @@ from typing import Any
 from bokeh.models import (
     BasicTicker,
     BasicTickFormatter,
-    ColorBar,
     ColumnDataSource,
     FixedTicker,
     LinearColorMapper,
@@ -16,8 +15,8 @@ from bokeh.models import (
     LogScale,
     Plot,
     Range1d,
-    Span,
 )
+from bokeh.models.annotations import ColorBar, Span
 from bokeh.plotting import figure
 
 from vijax.explorer.plane import Axis, ExploredPlane
@@ -117,8 +116,7 @@ def _bare(name: str, **further: Any) -> Any:
         **further,
     )
     made.outline_line_color = AXIS["line"]
-    made.background_fill_color = None
-    made.border_fill_color = None
+    made.background_fill_color = made.border_fill_color = "white"  # a clear one keeps the ticks of earlier ranges
     made.min_border_right = 14
     for axis in (*made.xaxis, *made.yaxis):
         axis.axis_label_text_font_style = "normal"
@@ -251,7 +249,11 @@ def _phase(of: PageTables) -> Any:
 
 def _course(of: PageTables) -> Any:
     made = _bare(
-        "course", y_axis_label="displacement u", x_range=Range1d(0, 2), y_range=Range1d(), min_border_left=_LEFT
+        "course",
+        y_axis_label="displacement u",
+        x_range=Range1d(start=0, end=2),
+        y_range=Range1d(),
+        min_border_left=_LEFT,
     )
     made.line("t", "x", source=of.course, line_color="black", line_width=1.2)
     for side in ("left", "right"):
@@ -266,7 +268,7 @@ def _energy(of: PageTables) -> Any:
         x_axis_label="t [half forcing periods]",
         y_axis_label="E [\u00b5J]",
         y_axis_type="log",
-        y_range=Range1d(1, 100),
+        y_range=Range1d(start=1, end=100),
         min_border_left=_LEFT,
     )
     made.left[0].ticker = FixedTicker(ticks=_ticks(1e-6, 1e9))

@@ -66,7 +66,7 @@ class Jobs:
         deliver: Called from a thread with what is to be called on the event loop.
     """
 
-    def __init__(self, crew: Crew, deliver: Callable[[Callable[[], None]], None]) -> None:
+    def __init__(self, crew: Crew, deliver: Callable[[Callable[[], None]], Any]) -> None:
         self._crew, self._deliver = crew, deliver
         self._current: dict[str, Job] = {}
 

@@ -5,7 +5,7 @@ any other motion `vijax.trajectory` what the ball does once `SETTLE` forcing per
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -135,26 +135,38 @@ def _of_flight(cell: ExploredCell, end: tuple[float, float], periods: int) -> tu
         return [np.empty(0)] * 3, _no_impacts(), 2.0 * periods
     # A period before and one after, so that the window is full.
     path = trajectory(cell.pair, *end, periods=periods + 2)
-    hits: Any = Impact(**{name: np.asarray(getattr(path.impacts, name)) for name in Impact.__dataclass_fields__})
-    there = hits.side != 0
-    hits = Impact(**{name: getattr(hits, name)[there] for name in Impact.__dataclass_fields__})
+    hits = _some(path.impacts, np.asarray(path.impacts.side) != 0)
     onset = 2 * hits.n + hits.t
     line = curve(cell.pair, onset, hits.side.astype(float), hits.v_in, hits.v_out, hits.duration, samples=_SAMPLES)
     begin = 2.0 if onset.size and onset[0] < 2.0 else 0.0
     inside = (onset >= begin) & (onset < begin + 2.0 * periods)
-    own = Impact(**{name: getattr(hits, name)[inside] for name in Impact.__dataclass_fields__})
-    own = Impact(**{**vars(own), "n": own.n - int(begin / 2)})
+    own = _some(hits, inside)
+    own = replace(own, n=own.n - int(begin / 2))
     return _window(line, begin, 2.0 * periods), own, 2.0 * periods
 
 
+def _some(hits: Impact, which: Any) -> Impact:
+    """Pick some impacts, by NumPy: JAX would compile a program for every number of them."""
+    rows: dict[str, Any] = {name: np.asarray(row)[which] for name, row in vars(hits).items()}
+    return Impact(**rows)
+
+
 def _no_impacts() -> Impact:
-    return Impact(**{name: np.empty(0) for name in Impact.__dataclass_fields__})
+    rows: dict[str, Any] = {name: np.empty(0) for name in Impact.__dataclass_fields__}
+    return Impact(**rows)
 
 
 def _window(line: Any, first: float, span: float) -> list[np.ndarray]:
-    """Cut so much time out of a course, its begin at zero."""
-    inside = (line.t >= first) & (line.t <= first + span)
-    return [np.asarray(row)[inside] for row in (line.t - first, line.u, line.v)]
+    """Cut so much time out of a course, its begin at zero; between two instants of it a straight line will do."""
+    t = line.t - first
+    inside = (t > 0) & (t < span)
+    ends = [(low, high) for low, high in ((0.0, 0), (span, -1)) if t.size and t[0] <= low <= t[-1]]
+    rows = [t, np.asarray(line.u), np.asarray(line.v)]
+    cut = [row[inside] for row in rows]
+    for at, side in ends:
+        values = (at, *(float(np.interp(at, t, row)) for row in rows[1:]))
+        cut = [np.insert(row, row.size if side else 0, value) for row, value in zip(cut, values, strict=True)]
+    return cut
 
 
 def _impacts(cell: ExploredCell, hits: Impact, span: float) -> dict[str, np.ndarray]:

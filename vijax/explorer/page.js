@@ -63,7 +63,10 @@ window.vijax = (() => {
       exact.value = +(+range.value).toPrecision(6);
       ask("value", { name, value: +exact.value, number: ++number });
     });
-    exact.addEventListener("change", () => ask("value", { name, value: exact.value, number: ++number }));
+    exact.addEventListener("change", () => {
+      const value = Number.isFinite(exact.valueAsNumber) ? exact.valueAsNumber : exact.value;
+      ask("value", { name, value, number: ++number });
+    });
     row.append(title, range, exact);
     base[name] = value;
     return row;

@@ -93,7 +93,7 @@ class Page:
 
     def tell(self, section: str, **content: Any) -> None:
         """Tell the page what one section of it is to show."""
-        self.channel.told = {"section": section, **content}
+        self.channel.update(told={"section": section, **content})
 
     def _ready(self, message: dict[str, Any]) -> None:
         self._tell_page()

@@ -218,7 +218,7 @@ class ExploredCell:
     device: Harvester
     u0: float
     v0: float
-    arguments: dict[str, float]
+    arguments: dict[str, Any]
     settings: dict[str, Any]
 
 

@@ -66,7 +66,7 @@ def _arguments(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
 def of_motion(cell: ExploredCell, found: CellMotion) -> Recipe:
     """Say how a motion, its label, P and multipliers are had."""
     pair = cell.pair
-    kappa = None if pair.rigid else float(pair.kappa)
+    kappa = None if pair.kappa is None else float(pair.kappa)
     lines = [
         "import vijax",
         f"found = vijax.sweep({_arguments(cell)})",

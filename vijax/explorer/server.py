@@ -2,7 +2,6 @@
 
 import secrets
 import socket
-from collections.abc import Callable
 from functools import partial
 from importlib import resources
 from typing import Any
@@ -39,7 +38,7 @@ class _Visitors(AuthProvider):
         super().__init__()
 
     @property
-    def get_user(self) -> Callable[[RequestHandler], str | None]:
+    def get_user(self) -> Any:
         """Say who comes; None is nobody."""
 
         def known(handler: RequestHandler) -> str | None:
@@ -60,7 +59,7 @@ class _Visitors(AuthProvider):
         """Have no page where a token could be guessed: `get_login_url` says what is missing."""
 
     @property
-    def get_login_url(self) -> Callable[[RequestHandler], str]:
+    def get_login_url(self) -> Any:
         """Send who has no token to a page that says so."""
         return lambda handler: "/token"
 
@@ -134,7 +133,8 @@ def _tell_of_warmth(page: Page, warmth: Warmth, told: list[str]) -> None:
 
 
 def _arguments(document: Document) -> dict[str, str]:
-    request = document.session_context.request if document.session_context else None
+    context: Any = document.session_context
+    request = context.request if context else None
     given = {} if request is None else request.arguments
     return {name: values[-1].decode(errors="replace") for name, values in given.items() if not name.startswith("bokeh")}
 

@@ -123,7 +123,7 @@ def _of_numbers(dataset: "xr.Dataset", name: str, x: str, y: str, log: bool | No
     norm = _scaled(kind.colours(dataset), log, dataset[name].values)
     values = np.minimum(dataset[name].values.astype(float), np.finfo(float).max)
     shown = has_colour(values, norm) & ~np.isnan(values)
-    colours = mpl.colormaps["viridis"](norm(np.where(shown, values, norm.vmin)))
+    colours = np.asarray(mpl.colormaps["viridis"](norm(np.where(shown, values, norm.vmin))))
     colours[~shown] = BARE_CELL
     run = dataset["status"].values != Status.NOT_RUN
     marks = [mark._replace(mask=mark.mask & run) for mark in kind.marks(dataset)]
