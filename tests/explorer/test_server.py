@@ -73,8 +73,8 @@ def test_an_open_address_needs_an_origin(dataset):
         server.serve(Source(dataset), "0.0.0.0", 0, ())
 
 
-def test_what_a_damaged_store_says_is_text(serving, dataset, tmp_path, monkeypatch):
-    one, page, ask = serving("127.0.0.1")
+def test_what_a_damaged_store_says_is_text(serving, monkeypatch):
+    _, page, ask = serving("127.0.0.1")
 
     def broken(self):
         raise ValueError("<script>alert(1)</script>")

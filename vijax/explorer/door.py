@@ -26,8 +26,8 @@ def explore(
 ) -> None:
     """Look into a map: a page with the motion of each cell that is picked, and what surrounds it.
 
-    In a notebook the page stands in a frame below the cell, and the kernel goes on. Elsewhere a server runs until it is stopped
-    by Ctrl-C. Needs the extra `explore`, which brings bokeh.
+    In a notebook the page stands in a frame below the cell, and the kernel goes on. Elsewhere a server runs until it is
+    stopped by Ctrl-C. Needs the extra `explore`, which brings bokeh.
 
     Args:
         source: What `sweep` returned, over two axes at least, or a store of it; a small plane is made unless given.

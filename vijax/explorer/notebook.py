@@ -1,7 +1,7 @@
 """The page of a map below a cell of a notebook: the page of a server in the kernel, in a frame of its own.
 
-A frame, and not the figures alone as `bokeh.io.show` would put them there: what is written about a cell, the sliders and
-the keys are of the page, and the notebook's own styles do not reach into it.
+A frame, and not the figures alone as `bokeh.io.show` would put them there: what is written about a cell, the sliders
+and the keys are of the page, and the notebook's own styles do not reach into it.
 """
 
 from typing import Any

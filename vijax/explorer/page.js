@@ -71,6 +71,10 @@ window.vijax = (() => {
     base[name] = value;
     return row;
   };
+  // When all of an answer is on the screen: what benchmarks and tests wait for.
+  const answered = (request) => {
+    requestAnimationFrame(() => requestAnimationFrame(() => { document.body.dataset.shown = request; }));
+  };
   const table = (rows) => {
     const made = make("table"), head = make("tr"), body = make("tbody");
     rows[0].forEach((text) => { const one = make("th", text); one.scope = "col"; head.append(one); });
@@ -131,7 +135,7 @@ window.vijax = (() => {
         return line;
       }));
     },
-    cell({ number: answered, heading, rows, note }) {
+    cell({ number: request, heading, rows, note }) {
       id("heading").textContent = heading;
       id("cellnote").textContent = note;
       hide(id("cellnote"), !note);
@@ -140,8 +144,7 @@ window.vijax = (() => {
         line.append(make("dt", name), make("dd", text));
         return line;
       }));
-      // When all of it is on the screen: what benchmarks and tests wait for.
-      requestAnimationFrame(() => requestAnimationFrame(() => { document.body.dataset.shown = answered; }));
+      answered(request);
     },
     panel({ name, state: now, text, rows }) {
       const place = document.querySelector(`[data-panel="${name}"]`);
@@ -150,6 +153,7 @@ window.vijax = (() => {
       if (text) place.append(make("p", text, now));
       if (now === "running") place.append(make("progress"));
       if (rows.length) place.append(table(rows));
+      if (name === "motion" && now === "failed") answered(number);
       if (now === "running" || now === "idle") files(name, false);
       if (now === "done") files(name, true);
       const button = document.querySelector(`.cancel[data-name="${name}"]`);
@@ -181,6 +185,7 @@ window.vijax = (() => {
       id("note").textContent = text;
       id("note").classList.toggle("error", error);
       hide(id("note"), !text);
+      if (error) answered(number);
     },
     warmth({ text }) {
       id("warmth").textContent = text;

@@ -90,6 +90,7 @@ class Page:
             handler(message)
         except (ValueError, TypeError, KeyError) as error:
             self.tell("note", text=str(error), error=True)
+            self._tell_view()
 
     def tell(self, section: str, **content: Any) -> None:
         """Tell the page what one section of it is to show."""
