@@ -191,7 +191,6 @@ window.vijax = (() => {
       id("warmth").textContent = text;
       hide(id("warmth"), !text);
     },
-    open({ name }) { ask("open", { name }); },
     ask({ text }) { if (confirm(text)) ask("make", { sure: true }); },
     file({ name, content }) {
       const link = make("a");

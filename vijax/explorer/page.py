@@ -64,6 +64,7 @@ class Page:
         self.exports: dict[str, Any] = {}
         self._trail: list[tuple[float, float]] = []
         self._made = False
+        self._pending = shown.panels  # to be computed once the first motion is there
         self._stamp = source.stamp()
         self.channel.on_change("asked", lambda attribute, old, new: self.heard(new))
 
@@ -100,8 +101,6 @@ class Page:
         self._tell_page()
         self._draw_map()
         self._run(0)
-        for name in self.view.panels:
-            self.tell("open", name=name)
 
     def _pick(self, message: dict[str, Any]) -> None:
         columns, rows = self.plane.shape
@@ -196,7 +195,9 @@ class Page:
         self._tell_recipe("motion", recipes.of_motion(self.cell, found))
         self.exports["motion"] = (self.cell, found)
         self._scale_diagrams()
-        self._start("line")
+        for name in ("line", *self._pending):
+            self._start(name)
+        self._pending = ()
 
     def _start(self, name: str) -> None:
         """Compute a panel."""

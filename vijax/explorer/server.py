@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
-from bokeh.events import DocumentReady, DoubleTap, Pan, PanEnd, PanStart, Tap
+from bokeh.events import ConnectionLost, DocumentReady, DoubleTap, Pan, PanEnd, PanStart, Tap
 from bokeh.models import CustomJS
 from bokeh.server.auth_provider import AuthProvider
 from bokeh.server.server import Server
@@ -103,6 +103,7 @@ def _open(document: Document, source: Source, crew: Crew, warmth: Warmth) -> Non
     document.title = "vijax explore"
     document.template = _template()
     document.config.notify_connection_status = False  # the page says it itself, and comes back by itself
+    document.config.reconnect_session = False  # a server that is started again knows no session
     arguments = _arguments(document)
     try:
         plane = source.plane()
@@ -150,6 +151,7 @@ def _listen(document: Document, page: Page) -> None:
     begin = CustomJS(args={**marks, "pick": pick, "map": shown}, code="vijax.begin({channel, across, up, pick, map})")
     shown.tags = [page.channel]
     document.js_on_event(DocumentReady, begin)
+    document.js_on_event(ConnectionLost, CustomJS(code="vijax.lost()"))
     page.channel.js_on_change("told", CustomJS(code="vijax.told(cb_obj.told)"))
 
 
