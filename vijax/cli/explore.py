@@ -5,7 +5,7 @@ import click
 from vijax.cli import process
 from vijax.cli.kinds import Whole
 from vijax.cli.page import Page
-from vijax.explorer.door import PORT, check_bokeh, run
+from vijax.explorer.address import MOST_PORT, PORT
 
 
 def explored(store: str | None, address: str, port: int, allow_origin: tuple[str, ...], no_browser: bool) -> None:
@@ -14,11 +14,15 @@ def explored(store: str | None, address: str, port: int, allow_origin: tuple[str
     A click on a cell shows its motion, the line through it, its basins, its branch and the nearest optimum. STORE is
     what `vijax sweep` wrote, or is writing; without it a small plane of d and kappa is made first.
     """
+    from vijax.explorer.door import check_bokeh, run
+
     with process.door():
         check_bokeh()
         from vijax.explorer.server import serve
         from vijax.explorer.source import Source
+        from vijax.runtime import checks
 
+        checks.whole("port", port, 0, MOST_PORT)
         source = Source(store)
         if store is not None:
             source.plane()

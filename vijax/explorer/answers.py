@@ -3,7 +3,7 @@
 from vijax.explorer.basin import CellBasin
 from vijax.explorer.branch import CellBranch
 from vijax.explorer.line import CellLine
-from vijax.explorer.motion import CellMotion
+from vijax.explorer.motion import MOST_IMPACTS, CellMotion
 from vijax.explorer.optimum import NearOptimum
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
 from vijax.explorer.theme import amount, symbol, unit_of
@@ -40,12 +40,18 @@ def cell_rows(plane: ExploredPlane, cell: ExploredCell, found: CellMotion) -> Ro
         ["penetration", f"{amount(1e3 * numbers['max_penetration'], 'mm')} (limit {amount(1e3 * limit, 'mm')})"],
         ["largest impact speed", amount(numbers["max_impact_speed"], "m/s")],
         ["impacts per period", amount(numbers["impacts_per_period"])],
-        ["multipliers", ", ".join(map(multiplier, found.multipliers)) or "no orbit"],
+        ["multipliers", ", ".join(map(multiplier, found.multipliers)) or _without(found)],
         ["status", found.status.name.lower()],
     ]
     if numbers["P_stderr"] > 0:
         rows[1][1] += f" \u00b1 {amount(numbers['P_stderr'], 'J', 2)}"
     return rows + place
+
+
+def _without(found: CellMotion) -> str:
+    """Say why there are no multipliers."""
+    impacts = found.numbers["impacts_left"] + found.numbers["impacts_right"]
+    return f"not solved for, {impacts:.0f} impacts" if impacts > MOST_IMPACTS else "no orbit"
 
 
 def multiplier(value: complex) -> str:

@@ -6,13 +6,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vijax.explorer.address import MOST_PORT, PORT
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
 if TYPE_CHECKING:
     import xarray as xr
-
-PORT = 5006
 
 
 @door
@@ -44,7 +43,7 @@ def explore(
     check_bokeh()
     checks.flag("browser", browser)
     origins = (allow_origin,) if isinstance(allow_origin, str) else tuple(allow_origin)
-    port = checks.whole("port", port, 0, 65535)
+    port = checks.whole("port", port, 0, MOST_PORT)
     given = import_module("vijax.explorer.source").Source(source)
     given.plane()
     if _in_notebook():

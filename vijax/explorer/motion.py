@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 SETTLE = 400
 """Forcing periods that a ball is flown before its motion is looked at."""
 
+MOST_IMPACTS = 24
+"""Of an orbit that is solved for. Newton's equations of 36 take a second, of 82 ten; longer ones are flown."""
+
 _SHOWN = 16  # forcing periods that are shown of a motion that is no orbit
-_LONGEST = 64  # orbits of more periods are shown by so many periods of a flight
+_LONGEST = 64  # forcing periods that are shown of a longer orbit
 _SAMPLES = 32  # instants of each contact and of each flight
 
 
@@ -76,7 +79,8 @@ def motion(cell: ExploredCell) -> CellMotion:
     name = str(_name(found))
     path = trajectory(cell.pair, cell.u0, cell.v0, periods=SETTLE)
     end = float(path.states.u[-1]), float(path.states.v[-1])
-    orbit = _orbit(cell, end, period, name) if np.isfinite(end).all() else None
+    short = 0 < numbers["impacts_left"] + numbers["impacts_right"] <= MOST_IMPACTS
+    orbit = _orbit(cell, end, period, name) if short and period > 0 and np.isfinite(end).all() else None
     if orbit is not None:
         course, hits, span = _of_orbit(cell, orbit)
     else:
@@ -103,8 +107,6 @@ def _name(found: "xr.Dataset") -> Any:
 
 def _orbit(cell: ExploredCell, end: tuple[float, float], period: int, name: str) -> Orbit | None:
     """Find the orbit that the ball has come to, if it is the one that the sweep has named."""
-    if not 0 < period <= _LONGEST or name in ("no impact", "permanent contact"):
-        return None
     orbit = from_state(cell.pair, *end, period=period)
     if int(orbit.status[0]) != Status.OK or str(orbit_properties.labels(orbit)[0]) != name:
         return None

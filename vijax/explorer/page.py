@@ -107,10 +107,11 @@ class Page:
         pick = min(max(int(message["column"]), 0), columns - 1), min(max(int(message["row"]), 0), rows - 1)
         values = dict(self.view.values)
         if self.view.follow and self.motion is not None:
-            half = 0.5 * float(self.plane.dataset["d"].max())
-            end = self.motion.end
-            values |= {"u0": min(max(end[0], -half), half), "v0": end[1]}
-            values = view.checked(self.plane, values)
+            # A rigid gap holds its start, and a soft one nearly so: a start is never far within a membrane.
+            half = 0.5 * float(self.plane.stored("d", pick, values))
+            ends = dict(zip(("u0", "v0"), self.motion.end, strict=True))
+            limits = view.bounds(self.plane) | {"u0": (-half, half)}
+            values |= {name: min(max(end, limits[name][0]), limits[name][1]) for name, end in ends.items()}
         self.view = replace(self.view, pick=pick, values=values, panels=())
         self._run(int(message.get("number", 0)))
 

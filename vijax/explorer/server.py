@@ -1,7 +1,6 @@
 """The server of a page: where it listens, who may come, what is compiled before somebody asks, and its end."""
 
 import secrets
-import socket
 from functools import partial
 from importlib import resources
 from typing import Any
@@ -18,6 +17,7 @@ from jinja2 import Template
 from tornado.web import RequestHandler
 
 from vijax.explorer import view
+from vijax.explorer.address import LOCAL, free_port
 from vijax.explorer.jobs import Crew
 from vijax.explorer.page import Page
 from vijax.explorer.source import Source
@@ -26,8 +26,6 @@ from vijax.explorer.warming import Warmth, warm
 
 REFRESH = 1000
 """Milliseconds after which a store is looked at again."""
-
-LOCAL = ("127.0.0.1", "localhost", "::1")
 
 
 class _Visitors(AuthProvider):
@@ -163,13 +161,6 @@ def _template() -> Template:
     return get_env().from_string(text.replace("/*style*/", style).replace("/*script*/", script))
 
 
-def _free_port(address: str) -> int:
-    """Find a port that nobody listens on."""
-    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as one:
-        one.bind((address, 0))
-        return int(one.getsockname()[1])
-
-
 def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> tuple[Server, Crew, str]:
     """Make a server that listens; give it, its threads, and the address of its page.
 
@@ -188,7 +179,7 @@ def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> 
             f"address must come with allow_origin where others can reach it; got {address} alone; "
             f"add --allow-origin HOST:PORT, as it stands in the browser"
         )
-    port = port or _free_port(address)
+    port = port or free_port(address)
     own = tuple(f"{host}:{port}" for host in ("127.0.0.1", "localhost"))
     crew, warmth = Crew(), Warmth()
     token = "" if address in LOCAL else secrets.token_urlsafe(24)

@@ -9,7 +9,7 @@ from vijax.explorer.basin import basin
 from vijax.explorer.branch import branch
 from vijax.explorer.jobs import Crew
 from vijax.explorer.line import line
-from vijax.explorer.motion import motion
+from vijax.explorer.motion import MOST_IMPACTS, motion
 from vijax.explorer.plane import ExploredPlane, cell
 from vijax.explorer.source import Source
 from vijax.explorer.view import first_view
@@ -53,14 +53,15 @@ def warm(source: Source, crew: Crew, warmth: Warmth) -> None:
 
 
 def samples(plane: ExploredPlane) -> list[tuple[int, int]]:
-    """Find a cell for every size that orbits are padded to, as each has programs of its own, and an aperiodic one."""
+    """Find a cell for every size that orbits are padded to, as each has programs of its own, and one that is flown."""
     names = ("period", "impacts_left", "impacts_right")
     if not set(names) <= set(map(str, plane.dataset.data_vars)):
         return [first_view(plane).pick]
     like = plane.sliced({}).transpose(plane.y.name, plane.x.name, ...)
     period, left, right = (like[name].broadcast_like(like["status"]).values for name in names)
     count = left + right
-    sizes = np.where(period > 0, [[padded(int(one)) if one > 0 else 0 for one in row] for row in count], -period - 1)
+    solved = (period > 0) & (count > 0) & (count <= MOST_IMPACTS)
+    sizes = np.where(solved, [[padded(int(one)) for one in row] for row in count], -1)
     found = []
     for size in np.unique(sizes):
         row, column = np.argwhere(sizes == size)[0][:2]
