@@ -32,11 +32,11 @@ _ON_DEMAND = ((56, 56), (40, 40), (60, 30), (36, 50), (50, 20))  # cells whose b
 _WAIT = 600_000  # milliseconds: with nothing kept all programs are compiled first
 _FRESH = 60  # clicks before memory is looked at: what is compiled at first is no growth
 
-# From the end of the next click to the second frame after its answer, in milliseconds, as `took`.
+# From the begin of the next click to the second frame after its answer, in milliseconds, as `took`.
 ARM = """() => {
     const number = vijax.number + 1;
     window.took = null;
-    addEventListener("pointerup", () => { window.began = performance.now(); }, { capture: true, once: true });
+    addEventListener("pointerdown", () => { window.began = performance.now(); }, { capture: true, once: true });
     const seen = new MutationObserver(() => {
         if (+document.body.dataset.shown < number) return;
         seen.disconnect();

@@ -91,8 +91,7 @@ def test_without_bokeh_the_extra_is_named(monkeypatch):
         vijax.explore(browser=False)
 
 
-def test_a_store_is_read_again_when_a_tile_is_done(tmp_path, monkeypatch):
-    monkeypatch.setenv("VIJAX_TILE", "8")
+def test_a_store_is_read_again_when_a_tile_is_done(tmp_path):
     store = tmp_path / "plane.zarr"
     whole = vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4), out=store)
     source = Source(store)

@@ -35,7 +35,17 @@ window.vijax = (() => {
     up.location = y;
     ask("pick", { column, row, number: ++number });
   };
-  const pointed = (x, y) => { if (axes) choose(cellAt(axes.x, x), cellAt(axes.y, y)); };
+  // By the pointer's own events: Bokeh waits 300 ms after a tap for a second one, and then tells of one double tap.
+  const pointed = (event) => {
+    if (!axes || (event.type === "pointermove" && !(event.buttons & 1)) || event.button > 0) return;
+    const { frame } = Bokeh.index.find_one(figure), box = id("map").getBoundingClientRect(), { bbox } = frame;
+    const sx = event.clientX - box.left, sy = event.clientY - box.top;
+    if (event.type === "pointerdown") {
+      if (sx < bbox.left || sx > bbox.right || sy < bbox.top || sy > bbox.bottom) return;
+      id("map").setPointerCapture(event.pointerId);
+    }
+    choose(cellAt(axes.x, frame.x_scale.invert(sx)), cellAt(axes.y, frame.y_scale.invert(sy)));
+  };
   const keys = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
   const pressed = (event) => {
     const step = keys[event.key];
@@ -231,6 +241,8 @@ window.vijax = (() => {
   const begin = (given) => {
     ({ channel, pick, across, up, map: figure } = given);
     id("map").addEventListener("keydown", pressed);
+    id("map").addEventListener("pointerdown", pointed);
+    id("map").addEventListener("pointermove", pointed);
     id("variable").addEventListener("change", colour);
     id("scale").addEventListener("change", colour);
     id("along").addEventListener("change", () => ask("along", { along: id("along").value }));
@@ -244,5 +256,5 @@ window.vijax = (() => {
     ask("ready");
   };
   const colour = () => ask("colour", { variable: id("variable").value, scale: id("scale").value });
-  return { begin, told, pointed, lost, pick: choose, get number() { return number; } };
+  return { begin, told, lost, get number() { return number; } };
 })();

@@ -9,7 +9,7 @@ from urllib.parse import urlencode
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
-from bokeh.events import ConnectionLost, DocumentReady, DoubleTap, Pan, PanEnd, PanStart, Tap
+from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.models import CustomJS
 from bokeh.server.auth_provider import AuthProvider
 from bokeh.server.server import Server
@@ -139,13 +139,10 @@ def _arguments(document: Document) -> dict[str, str]:
 
 
 def _listen(document: Document, page: Page) -> None:
-    """Hand the page's script what it needs, and what the pointer does on the map."""
+    """Hand the page's script what it needs, and call it when it is told something or the server is lost."""
     shown = page.drawing.figures.map
     marks = {"channel": page.channel, "across": page.drawing.walls.across, "up": page.drawing.walls.up}
     pick = page.drawing.tables.pick
-    # Two clicks within 300 ms are a tap and a double tap: both pick.
-    for event in (Tap, DoubleTap, PanStart, Pan, PanEnd):
-        shown.js_on_event(event, CustomJS(args={**marks, "pick": pick}, code="vijax.pointed(cb_obj.x, cb_obj.y)"))
     begin = CustomJS(args={**marks, "pick": pick, "map": shown}, code="vijax.begin({channel, across, up, pick, map})")
     shown.tags = [page.channel]
     document.js_on_event(DocumentReady, begin)
