@@ -42,8 +42,14 @@ class Drawing:
 
     def pick(self, x: float, y: float) -> None:
         """Move the crosshair."""
+        if self.tables.pick.data == {"x": [x], "y": [y]}:
+            return  # the page's script has moved it already
         self.tables.pick.data = {"x": [x], "y": [y]}
         self.walls.across.location, self.walls.up.location = x, y
+
+    def stand(self, place: float) -> None:
+        """Put the lines that say where the cell is on the axis of line and branch."""
+        self.walls.line.location = self.walls.branch.location = place
 
     def motion(self, found: CellMotion) -> None:
         """Draw the phase plane, the course in time and the energies of impacts."""

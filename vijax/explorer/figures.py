@@ -139,16 +139,14 @@ def _line(where: Any, dimension: Any, colour: str, width: float = 1.0, **style: 
 def figures(plane: ExploredPlane, of: PageTables) -> tuple[PageFigures, Walls, ColorBar]:
     """Make the figures of a page, with the lines in them that move."""
     shown_map, bar = _map(plane, of)
-    across = Span(dimension="height", line_color="white", line_width=1, line_dash="dotted")
-    up = Span(dimension="width", line_color="white", line_width=1, line_dash="dotted")
+    across = Span(dimension="height", line_color="white", line_dash="dotted", level="overlay")
+    up = Span(dimension="width", line_color="white", line_dash="dotted", level="overlay")
     shown_map.add_layout(across)
     shown_map.add_layout(up)
-    shown_map.scatter(
-        "x", "y", source=of.pick, marker="circle", size=13, fill_color=None, line_color="black", line_width=4
-    )
-    shown_map.scatter(
-        "x", "y", source=of.pick, marker="circle", size=13, fill_color=None, line_color="white", line_width=2
-    )
+    # What moves with the pick is on the layer above: the map below is not painted again.
+    for colour, width in (("black", 4), ("white", 2)):
+        ring = {"fill_color": None, "line_color": colour, "line_width": width, "level": "overlay"}
+        shown_map.scatter("x", "y", source=of.pick, size=13, **ring)
     phase, course, energy = _phase(of), _course(of), _energy(of)
     energy.x_range = course.x_range
     branch, basin = _branch(of), _basin(of)

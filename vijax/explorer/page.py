@@ -4,6 +4,7 @@ The page asks by messages (`Channel.asked`), each handled by a method of `Page`,
 (`Channel.told`), which its script writes as text: nothing of a store is ever HTML. Begin with `Page.heard`.
 """
 
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -31,6 +32,9 @@ from vijax.plots.cell_colours import coloured
 
 MOST_CELLS = 10**6
 """Cells of a plane that is made without being asked for twice."""
+
+LINE_DELAY = 200
+"""Milliseconds for which a pick stands still before its line is computed."""
 
 _TRAIL = 400  # impacts of picks that stay drawn in the line
 
@@ -64,6 +68,8 @@ class Page:
         self.exports: dict[str, Any] = {}
         self._trail: list[tuple[float, float]] = []
         self._made = False
+        self._opened: set[str] = set()  # panels of the picked cell that hold or compute something
+        self._wait: Any = None  # for the line
         self._pending = shown.panels  # to be computed once the first motion is there
         self._stamp = source.stamp()
         self.channel.on_change("asked", lambda attribute, old, new: self.heard(new))
@@ -100,6 +106,7 @@ class Page:
     def _ready(self, message: dict[str, Any]) -> None:
         self._tell_page()
         self._draw_map()
+        self._scale_diagrams()
         self._run(0)
 
     def _pick(self, message: dict[str, Any]) -> None:
@@ -137,6 +144,8 @@ class Page:
         self._trail.clear()
         self._scale_diagrams()
         self._clear_panels()
+        if self.cell is not None:
+            self.drawing.stand(self.cell.arguments[self.view.along])
         self._start("line")
         self._tell_view()
 
@@ -195,15 +204,26 @@ class Page:
         self.tell("cell", number=number, heading=answers.heading(found), rows=rows, note=note)
         self._tell_recipe("motion", recipes.of_motion(self.cell, found))
         self.exports["motion"] = (self.cell, found)
-        self._scale_diagrams()
-        for name in ("line", *self._pending):
+        self.drawing.stand(place)
+        for name in self._pending:
             self._start(name)
         self._pending = ()
+        self._line_later()
+
+    def _line_later(self) -> None:
+        """Compute the line once the pick has stood still for a moment: it would keep the motion from the screen."""
+        if self._wait is not None:
+            with suppress(ValueError):  # it has run meanwhile
+                self.document.remove_timeout_callback(self._wait)
+        self.jobs.cancel("line")
+        self._wait = self.document.add_timeout_callback(lambda: self._start("line"), LINE_DELAY)
 
     def _start(self, name: str) -> None:
         """Compute a panel."""
         if self.cell is None or self.motion is None:
             return
+        if name in view.PANELS:
+            self._opened.add(name)
         kind, asked = PANEL_KINDS[name], PanelRequest(self.plane, self.cell, self.motion, self.axis)
         self.tell("panel", name=name, state="running", text="Computing\u2026", rows=[])
 
@@ -218,12 +238,13 @@ class Page:
         )
 
     def _clear_panels(self) -> None:
-        for name in view.PANELS:
+        """Take off the panels of another cell, and nothing else: to empty an empty figure is to draw it once more."""
+        for name in self._opened:
             self.jobs.cancel(name)
-            if name in self.exports or name in self.view.panels:
-                self.exports.pop(name, None)
+            self.exports.pop(name, None)
             PANEL_KINDS[name].clear(self.drawing)
             self.tell("panel", name=name, state="idle", text="", rows=[])
+        self._opened.clear()
 
     def _failed(self, name: str) -> Any:
         def failed(said: str) -> None:
@@ -290,12 +311,9 @@ class Page:
 
     def _scale_diagrams(self) -> None:
         """Put the axes of line and branch on the axis that they go along."""
-        assert self.cell is not None
-        place = self.cell.arguments[self.view.along]
         for one in (self.drawing.figures.line, self.drawing.figures.branch):
             one.x_range.update(**ranged(self.axis))
             scale(one, self.axis)
-        self.drawing.walls.line.location = self.drawing.walls.branch.location = place
 
     # --- what is told ------------------------------------------------------------------------------------------------
 
