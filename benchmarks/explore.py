@@ -185,7 +185,7 @@ def picture(path: str, width: int, height: int) -> None:
     with served() as (address, _), opened(f"{address}?variable=P&cell=40%2C46&along=kappa", width, height) as page:
         for name in ("basin", "branch"):
             seconds(page, name)
-        page.evaluate("document.activeElement.blur()")
+        page.evaluate("document.activeElement.blur(); scrollTo(0, 0)")
         page.wait_for_timeout(500)
         page.screenshot(path=path)
 

@@ -184,7 +184,9 @@ def test_help_has_every_option_in_one_section_and_ends_with_the_examples(capsys,
     for (title, options), section in zip(page(name).sections.items(), sections[1:], strict=True):
         assert section.startswith(f"{title}:\n")
         shown = re.findall(r"^  (--[\w-]+)", section.split("\n\n")[0], re.MULTILINE)
-        assert [option for option in shown if option != "--help"] == [option.opts[0] for option in options]
+        assert [option for option in shown if option != "--help"] == [
+            option.opts[0] for option in options if isinstance(option, click.Option)
+        ]
     assert said.count("  --help  ") == 1
     assert examples.splitlines()[0] == "Examples:"
     assert [line.split(name, 1)[1].strip() for line in examples.splitlines()[1:]] == list(page(name).examples)

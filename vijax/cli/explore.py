@@ -39,8 +39,8 @@ explore = Page(
     "explore",
     explored,
     {
-        "Map": [click.Argument(["store"], required=False, metavar="[STORE]")],
         "Server": [
+            click.Argument(["store"], required=False, metavar="[STORE]"),
             click.Option(["--port"], type=Whole(0), default=PORT, show_default=True, help="0 for any that is free"),
             click.Option(["--address"], default="127.0.0.1", show_default=True, help="that the server binds"),
             click.Option(

@@ -1,7 +1,7 @@
 """One page: what is asked of it, what it answers, and what it computes in between.
 
-The page asks by messages (`Channel.asked`), each handled by a method of `Page`, and is told by messages
-(`Channel.told`), which its script writes as text: nothing of a store is ever HTML. Begin with `Page.heard`.
+The page asks by messages (`Channel.asked`), each handled by a method of `ExplorerPage`, and is told by messages
+(`Channel.told`), which its script writes as text: nothing of a store is ever HTML. Begin with `ExplorerPage.heard`.
 """
 
 from contextlib import suppress
@@ -46,7 +46,7 @@ class Channel(DataModel):
     told = Dict(String, AnyValue)
 
 
-class Page:
+class ExplorerPage:
     """A page that somebody looks at.
 
     Args:

@@ -19,7 +19,7 @@ from tornado.web import RequestHandler
 from vijax.explorer import view
 from vijax.explorer.address import LOCAL, free_port
 from vijax.explorer.jobs import Crew
-from vijax.explorer.page import Page
+from vijax.explorer.page import ExplorerPage
 from vijax.explorer.source import Source
 from vijax.explorer.theme import plain
 from vijax.explorer.warming import Warmth, warm
@@ -110,7 +110,7 @@ def _open(document: Document, source: Source, crew: Crew, warmth: Warmth) -> Non
             shown = view.from_query(plane, arguments)
         except ValueError as error:
             note = f"The address is not of this map: {error}"
-        page = Page(document, source, plane, shown, crew)
+        page = ExplorerPage(document, source, plane, shown, crew)
     except (ValueError, OSError) as error:
         document.template_variables["problem"] = plain(str(error))
         return
@@ -124,7 +124,7 @@ def _open(document: Document, source: Source, crew: Crew, warmth: Warmth) -> Non
     document.on_session_destroyed(lambda context: page.jobs.close())
 
 
-def _tell_of_warmth(page: Page, warmth: Warmth, told: list[str]) -> None:
+def _tell_of_warmth(page: ExplorerPage, warmth: Warmth, told: list[str]) -> None:
     """Say what is being compiled, when that changes."""
     if warmth.said != told[0]:
         told[0] = warmth.said
@@ -138,7 +138,7 @@ def _arguments(document: Document) -> dict[str, str]:
     return {name: values[-1].decode(errors="replace") for name, values in given.items() if not name.startswith("bokeh")}
 
 
-def _listen(document: Document, page: Page) -> None:
+def _listen(document: Document, page: ExplorerPage) -> None:
     """Hand the page's script what it needs, and call it when it is told something or the server is lost."""
     shown = page.drawing.figures.map
     marks = {"channel": page.channel, "across": page.drawing.walls.across, "up": page.drawing.walls.up}
