@@ -49,7 +49,8 @@ def explore(
     if _in_notebook():
         import_module("vijax.explorer.notebook").show(given, address, port, origins)
         return
-    run(*import_module("vijax.explorer.server").serve(given, address, port, origins), browser)
+    server, crew, page = import_module("vijax.explorer.server").serve(given, address, port, origins)
+    run(server, crew, page, browser)
 
 
 def check_bokeh() -> None:
