@@ -164,6 +164,14 @@ LINES: Lines = {
             "unknown": ("1",),
         },
     ),
+    "explore": (
+        ("--no-browser",),
+        {
+            "port": ("-1", "x", "1.5", "65536"),
+            "address": ("", "nowhere", "0.0.0.0"),
+            "unknown": ("1",),
+        },
+    ),
     "design": (
         ("--d", "0.2", "--survey-points", "8"),
         {

@@ -20,6 +20,7 @@ GALLERY = Path(__file__).parent / "gallery"
 
 PICTURES = {
     "power_map": "-m vijax sweep --plot {}",
+    "explorer": "-m benchmarks.explore --picture {}",
     "curves": "-m vijax curves --plot {}",
     "design_paper": "-m vijax design --d 0.2 --plot {}",
     "design_small": "-m vijax design --d 0.2 --r 0.5 --A 3 --omega 10pi --set V=1700 --tolerance omega0=5% --plot {}",

@@ -26,11 +26,13 @@ ONLY_IN = {
     "diffrax": {"vijax/engine/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
     "distributed": {"vijax/planes/cluster.py"},
     "pint": {"vijax/model/units.py"},
+    "bokeh": {"vijax/explorer"},
+    "playwright": {"benchmarks/explore.py"},
     "matplotlib": {"vijax/plots", "scripts/paper/portrait.py", "benchmarks/charts.py"},
 }
 KNOWN = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in PACKAGE}
 NO_ROOMS = {"vijax.waiting", "vijax.json"}  # a logger, a file
-NOT_AT_IMPORT = ["matplotlib", "xarray", "diffrax", "optax", "distributed", "pint"]
+NOT_AT_IMPORT = ["bokeh", "matplotlib", "xarray", "diffrax", "optax", "distributed", "pint"]
 IMPORT_SECONDS = 1.5
 
 # Built here, so that this line is not what it looks for.

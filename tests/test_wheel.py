@@ -24,6 +24,8 @@ ROOT = Path(__file__).parent.parent
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 BESIDE = {"CHANGELOG.md", "CONTRIBUTING.md", "PKG-INFO", "README.md", "constraints.txt", "pyproject.toml", ".gitignore"}
 
+EXTRAS = {"dask", "distributed", "IPython", "bokeh", "jinja2", "tornado"}  # of `cluster`, of notebooks, of `explore`
+
 USER = """
 import numpy as np
 import xarray as xr
@@ -142,7 +144,7 @@ def test_the_wheel_alone_maps_a_plane(installed, tmp_path):
 def test_the_wheel_alone_asks_for_all_that_it_imports(installed, tmp_path):
     files = (ROOT / "vijax").rglob("*.py")
     names = {name.partition(".")[0] for file in files for name in house.imported(ast.parse(file.read_text()))}
-    asked = sorted(names - sys.stdlib_module_names - {"dask", "distributed"})  # what the extra `cluster` brings
+    asked = sorted(names - sys.stdlib_module_names - EXTRAS)
     code = "import importlib, sys; print(len([importlib.import_module(name) for name in sys.argv[1:]]))"
     done = alone([str(installed), "-c", code, *asked], tmp_path)
     assert done.stdout == f"{len(asked)}\n", done.stderr

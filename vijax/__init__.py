@@ -30,6 +30,8 @@ bounds it where two constants are off (`TolerancePlane`), `design_extents` how f
 balls arrive at it, `weigh_basins` which is best if its basin counts; `DesignSettings` decide where ascents begin and
 how they climb.
 
+A page in the browser: `explore` looks into a map, cell by cell.
+
 Pictures: `plots`, which is loaded, and matplotlib with it, when it is first asked for.
 """
 

@@ -16,6 +16,7 @@ from vijax.design.robustness import weighted as weigh_basins
 from vijax.design.tolerance import Tolerance
 from vijax.design.tolerance_plane import TolerancePlane
 from vijax.design.tolerance_plane import tolerance_plane as design_plane
+from vijax.explorer.door import explore
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
 from vijax.model.membrane import HuntCrossley
@@ -86,6 +87,7 @@ __all__ = [
     "design_arrival",
     "design_extents",
     "design_plane",
+    "explore",
     "find_orbits",
     "follow_curves",
     "follow_families",

@@ -20,6 +20,7 @@ _PAGES = {
     "branch": "branch",
     "curves": "curves",
     "design": "design",
+    "explore": "explore",
     "docs": "docs",
 }
 

@@ -41,7 +41,7 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
         for colour, width, kept in ((_UNSTABLE, 0.8, 0.0), (_STABLE, 1.4, 1.0)):
             # A segment belongs to the point it leads to, so that the two colours join.
             shown = (one["stable"] == kept) | (one["stable"].shift(point=-1) == kept)
-            for piece in _pieces(one, quantity):
+            for piece in pieces(one, quantity):
                 lines = one[quantity].where(shown).isel(point=piece)
                 axes.plot(one[along.name].isel(point=piece), lines, color=colour, linewidth=width)
         _mark_events(axes, one, quantity)
@@ -55,7 +55,7 @@ def branches(dataset: "xr.Dataset", quantity: str = "v_in") -> Figure:
     return figure
 
 
-def _pieces(one: "xr.Dataset", quantity: str) -> "list[np.ndarray]":
+def pieces(one: "xr.Dataset", quantity: str) -> list[np.ndarray]:
     """Part the points of a branch at grazes, where an impact more or fewer moves the others to other columns."""
     if "impact" not in one[quantity].dims:
         return [np.arange(one.sizes["point"])]

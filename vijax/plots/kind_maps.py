@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Of kinds: so many by name, in these colours; strong ones first, their pale sisters after them, without the greys.
-_MOST_NAMED = 12
-_COLOURS = [mpl.colormaps["tab20"](n) for n in (*range(0, 20, 2), *range(1, 20, 2)) if n not in (14, 15)]
-_OTHERS = "#fff3c4"
-_NO_ORBIT = {
+MOST_NAMED = 12
+COLOURS = [mpl.colormaps["tab20"](n) for n in (*range(0, 20, 2), *range(1, 20, 2)) if n not in (14, 15)]
+OTHERS = "#fff3c4"
+NO_ORBIT = {
     "no impact": "0.93",
     "permanent contact": "white",
     "aperiodic": "0.35",
@@ -33,7 +33,7 @@ _NO_ORBIT = {
 _GREYS = LinearSegmentedColormap.from_list("greys", ["0.8", "black"])
 
 
-class _Category(NamedTuple):
+class Category(NamedTuple):
     """One colour of a map of kinds, and what it means."""
 
     colour: Any
@@ -55,6 +55,11 @@ def label_map(dataset: "xr.Dataset") -> Figure:
         ValueError: As `power_map`.
     """
     checks.variables("dataset", dataset, LABEL_NEEDS, "sweep")
+    return coded(*of_labels(dataset))
+
+
+def of_labels(dataset: "xr.Dataset") -> "tuple[xr.Dataset, list[Category]]":
+    """Turn labels into places among categories: the commonest by name, the others, and what is no orbit."""
     period = dataset["period"]
     level = (dataset["gamma"] == 0).broadcast_like(period).transpose(*period.dims)
     words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
@@ -62,7 +67,7 @@ def label_map(dataset: "xr.Dataset") -> Figure:
     drawn = dataset[["lyapunov"] if "lyapunov" in dataset else []].assign(
         code=(period.dims, codes), aperiodic=period == 0
     )
-    return coded(drawn.assign_attrs(dataset.attrs), categories)
+    return drawn.assign_attrs(dataset.attrs), categories
 
 
 @styled
@@ -78,7 +83,7 @@ def basin_map(dataset: "xr.Dataset") -> Figure:
     checks.variables("dataset", dataset, ("basin", "label", "fraction", "P"), "basins")
     further = [dim for dim in dataset["P"].dims if dim not in (*dataset["basin"].dims, "attractor")]
     dataset = dataset.isel(dict.fromkeys(further, 0))
-    drawn = dataset.assign(code=dataset["basin"].clip(max=_MOST_NAMED)).drop_vars("basin")
+    drawn = dataset.assign(code=dataset["basin"].clip(max=MOST_NAMED)).drop_vars("basin")
     return coded(drawn, None)
 
 
@@ -96,10 +101,10 @@ def multistability_map(dataset: "xr.Dataset") -> Figure:
     number = dataset["attractors"]
     most = int(number.max())
     shades = mpl.colormaps["viridis_r"](np.linspace(0, 1, most + 1))
-    shades[0] = to_rgba(_NO_ORBIT["undecided"])
+    shades[0] = to_rgba(NO_ORBIT["undecided"])
     texts = ["undecided", "1 attractor", *(f"{n} attractors" for n in range(2, most + 1))]
     categories = [
-        _Category(tuple(shade), f"{_share((number == n).mean())} {text}")
+        Category(tuple(shade), f"{_share((number == n).mean())} {text}")
         for n, (shade, text) in enumerate(zip(shades, texts[: most + 1], strict=True))
     ]
     drawn = dataset[[]].assign(code=number).assign_attrs(dataset.attrs)
@@ -116,7 +121,7 @@ def basins(dataset: "xr.Dataset") -> Figure:
     return (multistability_map if "start" in dataset.sizes else basin_map)(dataset)
 
 
-def of_flags(dataset: "xr.Dataset", name: str) -> "tuple[xr.Dataset, list[_Category]]":
+def of_flags(dataset: "xr.Dataset", name: str) -> "tuple[xr.Dataset, list[Category]]":
     """Turn a variable of flags into places among categories, those that occur."""
     variable = dataset[name]
     if variable.dtype == bool:
@@ -126,11 +131,11 @@ def of_flags(dataset: "xr.Dataset", name: str) -> "tuple[xr.Dataset, list[_Categ
     found = sorted(flag for flag in words if (variable == flag).any())
     codes = np.searchsorted(found, variable.values.astype(int))
     shares = [f"{_share((variable.values == flag).mean())} {words[flag].replace('_', ' ')}" for flag in found]
-    categories = [_Category(colour, text) for colour, text in zip(_COLOURS, shares, strict=False)]
+    categories = [Category(colour, text) for colour, text in zip(COLOURS, shares, strict=False)]
     return dataset[[]].assign(code=variable.copy(data=codes)).assign_attrs(dataset.attrs), categories
 
 
-def coded(dataset: "xr.Dataset", categories: list[_Category] | None) -> Figure:
+def coded(dataset: "xr.Dataset", categories: list[Category] | None) -> Figure:
     """Draw kinds by their places `code` among the categories; those of every panel's own table if there are none.
 
     Where it is `aperiodic`, the Lyapunov exponent shades it.
@@ -169,14 +174,14 @@ def _shade(figure: Figure, dataset: "xr.Dataset", filled: "list[tuple[Axes, xr.D
     figure.colorbar(mesh, ax=figure.axes, location="bottom", aspect=40, label="Lyapunov exponent per forcing period")
 
 
-def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]]:
+def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[Category]]:
     """Place every word among the categories, and name these: the commonest labels, the others, and what is no orbit."""
     kinds, which, counts = np.unique(words, return_inverse=True, return_counts=True)
-    orbits = [place for place in np.argsort(-counts, kind="stable") if kinds[place] not in _NO_ORBIT]
-    ranked = [[place] for place in orbits[:_MOST_NAMED]] + [orbits[_MOST_NAMED:]]
-    colours = [*_COLOURS[: len(ranked) - 1], _OTHERS]
+    orbits = [place for place in np.argsort(-counts, kind="stable") if kinds[place] not in NO_ORBIT]
+    ranked = [[place] for place in orbits[:MOST_NAMED]] + [orbits[MOST_NAMED:]]
+    colours = [*COLOURS[: len(ranked) - 1], OTHERS]
     texts = [str(kinds[place[0]]) for place in ranked[:-1]] + [f"{len(ranked[-1])} other labels"]
-    for word, colour in _NO_ORBIT.items():
+    for word, colour in NO_ORBIT.items():
         ranked.append(list(np.flatnonzero(kinds == word)))
         colours.append(colour)
         texts.append(f"aperiodic within {periods} periods" if word == "aperiodic" else word)
@@ -184,28 +189,28 @@ def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[_Category]
     codes = np.empty(kinds.size, int)
     for code, n in enumerate(shown):
         codes[ranked[n]] = code
-    categories = [_Category(colours[n], f"{_share(counts[ranked[n]].sum() / words.size)} {texts[n]}") for n in shown]
+    categories = [Category(colours[n], f"{_share(counts[ranked[n]].sum() / words.size)} {texts[n]}") for n in shown]
     return codes[which].reshape(words.shape), categories
 
 
-def _table_categories(panel: "xr.Dataset") -> list[_Category]:
+def _table_categories(panel: "xr.Dataset") -> list[Category]:
     """Name the attractors of one table, the commonest by name."""
     found = panel.isel(attractor=panel["starts"].values > 0)
-    colours = iter(_COLOURS)
+    colours = iter(COLOURS)
     categories = []
-    for n in range(min(found.sizes["attractor"], _MOST_NAMED)):
+    for n in range(min(found.sizes["attractor"], MOST_NAMED)):
         entry = found.isel(attractor=n)
         word = str(entry["label"].values)
-        colour = _NO_ORBIT[word] if word in _NO_ORBIT else next(colours)
+        colour = NO_ORBIT[word] if word in NO_ORBIT else next(colours)
         if word == "aperiodic":
             word += f" within {float(entry['periods_run']):g} periods"
         power = f", $P$ = {EngFormatter('J', places=2)(float(entry['P']))}" if entry["P"] > 0 else ""
-        categories.append(_Category(colour, f"{_share(entry['fraction'])} {word}{power}"))
-    rest = found["fraction"].values[_MOST_NAMED:]
-    return [*categories, _Category(_OTHERS, f"{_share(rest.sum())} {rest.size} others")] if rest.size else categories
+        categories.append(Category(colour, f"{_share(entry['fraction'])} {word}{power}"))
+    rest = found["fraction"].values[MOST_NAMED:]
+    return [*categories, Category(OTHERS, f"{_share(rest.sum())} {rest.size} others")] if rest.size else categories
 
 
-def _list_categories(where: Figure | Axes, categories: list[_Category], **place: Any) -> None:
+def _list_categories(where: Figure | Axes, categories: list[Category], **place: Any) -> None:
     handles = [Patch(facecolor=kind.colour, edgecolor="0.3", linewidth=0.4) for kind in categories]
     texts = [kind.text for kind in categories]
     where.legend(handles, texts, frameon=False, handlelength=1.2, fontsize="small", **place)

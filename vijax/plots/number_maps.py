@@ -44,7 +44,7 @@ _SINGLE = {"markersize": 4.0}  # a mark that is not one of thousands may be larg
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 11, "color": "red", "mec": "white", "linestyle": "none"}
 
 
-class _Mark(NamedTuple):
+class Mark(NamedTuple):
     """Cells that carry a mark, and what it means: a veil, the border around them, a point on most or any, or none."""
 
     mask: np.ndarray
@@ -53,7 +53,7 @@ class _Mark(NamedTuple):
     text: str
 
 
-class _Kind(NamedTuple):
+class MapKind(NamedTuple):
     """A kind of picture: what it colours and how, which function makes such maps, the variables that it needs.
 
     And those that it can do without, its marks.
@@ -65,7 +65,7 @@ class _Kind(NamedTuple):
     needs: tuple[str, ...]
     optional: tuple[str, ...]
     colours: "Callable[[xr.Dataset], Normalize]"
-    marks: "Callable[[xr.Dataset], list[_Mark]]"
+    marks: "Callable[[xr.Dataset], list[Mark]]"
 
 
 @styled
@@ -83,7 +83,7 @@ def power_map(dataset: "xr.Dataset") -> Figure:
     Raises:
         ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
-    return _picture(dataset, _POWER)
+    return _picture(dataset, POWER)
 
 
 @styled
@@ -107,11 +107,16 @@ def variable_map(dataset: "xr.Dataset", name: str) -> Figure:
         return coded(*of_flags(dataset, name))
     if variable.dtype.kind == "i":
         dataset = dataset.assign({name: variable.where(variable >= 0)})  # -1 is none
+    return _picture(dataset, kind_of(dataset, name))
+
+
+def kind_of(dataset: "xr.Dataset", name: str) -> MapKind:
+    """Say how a variable of numbers is coloured and what marks it has, as `variable_map` draws it."""
+    variable = dataset[name]
     written = name.replace("_", " ") + (f" [{units(variable)}]" if units(variable) else "")
-    kind = _Kind(
+    return MapKind(
         name, written, "sweep", (name,), (*NEEDS,), partial(_number_colours, name), partial(_number_marks, name)
     )
-    return _picture(dataset, kind)
 
 
 @styled
@@ -130,7 +135,7 @@ def difference_map(dataset: "xr.Dataset") -> Figure:
     return _picture(dataset, _DIFFERENCE)
 
 
-def _picture(dataset: "xr.Dataset", kind: _Kind) -> Figure:
+def _picture(dataset: "xr.Dataset", kind: MapKind) -> Figure:
     checks.variables("dataset", dataset, kind.needs, kind.made, "variable_map (--show NAME) draws any that there is")
     whole = dataset[kind.coloured]
     layout({str(dim): size for dim, size in whole.sizes.items()})
@@ -143,7 +148,7 @@ def _picture(dataset: "xr.Dataset", kind: _Kind) -> Figure:
     return figure
 
 
-def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str]) -> Figure:
+def _maps(dataset: "xr.Dataset", kind: MapKind, dims: list[str]) -> Figure:
     figure, filled = panels(dataset, dims)
     norm, peak = kind.colours(dataset), _peak(dataset)
     for axes, panel in filled:
@@ -155,16 +160,18 @@ def _maps(dataset: "xr.Dataset", kind: _Kind, dims: list[str]) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, panel: "xr.Dataset", kind: _Kind, x: str, y: str, norm: Normalize) -> QuadMesh:
+def _panel(axes: Axes, panel: "xr.Dataset", kind: MapKind, x: str, y: str, norm: Normalize) -> QuadMesh:
     across, up = (edges(panel[dim].values)[0] for dim in (x, y))
     # matplotlib takes infinities for missing.
     values = np.minimum(panel[kind.coloured].values, np.finfo(float).max)
-    mesh = axes.pcolormesh(across, up, np.ma.masked_where(~_drawn(values, norm), values), norm=norm, rasterized=True)
+    mesh = axes.pcolormesh(
+        across, up, np.ma.masked_where(~has_colour(values, norm), values), norm=norm, rasterized=True
+    )
     _mark_map(axes, kind.marks(panel), (panel[x].values, panel[y].values), (across, up))
     return mesh
 
 
-def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
+def _curve(dataset: "xr.Dataset", kind: MapKind) -> Figure:
     """Draw the coloured variable over a single axis, with the marks of a map."""
     (x,) = (str(dim) for dim in dataset[kind.coloured].dims)
     dataset = dataset.sortby(x)
@@ -175,7 +182,7 @@ def _curve(dataset: "xr.Dataset", kind: _Kind) -> Figure:
     norm = kind.colours(dataset)
     yscale = "log" if isinstance(norm, LogNorm) else "linear"
     axes.set(xscale=xscale, yscale=yscale, xlim=across[[0, -1]], xlabel=axis_label(dataset[x]), ylabel=kind.label)
-    drawn = _drawn(values, norm) & np.isfinite(values)
+    drawn = has_colour(values, norm) & np.isfinite(values)
     axes.plot(places, np.where(drawn, values, np.nan), color="tab:blue", linewidth=0.9, zorder=1)
     axes.margins(y=0.05)
     label_logs(axes)
@@ -191,7 +198,7 @@ def _peak(dataset: "xr.Dataset") -> "xr.DataArray | None":
 
 
 def _mark_map(
-    axes: Axes, marks: list[_Mark], places: tuple[np.ndarray, np.ndarray], around: tuple[np.ndarray, np.ndarray]
+    axes: Axes, marks: list[Mark], places: tuple[np.ndarray, np.ndarray], around: tuple[np.ndarray, np.ndarray]
 ) -> None:
     for mask, how, style, _ in marks:
         if how == "veil":
@@ -202,7 +209,7 @@ def _mark_map(
             axes.plot(*marked_places(mask, *places, most=how == "most"), **style)
 
 
-def _mark_curve(axes: Axes, marks: list[_Mark], places: np.ndarray, across: np.ndarray, values: np.ndarray) -> None:
+def _mark_curve(axes: Axes, marks: list[Mark], places: np.ndarray, across: np.ndarray, values: np.ndarray) -> None:
     for mask, how, style, _ in marks:
         if how == "veil":
             for start, end in runs(mask):
@@ -214,7 +221,7 @@ def _mark_curve(axes: Axes, marks: list[_Mark], places: np.ndarray, across: np.n
             axes.plot(places[mask], values[mask], **style | _SINGLE, zorder=2)
 
 
-def _drawn(values: np.ndarray, norm: Normalize) -> np.ndarray:
+def has_colour(values: np.ndarray, norm: Normalize) -> np.ndarray:
     """Say which values have a colour."""
     return values > 0 if isinstance(norm, LogNorm) else ~np.isnan(values)
 
@@ -239,23 +246,23 @@ def _power_colours(dataset: "xr.Dataset") -> LogNorm:
     return _log_colours(shown, decades) if shown.size else LogNorm(1e-9, 1e-6)
 
 
-def _common_marks(dataset: "xr.Dataset") -> list[_Mark]:
+def _common_marks(dataset: "xr.Dataset") -> list[Mark]:
     """Make marks of what a map holds besides what is coloured."""
     marks = []
     if "admissible" in dataset:
-        marks.append(_Mark(~dataset["admissible"].values, "veil", VEIL, "inadmissible"))
+        marks.append(Mark(~dataset["admissible"].values, "veil", VEIL, "inadmissible"))
     if "period" in dataset:
         period = dataset["period"].values
         marks += [
-            _Mark(period == 1, "border", _LINE, "border of period 1"),
-            _Mark(period == 0, "most", _DOT, "aperiodic"),
-            _Mark(period < 0, "any", _CROSS, "undecided"),
+            Mark(period == 1, "border", _LINE, "border of period 1"),
+            Mark(period == 0, "most", _DOT, "aperiodic"),
+            Mark(period < 0, "any", _CROSS, "undecided"),
         ]
     return marks
 
 
-def _power_marks(dataset: "xr.Dataset") -> list[_Mark]:
-    return [*_common_marks(dataset), _Mark(dataset["P"].values == 0, "bare", BARE, "no impact")]
+def _power_marks(dataset: "xr.Dataset") -> list[Mark]:
+    return [*_common_marks(dataset), Mark(dataset["P"].values == 0, "bare", BARE, "no impact")]
 
 
 def _number_colours(name: str, dataset: "xr.Dataset") -> Normalize:
@@ -266,11 +273,11 @@ def _number_colours(name: str, dataset: "xr.Dataset") -> Normalize:
     return Normalize(shown.min(), shown.max()) if shown.size else Normalize(0, 1)
 
 
-def _number_marks(name: str, dataset: "xr.Dataset") -> list[_Mark]:
+def _number_marks(name: str, dataset: "xr.Dataset") -> list[Mark]:
     others = dataset.drop_vars(name) if name == "period" else dataset  # its own colours say it
-    none = ~_drawn(dataset[name].values, _number_colours(name, dataset))
+    none = ~has_colour(dataset[name].values, _number_colours(name, dataset))
     zero = bool((dataset[name].values[none] == 0).any())
-    return [*_common_marks(others), _Mark(none, "bare", BARE, "zero, or no value" if zero else "no value")]
+    return [*_common_marks(others), Mark(none, "bare", BARE, "zero, or no value" if zero else "no value")]
 
 
 def _difference_colours(_: "xr.Dataset") -> LogNorm:
@@ -278,22 +285,22 @@ def _difference_colours(_: "xr.Dataset") -> LogNorm:
     return LogNorm(10.0**-_DECADES, 1.0)
 
 
-def _difference_marks(dataset: "xr.Dataset") -> list[_Mark]:
+def _difference_marks(dataset: "xr.Dataset") -> list[Mark]:
     differs = dataset["label"].values == Label.DIFFERS
-    marks = [_Mark(differs, "border", _LINE, "border of other labels")]
+    marks = [Mark(differs, "border", _LINE, "border of other labels")]
     if "cheapest_model" in dataset:
         verdict = dataset["cheapest_model"]
         within = f"{100 * verdict.attrs['tolerance']:.4g} %"
         marks += [
-            _Mark(verdict.values == Model.RIGID, "border", _OUTLINE, f"rigid is enough within {within}"),
-            _Mark(verdict.values == Model.UNDECIDED, "any", _CROSS | {"color": "orange"}, "undecided"),
+            Mark(verdict.values == Model.RIGID, "border", _OUTLINE, f"rigid is enough within {within}"),
+            Mark(verdict.values == Model.UNDECIDED, "any", _CROSS | {"color": "orange"}, "undecided"),
         ]
     bare = ~(dataset["relative_difference"].values > 0)
-    return [*marks, _Mark(bare, "bare", BARE, "no difference, or failed")]
+    return [*marks, Mark(bare, "bare", BARE, "no difference, or failed")]
 
 
-_POWER = _Kind("P", QUANTITIES["P"], "sweep", NEEDS, (), _power_colours, _power_marks)
-_DIFFERENCE = _Kind(
+POWER = MapKind("P", QUANTITIES["P"], "sweep", NEEDS, (), _power_colours, _power_marks)
+_DIFFERENCE = MapKind(
     "relative_difference",
     r"$|P_\mathrm{rigid} - P_\mathrm{soft}| / P_\mathrm{soft}$",
     "compare",
@@ -304,7 +311,7 @@ _DIFFERENCE = _Kind(
 )
 
 
-def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataArray | None") -> None:
+def _explain(figure: Figure, dataset: "xr.Dataset", kind: MapKind, peak: "xr.DataArray | None") -> None:
     """Explain above what the map holds constant, below what its marks mean; only the marks that it has."""
     figure.suptitle(title(dataset), fontsize="medium")
     shown = [(_handle(mark), mark.text) for mark in kind.marks(dataset) if mark.mask.any()]
@@ -315,7 +322,7 @@ def _explain(figure: Figure, dataset: "xr.Dataset", kind: _Kind, peak: "xr.DataA
     figure.legend(handles, texts, loc="outside lower center", ncols=3, frameon=False, handlelength=1.6)
 
 
-def _handle(mark: _Mark) -> Patch | Line2D:
+def _handle(mark: Mark) -> Patch | Line2D:
     if mark.how in ("veil", "bare"):
         return Patch(**mark.style)
     return Line2D([], [], **mark.style if mark.how == "border" else mark.style | _SINGLE)

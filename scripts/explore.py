@@ -1,0 +1,17 @@
+"""A page in the browser that looks into a map: `vijax explore`.
+
+python scripts/explore.py
+python scripts/explore.py --help  # options, and more lines to begin with
+"""
+
+from vijax.cli.explore import explore
+from vijax.cli.process import leave, run
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command and give its exit code; see `process.run`."""
+    return run(explore, arguments)
+
+
+if __name__ == "__main__":
+    leave(main())

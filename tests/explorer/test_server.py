@@ -1,0 +1,139 @@
+"""Who may ask the server, what it says where it cannot serve, and the page in a notebook."""
+
+import os
+import time
+
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
+from tornado.websocket import websocket_connect
+
+import vijax
+from vijax.explorer import door, server, worker
+from vijax.explorer.source import Source
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4))
+
+
+@pytest.fixture
+def serving(dataset, monkeypatch):
+    """Make servers of the map, none of which compiles ahead; give each, a page of it, and how to ask it."""
+    monkeypatch.setattr(server, "warm", lambda *_: None)
+    made = []
+
+    def serve(address, origins=()):
+        one, crew, page = server.serve(Source(dataset), address, 0, origins)
+        made.append((one, crew))
+
+        def ask(url, **further):
+            return one.io_loop.run_sync(lambda: AsyncHTTPClient().fetch(HTTPRequest(url, **further)), timeout=30)
+
+        return one, page, ask
+
+    yield serve
+    for one, crew in made:
+        one.stop()
+        crew.close()
+
+
+def test_this_machine_alone_is_served_without_a_token(serving):
+    one, page, ask = serving("127.0.0.1")
+    assert page == f"http://127.0.0.1:{one.port}/"
+    body = ask(page).body.decode()
+    assert 'id="map"' in body
+    assert "https://" not in body.partition("<body>")[0].replace("https://github.com", "")
+
+
+def test_others_need_the_token_of_the_address(serving):
+    one, page, ask = serving("0.0.0.0", ("127.0.0.1:1",))
+    base, token = f"http://127.0.0.1:{one.port}/", page.partition("token=")[2]
+    assert len(token) > 20
+    for wrong in ("", "?token=", "?token=guess"):
+        with pytest.raises(HTTPClientError, match="403"):
+            ask(base + wrong)
+    answer = ask(f"{base}?token={token}")
+    assert 'id="map"' in answer.body.decode()
+    assert "HttpOnly" in answer.headers["Set-Cookie"]
+
+
+def test_a_page_from_elsewhere_may_not_ask(serving):
+    one, _, _ = serving("127.0.0.1")
+    asked = HTTPRequest(f"ws://127.0.0.1:{one.port}/ws", headers={"Origin": "http://elsewhere.example"})
+    with pytest.raises(HTTPClientError, match="403"):
+        one.io_loop.run_sync(lambda: websocket_connect(asked, subprotocols=["bokeh", "none"]), timeout=30)
+
+
+def test_an_open_address_needs_an_origin(dataset):
+    with pytest.raises(ValueError, match="address must come with allow_origin"):
+        server.serve(Source(dataset), "0.0.0.0", 0, ())
+
+
+def test_what_a_damaged_store_says_is_text(serving, monkeypatch):
+    _, page, ask = serving("127.0.0.1")
+
+    def broken(self):
+        raise ValueError("<script>alert(1)</script>")
+
+    monkeypatch.setattr(Source, "plane", broken)
+    body = ask(page).body.decode()
+    assert "&lt;script&gt;alert(1)" in body
+    assert "<script>alert(1)" not in body
+
+
+def test_without_bokeh_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(door, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'vijax\[explore\]'"):
+        vijax.explore(browser=False)
+
+
+def test_a_store_is_read_again_when_a_tile_is_done(tmp_path):
+    store = tmp_path / "plane.zarr"
+    whole = vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4), out=store)
+    source = Source(store)
+    first = source.plane()
+    assert source.plane() is first
+    record = next((store / "status/tiles").glob("[0-9]*.json"))
+    later = time.time_ns() + 10**9
+    os.utime(record, ns=(later, later))
+    assert source.plane() is not first
+    assert (source.plane().dataset["P"].values == whole["P"].values).all()
+
+
+def test_a_process_that_is_cancelled_ends_and_the_next_work_has_another():
+    one, ticks = worker.Worker(), []
+
+    def until_third(done, total):
+        ticks.append(done)
+        if len(ticks) == 3:
+            raise KeyError("cancelled")
+
+    with pytest.raises(KeyError):
+        one.run(time.sleep, (60,), until_third)
+    assert one.run(divmod, (7, 2), lambda done, total: None) == (3, 1)
+    with pytest.raises(worker.WorkerError, match="division"):
+        one.run(divmod, (7, 0), lambda done, total: None)
+    one.close()
+
+
+def test_a_notebook_shows_the_page_in_a_frame():
+    code = (
+        "import numpy as np, vijax\n"
+        "ds = vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4))\n"
+        "vijax.explore(ds, port=0)"
+    )
+    ask = (
+        "from tornado.httpclient import AsyncHTTPClient\n"
+        "from vijax.explorer import notebook\n"
+        "address = f'http://127.0.0.1:{notebook._KEPT[0][0].port}/'\n"
+        "b'id=\"map\"' in (await AsyncHTTPClient().fetch(address)).body"
+    )
+    book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(one) for one in (code, ask)])
+    NotebookClient(book, timeout=120, kernel_name="python3").execute()
+    (frame,) = (one for one in book.cells[0].outputs if "text/html" in one.get("data", {}))
+    assert "<iframe" in frame["data"]["text/html"]
+    assert book.cells[1].outputs[0]["data"]["text/plain"] == "True"

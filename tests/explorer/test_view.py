@@ -1,0 +1,120 @@
+"""What a page shows stands in its address, within bounds; what a cell is follows from the map; recipes say it again."""
+
+import shlex
+from urllib.parse import parse_qsl
+
+import numpy as np
+import pytest
+
+import vijax
+from vijax.cli.main import main
+from vijax.explorer import recipes, view
+from vijax.explorer.plane import cell, explored
+from vijax.explorer.view import View
+
+COORDINATES = ("d", "kappa", "r", "gamma", "u0", "v0")
+
+
+@pytest.fixture(scope="module")
+def power():
+    """A small map, P over d and kappa."""
+    return vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4))
+
+
+@pytest.fixture(scope="module")
+def plane(power):
+    return explored(power)
+
+
+@pytest.fixture(scope="module")
+def physical():
+    """A map over quantities of the device, of which the nondimensional ones all vary."""
+    omega, device = np.pi * np.array([1.0, 4.0, 9.0]), vijax.Harvester(V=1500.0)
+    return vijax.sweep(omega=omega, omega0=[40.0, 400.0], A=[1.0, 2.0], s=0.2, beta=0.1, device=device)
+
+
+def test_a_view_is_restored_by_its_address(plane):
+    shown = View("label", "log", (3, 1), {"r": 0.43210987654321, "v0": -0.25}, "d", ("branch",), True)
+    assert view.from_query(plane, dict(parse_qsl(view.query(shown)))) == shown
+
+
+def test_an_address_without_a_query_opens_on_the_best_cell(plane, power):
+    column, row = view.from_query(plane, {}).pick
+    best = power["P"].where(power["admissible"]).max()
+    assert power["P"].isel(d=column, kappa=row) == best
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("cell", "4,0"),
+        ("cell", "-1,0"),
+        ("cell", "x"),
+        ("r", "1.5"),
+        ("r", "nan"),
+        ("gamma", "many"),
+        ("variable", "<b>"),
+        ("scale", "cubic"),
+        ("along", "r"),
+        ("open", "all"),
+        ("beta", "0.1"),
+    ],
+)
+def test_what_an_address_cannot_say_is_refused_in_a_line(plane, name, text):
+    with pytest.raises(ValueError, match="must"):
+        view.from_query(plane, {name: text})
+
+
+def test_every_cell_is_that_of_the_map(power, physical):
+    for dataset in (power, physical):
+        plane = explored(dataset)
+        (x, y), pick = (plane.x.name, plane.y.name), (1, 1)
+        own = dataset.isel({x: 1, y: 1} | dict.fromkeys(plane.further, 0))
+        found = cell(plane, pick, {})
+        got = {name: float(getattr(found.pair, name)) for name in COORDINATES[:4]} | {"u0": found.u0, "v0": found.v0}
+        assert got == pytest.approx({name: float(own[name]) for name in COORDINATES}, rel=1e-14)
+        again = vijax.sweep(device=found.device, **found.settings, **found.arguments)
+        assert float(again["P"]) == pytest.approx(float(own["P"]), rel=1e-12)
+
+
+def test_a_further_axis_and_what_is_fixed_can_be_moved(physical):
+    plane = explored(physical)
+    assert set(plane.fixed) == {"s", "r", "beta"}
+    assert set(view.bounds(plane)) == {"s", "r", "beta", "u0", "v0", "A"}
+    found = cell(plane, (0, 1), {"A": 2.0, "s": 0.1})
+    assert float(found.pair.d) == pytest.approx(0.1 / (2.0 * np.pi**2) * np.pi**2)
+    assert plane.slices({"A": 2.0}) == {"A": 1}
+    assert plane.differs({"A": 2.0}) == ()
+    assert plane.differs({"s": 0.1}) == ("s",)
+
+
+@pytest.mark.parametrize(
+    ("changed", "must"),
+    [
+        (lambda power: power.isel(kappa=[0]), "two axes of more than one value; got d"),
+        (lambda power: power.assign_attrs(until="window"), "until='attractor'"),
+        (lambda power: power.assign_attrs(method="rk4"), "method='exact'"),
+        (lambda power: power.rename(kappa="pressure"), "must be a map that vijax.sweep made"),
+        (lambda power: 3, "dataset must be"),
+    ],
+)
+def test_what_cannot_be_looked_into_is_said_at_the_door(power, changed, must):
+    with pytest.raises(ValueError, match=must):
+        explored(changed(power))
+
+
+def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, monkeypatch):
+    from vijax.explorer.motion import motion
+
+    monkeypatch.chdir(tmp_path)
+    plane = explored(physical)
+    found = cell(plane, (1, 1), {"r": 0.6})
+    moved = motion(found)
+    recipe = recipes.of_motion(found, moved)
+    made: dict = {}
+    exec(recipe.python, made)
+    assert float(made["found"]["P"]) == moved.numbers["P"]
+    if moved.orbit is not None:
+        assert np.array_equal(np.asarray(made["orbit"].multipliers), np.asarray(moved.orbit.multipliers))
+    assert main([*shlex.split(recipe.command)[1:], "--out", "cell.zarr"]) == 0
+    assert f"{moved.numbers['P']:.6g}" in capsys.readouterr().out

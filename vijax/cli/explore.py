@@ -1,0 +1,63 @@
+"""`vijax explore`: a page in the browser that looks into a map."""
+
+import click
+
+from vijax.cli import process
+from vijax.cli.kinds import Whole
+from vijax.cli.page import Page
+from vijax.explorer.address import MOST_PORT, PORT
+
+
+def explored(store: str | None, address: str, port: int, allow_origin: tuple[str, ...], no_browser: bool) -> None:
+    """Look into a map in the browser.
+
+    A click on a cell shows its motion, the line through it, its basins, its branch and the nearest optimum. STORE is
+    what `vijax sweep` wrote, or is writing; without it a small plane of d and kappa is made first.
+    """
+    from vijax.explorer.door import check_bokeh, run
+
+    with process.door():
+        check_bokeh()
+        from vijax.explorer.server import serve
+        from vijax.explorer.source import Source
+        from vijax.runtime import checks
+
+        checks.whole("port", port, 0, MOST_PORT)
+        source = Source(store)
+        if store is not None:
+            source.plane()
+        server, crew, page = serve(source, address, port, allow_origin)
+    try:
+        run(server, crew, page, not no_browser)
+    except KeyboardInterrupt:
+        process.stop("the server is closed")
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+explore = Page(
+    "explore",
+    explored,
+    {
+        "Server": [
+            click.Argument(["store"], required=False, metavar="[STORE]"),
+            click.Option(["--port"], type=Whole(0), default=PORT, show_default=True, help="0 for any that is free"),
+            click.Option(["--address"], default="127.0.0.1", show_default=True, help="that the server binds"),
+            click.Option(
+                ["--allow-origin"],
+                multiple=True,
+                metavar="HOST:PORT",
+                help="with --address: who may ask, as it stands in the browser",
+            ),
+            click.Option(["--no-browser"], is_flag=True, help="open no browser, say where the page is"),
+        ],
+    },
+    examples=[
+        "",
+        "power_map.zarr",
+        "power_map.zarr --no-browser --port 0",
+        "power_map.zarr --address 0.0.0.0 --allow-origin lab.example.org:5006",
+    ],
+    epilog="The page is of this machine alone unless --address says otherwise; its address then has a token in it. "
+    "Needs the extra explore: pip install 'vijax[explore]'.",
+)

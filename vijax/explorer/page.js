@@ -1,0 +1,260 @@
+// What the page does by itself: it asks the server by messages and writes what it is told, always as text.
+window.vijax = (() => {
+  let channel, pick, across, up, figure, axes, number = 0, sent = 0, state = {}, base = {};
+  const id = (name) => document.getElementById(name);
+  const all = (selector) => document.querySelectorAll(selector);
+  const make = (tag, text, classes) => {
+    const made = document.createElement(tag);
+    if (text !== undefined) made.textContent = text;
+    if (classes) made.className = classes;
+    return made;
+  };
+  // Equal messages in a row would be no change to the server, so each is numbered.
+  const ask = (kind, content = {}) => { channel.asked = { kind, sent: ++sent, ...content }; };
+  const hide = (element, hidden) => { element.hidden = hidden; };
+
+  // --- the pick ------------------------------------------------------------------------------------------------
+  const cellAt = (axis, value) => {
+    const { edges } = axis;
+    let low = 0, high = edges.length - 2;
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (edges[middle] <= value) low = middle; else high = middle - 1;
+    }
+    return low;
+  };
+  const choose = (column, row) => {
+    const most = [axes.x.values.length - 1, axes.y.values.length - 1];
+    column = Math.min(Math.max(column, 0), most[0]);
+    row = Math.min(Math.max(row, 0), most[1]);
+    if (state.pick && state.pick[0] === column && state.pick[1] === row) return;
+    state.pick = [column, row];
+    const x = axes.x.values[column], y = axes.y.values[row];
+    pick.data = { x: [x], y: [y] };
+    across.location = x;
+    up.location = y;
+    ask("pick", { column, row, number: ++number });
+  };
+  // By the pointer's own events: Bokeh waits 300 ms after a tap for a second one, and then tells of one double tap.
+  const pointed = (event) => {
+    if (!axes || (event.type === "pointermove" && !(event.buttons & 1)) || event.button > 0) return;
+    const { frame } = Bokeh.index.find_one(figure), box = id("map").getBoundingClientRect(), { bbox } = frame;
+    const sx = event.clientX - box.left, sy = event.clientY - box.top;
+    if (event.type === "pointerdown") {
+      if (sx < bbox.left || sx > bbox.right || sy < bbox.top || sy > bbox.bottom) return;
+      id("map").setPointerCapture(event.pointerId);
+    }
+    choose(cellAt(axes.x, frame.x_scale.invert(sx)), cellAt(axes.y, frame.y_scale.invert(sy)));
+  };
+  const keys = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+  const pressed = (event) => {
+    const step = keys[event.key];
+    if (!step || !state.pick) return;
+    event.preventDefault();
+    const far = event.shiftKey ? 10 : 1;
+    choose(state.pick[0] + far * step[0], state.pick[1] + far * step[1]);
+  };
+
+  // --- what is told --------------------------------------------------------------------------------------------
+  const options = (select, names) => select.replaceChildren(...names.map((name) => {
+    const one = make("option", name.replaceAll("_", " "));
+    one.value = name;
+    return one;
+  }));
+  const slider = ({ name, label, low, high, value }) => {
+    const row = make("div", undefined, "value");
+    row.dataset.name = name;
+    const title = make("label", label), range = make("input"), exact = make("input");
+    Object.assign(range, { type: "range", id: `value-${name}`, min: low, max: high, step: "any", value });
+    Object.assign(exact, { type: "number", min: low, max: high, step: "any", value: +(+value).toPrecision(6) });
+    exact.setAttribute("aria-label", `${label}, exactly`);
+    title.htmlFor = range.id;
+    range.addEventListener("input", () => {
+      exact.value = +(+range.value).toPrecision(6);
+      ask("value", { name, value: +exact.value, number: ++number });
+    });
+    exact.addEventListener("change", () => {
+      const value = Number.isFinite(exact.valueAsNumber) ? exact.valueAsNumber : exact.value;
+      ask("value", { name, value, number: ++number });
+    });
+    row.append(title, range, exact);
+    base[name] = value;
+    return row;
+  };
+  // When all of an answer is on the screen: what benchmarks and tests wait for.
+  const answered = (request) => {
+    requestAnimationFrame(() => requestAnimationFrame(() => { document.body.dataset.shown = request; }));
+  };
+  const table = (rows) => {
+    const made = make("table"), head = make("tr"), body = make("tbody");
+    rows[0].forEach((text) => { const one = make("th", text); one.scope = "col"; head.append(one); });
+    if (rows[0][0] === "") head.firstChild.append(make("span", "colour", "unseen"));
+    rows.slice(1).forEach((row) => {
+      const line = make("tr");
+      row.forEach((text) => {
+        const cell = make("td");
+        if (/^#[0-9a-f]{6}$/.test(text)) {
+          const sign = make("span", undefined, "sign");
+          sign.style.background = text;
+          cell.append(sign);
+        } else cell.textContent = text;
+        line.append(cell);
+      });
+      body.append(line);
+    });
+    const top = make("thead");
+    top.append(head);
+    made.append(top, body);
+    return made;
+  };
+  const sections = {
+    page({ title, variables, axes: told, sliders }) {
+      axes = told;
+      id("title").textContent = title;
+      document.title = `vijax ${title}`;
+      options(id("variable"), variables);
+      options(id("along"), [axes.x.name, axes.y.name]);
+      id("values").replaceChildren(...sliders.map(slider));
+    },
+    view(told) {
+      state = told;
+      id("variable").value = told.variable;
+      id("scale").value = told.scale;
+      id("along").value = told.along;
+      id("follow").checked = told.follow;
+      all(".value").forEach((row) => {
+        const { name } = row.dataset, moved = name in told.values, value = moved ? told.values[name] : base[name];
+        const [, range, exact] = row.children;
+        row.classList.toggle("moved", moved);
+        if (document.activeElement !== range) range.value = value;
+        if (document.activeElement !== exact) exact.value = +(+value).toPrecision(6);
+      });
+      id("make").disabled = told.moved.length === 0;
+      const token = new URLSearchParams(location.search).get("token");
+      const query = new URLSearchParams(told.query);
+      if (token) query.set("token", token);
+      history.replaceState(null, "", `?${query}`);
+    },
+    legend({ title, entries }) {
+      id("coloured").textContent = title;
+      id("legend").replaceChildren(...entries.map(([sign, colour, text, count]) => {
+        const line = make("li"), mark = make("span", { dot: "\u2022", cross: "\u00d7", star: "\u2605" }[sign] ?? "", `sign ${sign}`);
+        if (sign === "cell") mark.style.background = colour;
+        if (["dot", "cross", "star"].includes(sign)) mark.style.color = colour;
+        line.append(mark, make("span", text), make("span", sign === "star" ? "" : count.toLocaleString("en"), "count"));
+        return line;
+      }));
+    },
+    cell({ number: request, heading, rows, note }) {
+      id("heading").textContent = heading;
+      id("cellnote").textContent = note;
+      hide(id("cellnote"), !note);
+      id("rows").replaceChildren(...rows.map(([name, text]) => {
+        const line = make("div");
+        line.append(make("dt", name), make("dd", text));
+        return line;
+      }));
+      answered(request);
+    },
+    panel({ name, state: now, text, rows }) {
+      const place = document.querySelector(`[data-panel="${name}"]`);
+      place.replaceChildren();
+      place.dataset.state = now;
+      if (text) place.append(make("p", text, now));
+      if (now === "running") place.append(make("progress"));
+      if (rows.length) place.append(table(rows));
+      if (name === "motion" && now === "failed") answered(number);
+      if (now === "running" || now === "idle") files(name, false);
+      if (now === "done") files(name, true);
+      const button = document.querySelector(`.cancel[data-name="${name}"]`);
+      if (button) hide(button, now !== "running");
+      if (name === "plane" && now === "running") {
+        const stop = make("button", "Cancel");
+        stop.type = "button";
+        stop.addEventListener("click", () => ask("cancel", { name }));
+        place.append(stop);
+      }
+    },
+    progress({ name, done, total }) {
+      const bar = document.querySelector(`[data-panel="${name}"] progress`);
+      if (bar) Object.assign(bar, { value: done, max: total });
+    },
+    recipe({ name, command, python }) {
+      const place = document.querySelector(`[data-recipe="${name}"]`);
+      if (!place) return;
+      hide(place, false);
+      place.replaceChildren(place.firstElementChild, ...[command, python].filter(Boolean).map((text) => {
+        const block = make("div"), copy = make("button", "Copy");
+        copy.type = "button";
+        copy.addEventListener("click", () => copied(text, copy));
+        block.append(make("pre", text), copy);
+        return block;
+      }));
+    },
+    note({ text, error }) {
+      id("note").textContent = text;
+      id("note").classList.toggle("error", error);
+      hide(id("note"), !text);
+      if (error) answered(number);
+    },
+    warmth({ text }) {
+      id("warmth").textContent = text;
+      hide(id("warmth"), !text);
+    },
+    ask({ text }) { if (confirm(text)) ask("make", { sure: true }); },
+    file({ name, content }) {
+      const link = make("a");
+      link.href = `data:application/octet-stream;base64,${content}`;
+      link.download = name;
+      link.click();
+    },
+  };
+  const told = (message) => sections[message.section]?.(message);
+  const copied = async (text, button) => {
+    await navigator.clipboard.writeText(text);
+    const before = button.textContent;
+    button.textContent = "Copied";
+    setTimeout(() => { button.textContent = before; }, 1500);
+  };
+  const files = (name, there) => {
+    const place = document.querySelector(`.files[data-what="${name}"]`);
+    if (!place) return;
+    place.replaceChildren(...(there ? ["pdf", "svg", "png"] : []).map((format) => {
+      const button = make("button", format.toUpperCase());
+      button.type = "button";
+      button.setAttribute("aria-label", `Save the picture of this ${name} as ${format.toUpperCase()}`);
+      button.addEventListener("click", () => ask("export", { what: name, format }));
+      return button;
+    }));
+  };
+
+  // --- the server ----------------------------------------------------------------------------------------------
+  const lost = () => {
+    hide(id("lost"), false);
+    const again = setInterval(async () => {
+      try {
+        const answer = await fetch(location.href, { cache: "no-store" });
+        if (answer.ok) { clearInterval(again); location.reload(); }
+      } catch { /* not yet */ }
+    }, 1000);
+  };
+  const begin = (given) => {
+    ({ channel, pick, across, up, map: figure } = given);
+    id("map").addEventListener("keydown", pressed);
+    id("map").addEventListener("pointerdown", pointed);
+    id("map").addEventListener("pointermove", pointed);
+    id("variable").addEventListener("change", colour);
+    id("scale").addEventListener("change", colour);
+    id("along").addEventListener("change", () => ask("along", { along: id("along").value }));
+    id("follow").addEventListener("change", () => ask("follow", { follow: id("follow").checked, number: ++number }));
+    id("make").addEventListener("click", () => ask("make"));
+    id("reset").addEventListener("click", () => Object.keys(state.values).forEach((name) => ask("value", { name, number: ++number })));
+    id("link").addEventListener("click", () => copied(location.href, id("link")));
+    all(".compute").forEach((one) => one.addEventListener("click", () => ask("open", { name: one.dataset.name })));
+    all(".cancel").forEach((one) => one.addEventListener("click", () => ask("cancel", { name: one.dataset.name })));
+    ["map", "motion"].forEach((name) => files(name, true));
+    ask("ready");
+  };
+  const colour = () => ask("colour", { variable: id("variable").value, scale: id("scale").value });
+  return { begin, told, lost, get number() { return number; } };
+})();

@@ -1,0 +1,238 @@
+"""The map that a page shows: its two axes, further ones, what it holds fixed, and the arguments of any cell of it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vijax.model.device import Harvester, with_constants, with_pair
+from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.quantities import AXES, START, START_REACH, synonyms
+from vijax.planes.axes import cells
+from vijax.plots.cells import edges
+from vijax.plots.style import LABEL_NEEDS
+from vijax.runtime import checks
+from vijax.runtime.context import door
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# Constants of the device that a map has among its attributes.
+_TOLD = ("m_b", "g", "w0", "R0", "eps_M", "C_T", "V", "r_b", "penetration_limit")
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis of the map as it is drawn: ascending.
+
+    Attributes:
+        name: Of the quantity.
+        values: Ascending.
+        edges: Of the cells around them.
+        scale: "log" or "linear": that on which the values are evenly spaced, "linear" where they are on neither.
+        even: Whether they are evenly spaced on it.
+    """
+
+    name: str
+    values: np.ndarray
+    edges: np.ndarray
+    scale: str
+    even: bool
+
+    def nearest(self, value: float) -> int:
+        """Find the cell that holds a value, or the nearest to it."""
+        return int(np.clip(np.searchsorted(self.edges, value) - 1, 0, self.values.size - 1))
+
+    def part(self, value: float) -> float:
+        """Say which part of the way along the axis a value lies, on its scale."""
+        low, high = self.values[0], self.values[-1]
+        if self.scale == "log":
+            return float(np.log(value / low) / np.log(high / low))
+        return float((value - low) / (high - low))
+
+
+@dataclass(frozen=True)
+class ExploredPlane:
+    """A map that can be looked into.
+
+    Attributes:
+        dataset: What `sweep` returned, its first two axes ascending.
+        x, y: The axes that are drawn.
+        further: Values of its other axes, of which one value at a time is shown.
+        fixed: Axes of `sweep` by which every other cell of this device could be run, each one number.
+        device: Its constants that are no axes.
+        wall, periods: As in `sweep`.
+        variables: What can be shown, "label" among them where the map holds what makes one.
+    """
+
+    dataset: "xr.Dataset"
+    x: Axis
+    y: Axis
+    further: dict[str, np.ndarray]
+    fixed: dict[str, float]
+    device: Harvester
+    wall: Any
+    periods: int
+    variables: tuple[str, ...]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Count the columns and rows."""
+        return self.x.values.size, self.y.values.size
+
+    def arguments(self, pick: tuple[int, int], values: Mapping[str, float]) -> dict[str, float]:
+        """Give the axes of `sweep` at a cell, what was moved in place of what the map holds."""
+        column, row = pick
+        place = {self.x.name: float(self.x.values[column]), self.y.name: float(self.y.values[row])}
+        known = {name: float(x[0]) for name, x in self.further.items()} | self.fixed
+        return place | known | {name: float(value) for name, value in values.items() if name not in place}
+
+    def settings(self) -> dict[str, Any]:
+        """Give the arguments of `sweep` that say how the map was run, where they are not its defaults."""
+        told: dict[str, Any] = {}
+        if self.wall != "soft":
+            told["wall"] = self.wall
+        if self.periods != 400:
+            told["periods"] = self.periods
+        return told
+
+    def stored(self, name: str, pick: tuple[int, int], values: Mapping[str, float]) -> Any:
+        """Read what the map holds of a cell, at the values of its further axes that are nearest to those shown."""
+        column, row = pick
+        variable = self.dataset[name]
+        place = {self.x.name: column, self.y.name: row} | self.slices(values)
+        return variable.isel({dim: index for dim, index in place.items() if dim in variable.dims}).values[()]
+
+    def slices(self, values: Mapping[str, float]) -> dict[str, int]:
+        """Find which value of each further axis is shown."""
+        return {name: int(np.abs(axis - values.get(name, axis[0])).argmin()) for name, axis in self.further.items()}
+
+    def sliced(self, values: Mapping[str, float]) -> "xr.Dataset":
+        """Cut out the part of the map that is shown."""
+        return self.dataset.isel(self.slices(values))
+
+    def differs(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Name the values that are none of this map's."""
+        held = {name: axis.tolist() for name, axis in self.further.items()}
+        held |= {name: [value] for name, value in self.fixed.items()}
+        started = ("u0", "v0")
+        return tuple(name for name, value in values.items() if name not in started and value not in held.get(name, []))
+
+
+@door
+def explored(dataset: "xr.Dataset") -> ExploredPlane:
+    """Take a map to be looked into.
+
+    Args:
+        dataset: What `sweep` returned, over two axes at least, by the exact method until attractors.
+
+    Raises:
+        ValueError: What must hold of it, what came, what to do.
+    """
+    checks.variables("dataset", dataset, ("status",), "vijax.sweep")
+    along = [str(dim) for dim in dataset.dims if dim in AXES and dataset.sizes[dim] > 1]
+    single = [dim for dim in dataset.dims if dim not in along]
+    if any(dim not in AXES for dim in single):
+        raise ValueError(f"dataset must be a map that vijax.sweep made; got one over {checks.joined(map(str, single))}")
+    if len(along) < 2:
+        got = checks.joined(along) or "none"
+        raise ValueError(f"dataset must have two axes of more than one value; got {got}; plots draw what has fewer")
+    for name, needed in (("method", "exact"), ("until", "attractor")):
+        if (got := dataset.attrs.get(name, needed)) != needed:
+            raise ValueError(
+                f"dataset must be made with {name}={needed!r}, as the page runs its cells; got {got!r}; make it anew"
+            )
+    dataset = dataset.squeeze([str(dim) for dim in single]).sortby(along[:2])
+    x, y = (_axis(dataset, name) for name in along[:2])
+    shown = [str(name) for name in dataset.data_vars if {x.name, y.name} & set(map(str, dataset[name].dims))]
+    labelled = ("label",) if set(LABEL_NEEDS) <= set(map(str, dataset.data_vars)) else ()
+    return ExploredPlane(
+        dataset=dataset,
+        x=x,
+        y=y,
+        further={name: np.asarray(dataset[name].values, float) for name in along[2:]},
+        fixed=_fixed(dataset, along),
+        device=_device(dataset),
+        wall=str(dataset.attrs.get("wall", "soft")),
+        periods=int(dataset.attrs.get("periods", 400)),
+        variables=(*sorted(shown, key=lambda name: name != "P"), *labelled),
+    )
+
+
+def _axis(dataset: "xr.Dataset", name: str) -> Axis:
+    values = np.asarray(dataset[name].values, float)
+    around, scale = edges(values)
+    steps = np.diff(np.log(values) if scale == "log" else values)
+    return Axis(name, values, around, scale, bool(np.ptp(steps) < 1e-6 * max(abs(steps).max(), 1e-300) * values.size))
+
+
+def _device(dataset: "xr.Dataset") -> Harvester:
+    """Read the constants of the device that no axis stands for."""
+    told = {name: float(dataset.attrs[f"harvester_{name}"]) for name in _TOLD if f"harvester_{name}" in dataset.attrs}
+    # The limit is told as a number even where it is the radius of the membrane, as a device says by None.
+    if told.get("penetration_limit") == told.get("R0", Harvester().R0):
+        told.pop("penetration_limit", None)
+    return Harvester(**told)
+
+
+def _fixed(dataset: "xr.Dataset", along: list[str]) -> dict[str, float]:
+    """Find what the map holds fixed: as d, kappa and gamma or, where these vary with omega or A, as s, omega0, beta."""
+
+    def first(name: str) -> float:
+        return float(dataset[name].values.flat[0])
+
+    omega, amplitude = first("omega"), first("A")
+    inner = {
+        "d": ("s", lambda: first("d") * amplitude * (math.pi / omega) ** 2),
+        "kappa": ("omega0", lambda: first("kappa") * omega / math.pi),
+        "gamma": ("beta", lambda: math.asin(first("gamma") * amplitude / float(_device(dataset).g))),
+    }
+    found = {}
+    for name, (constant, value) in inner.items():
+        if set(synonyms(name)) & set(along):
+            continue
+        if dataset[name].ndim == 0:
+            found[name] = first(name)
+        else:
+            found[constant] = value()
+    found |= {name: first(name) for name in ("r", "omega", "A") if name not in along}
+    starts = {name: dataset[name] for name in ("u0", "v0") if name not in along and dataset[name].ndim == 0}
+    usual = {"u0": min(START[0], START_REACH * found["d"]) if "d" in found else None, "v0": START[1]}
+    return found | {name: float(start) for name, start in starts.items() if float(start) != usual[name]}
+
+
+@dataclass(frozen=True)
+class ExploredCell:
+    """One cell of a map, or beside it: what its motion depends on.
+
+    Attributes:
+        pair, device: The nondimensional cell, and the device that has it.
+        u0, v0: Where its motion begins.
+        arguments: Of `sweep`, by which it is run.
+        settings: Further arguments of `sweep`, where they are not its defaults.
+    """
+
+    pair: ImpactPair
+    device: Harvester
+    u0: float
+    v0: float
+    arguments: dict[str, Any]
+    settings: dict[str, Any]
+
+
+def cell(plane: ExploredPlane, pick: tuple[int, int], values: Mapping[str, float]) -> ExploredCell:
+    """Find what a picked cell is, with values of sliders in place of the map's.
+
+    Raises:
+        ValueError: Values that no cell can have.
+    """
+    arguments = plane.arguments(pick, values)
+    found = {name: float(value.values) for name, value in cells(arguments, plane.device, plane.wall).quantities.items()}
+    rigid = plane.wall == "rigid"
+    pair = impact_pair(found["d"], None if rigid else found["kappa"], found["r"], found["gamma"])
+    moved = with_constants(
+        plane.device, A=found["A"], omega=found["omega"], omega0=found["kappa"] * found["omega"] / math.pi
+    )
+    return ExploredCell(pair, with_pair(moved, pair), found["u0"], found["v0"], arguments, plane.settings())

@@ -1,0 +1,168 @@
+"""The command and the Python lines that reproduce a panel, to copy."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from vijax.explorer import basin, branch, line, motion, optimum
+from vijax.explorer.motion import CellMotion
+from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
+from vijax.model.device import Harvester
+from vijax.planes.sweep_settings import SPEED
+
+# Axes that need not be told where they are the device's own.
+_USUAL = {"r": 0.5, "gamma": 0.0, "omega": math.pi, "A": 1.0}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a panel is had again.
+
+    Attributes:
+        command: A line for a shell; "" where the command has no such page.
+        python: Lines of Python.
+    """
+
+    command: str
+    python: str
+
+
+def told(arguments: Mapping[str, float]) -> dict[str, float]:
+    """Leave out what a device has unless it is told otherwise."""
+    return {name: value for name, value in arguments.items() if value != _USUAL.get(name)}
+
+
+def _constants(cell: ExploredCell) -> dict[str, float]:
+    """Name the constants that differ from those of Tables I and II, other than those that axes stand for."""
+    usual = Harvester()
+    names = ("m_b", "g", "w0", "R0", "eps_M", "C_T", "V", "r_b")
+    found = {name: float(getattr(cell.device, name)) for name in names}
+    if cell.device.penetration_limit is not None:
+        found["penetration_limit"] = float(cell.device.penetration_limit)
+    return {name: value for name, value in found.items() if value != getattr(usual, name, None)}
+
+
+def _options(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
+    words = [
+        f"--{name}={value!r}" if value < 0 else f"--{name} {value!r}"
+        for name, value in told(cell.arguments).items()
+        if name not in without
+    ]
+    words += [f"--{name} {value}" for name, value in cell.settings.items()]
+    words += [f"--set {name}={value!r}" for name, value in _constants(cell).items()]
+    return " ".join(words)
+
+
+def _arguments(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
+    given: dict[str, Any] = {name: value for name, value in told(cell.arguments).items() if name not in without}
+    parts = [f"{name}={value!r}" for name, value in (given | cell.settings).items() if name not in without]
+    if constants := _constants(cell):
+        named = ", ".join(f"{name}={value!r}" for name, value in constants.items())
+        parts.append(f"device=vijax.Harvester({named})")
+    return ", ".join(parts)
+
+
+def of_motion(cell: ExploredCell, found: CellMotion) -> Recipe:
+    """Say how a motion, its label, P and multipliers are had."""
+    pair = cell.pair
+    kappa = None if pair.kappa is None else float(pair.kappa)
+    lines = [
+        "import vijax",
+        f"found = vijax.sweep({_arguments(cell)})",
+        f"pair = vijax.impact_pair({float(pair.d)!r}, {kappa!r}, {float(pair.r)!r}, {float(pair.gamma)!r})",
+        f"path = vijax.trajectory(pair, {cell.u0!r}, {cell.v0!r}, periods={motion.SETTLE})",
+    ]
+    if found.orbit is not None:
+        period = int(found.numbers["period"])
+        lines.append(f"orbit = vijax.orbits_from_states(pair, path.states.u[-1], path.states.v[-1], period={period})")
+        lines.append("vijax.orbit_labels(orbit), orbit.multipliers")
+    return Recipe(f"vijax sweep {_options(cell)}", "\n".join(lines))
+
+
+def of_line(cell: ExploredCell, axis: Axis) -> Recipe:
+    """Say how a line through a cell is had."""
+    low, high, count = float(axis.values[0]), float(axis.values[-1]), line.POINTS
+    log, space = (":log", "geomspace") if axis.scale == "log" else ("", "linspace")
+    others = (axis.name, "periods")
+    settings = f"direction='both', periods={line.PERIODS}, recorded_periods={line.RECORDED}"
+    return Recipe(
+        f"vijax orbit-diagram --along {axis.name}={low!r}:{high!r}:{count}{log} --direction both "
+        f"--periods {line.PERIODS} --recorded-periods {line.RECORDED} {_options_of(cell, others)}",
+        "import numpy as np\nimport vijax\n"
+        f"vijax.orbit_diagram(along={axis.name!r}, values=np.{space}({low!r}, {high!r}, {count}), {settings}, "
+        f"{_arguments(cell, others)})",
+    )
+
+
+def _options_of(cell: ExploredCell, without: tuple[str, ...]) -> str:
+    """Write the options of a cell without some, settings among them."""
+    kept = {name: value for name, value in cell.settings.items() if name not in without}
+    return _options(ExploredCell(cell.pair, cell.device, cell.u0, cell.v0, cell.arguments, kept), without)
+
+
+def of_basin(cell: ExploredCell) -> Recipe:
+    """Say how the basins of a cell are had."""
+    starts = ("u0", "v0")
+    return Recipe(
+        f"vijax basins {_options(cell, starts)} --v0=-{SPEED!r}:{SPEED!r}:{basin.SIDE}",
+        "import numpy as np\nimport vijax\n"
+        f"vijax.basins(v0=np.linspace(-{SPEED!r}, {SPEED!r}, {basin.SIDE}), {_arguments(cell, starts)})",
+    )
+
+
+def of_branch(cell: ExploredCell, found: CellMotion, axis: Axis) -> Recipe:
+    """Say how the branch through a cell is had; its lines go on from those of the motion."""
+    low, high = float(axis.values[0]), float(axis.values[-1])
+    device = (
+        f"device = vijax.Harvester(A={float(cell.device.A)!r}, omega={float(cell.device.omega)!r}, "
+        f"omega0={float(cell.device.omega0)!r})\n"
+    )
+    more = (
+        f"{device}branches = vijax.follow_families(orbit, {axis.name!r}, ({low!r}, {high!r}), device=device, "
+        f"max_switches={branch.MOST_SWITCHES}, points={branch.MOST_POINTS}, "
+        f"settings=vijax.ContinuationSettings(max_grazings={branch.MOST_GRAZINGS}))"
+    )
+    return Recipe("", f"{of_motion(cell, found).python}\n{more}")
+
+
+def of_optimum(cell: ExploredCell, axis: Axis) -> Recipe:
+    """Say how the optima near a cell are had."""
+    low, high = float(axis.values[0]), float(axis.values[-1])
+    device = cell.device
+    names = ("s", "omega0", "r", "A", "omega", "beta")
+    constants = {name: float(getattr(device, name)) for name in names} | _constants(cell)
+    named = ", ".join(f"{name}={value!r}" for name, value in constants.items())
+    effort = ", ".join(f"{name}={value!r}" for name, value in optimum.EFFORT.items())
+    options = " ".join(
+        f"--{name} {value!r}" if name in names else f"--set {name}={value!r}" for name, value in constants.items()
+    )
+    words = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in optimum.EFFORT.items())
+    return Recipe(
+        f"vijax design {options} --tune {axis.name} --bounds {axis.name}={low!r}:{high!r} {words}",
+        f"import vijax\nvijax.optimise(vijax.Harvester({named}), tune={axis.name!r}, "
+        f"bounds={{{axis.name!r}: ({low!r}, {high!r})}}, {effort})",
+    )
+
+
+def of_plane(plane: ExploredPlane, cell: ExploredCell) -> Recipe:
+    """Say how the plane with the values of the sliders is made."""
+    axes = (plane.x.name, plane.y.name)
+    spans = {}
+    for axis in (plane.x, plane.y):
+        if not axis.even:
+            return Recipe("", f"import vijax\n# {axis.name} is not evenly spaced: its values are those of the store")
+        log = ":log" if axis.scale == "log" else ""
+        spans[axis.name] = f"{float(axis.values[0])!r}:{float(axis.values[-1])!r}:{axis.values.size}{log}"
+    options = " ".join(f"--{name} {span}" for name, span in spans.items())
+    spaces = {
+        axis.name: f"np.{'geomspace' if axis.scale == 'log' else 'linspace'}"
+        f"({float(axis.values[0])!r}, {float(axis.values[-1])!r}, {axis.values.size})"
+        for axis in (plane.x, plane.y)
+    }
+    arrays = ", ".join(f"{name}={text}" for name, text in spaces.items())
+    rest = _arguments(cell, axes)
+    return Recipe(
+        f"vijax sweep {options} {_options(cell, axes)} --out plane.zarr".replace("  ", " "),
+        f"import numpy as np\nimport vijax\nvijax.sweep({arrays}{', ' + rest if rest else ''})",
+    )

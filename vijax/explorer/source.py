@@ -1,0 +1,56 @@
+"""Where the map of a page comes from: a dataset, or a store that may be growing, damaged, or gone."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vijax.explorer.plane import ExploredPlane, explored
+from vijax.planes import inventory
+from vijax.planes.store import load
+from vijax.planes.sweep import sweep
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Source:
+    """A map, read again when its files have changed.
+
+    `name` says what it is in a few words.
+
+    Args:
+        given: A dataset, the path of a store, or None for a small plane that is made when it is first read.
+    """
+
+    def __init__(self, given: "xr.Dataset | str | Path | None") -> None:
+        self.path = Path(given) if isinstance(given, str | Path) else None
+        self._dataset: xr.Dataset | None = None if isinstance(given, str | Path) else given
+        self.name = self.path.name if self.path else "the default plane" if given is None else "a dataset"
+        self._read: tuple[tuple[int, int], ExploredPlane] | None = None
+
+    def stamp(self) -> tuple[int, int]:
+        """Tell a state of the store from any other: how many tiles are done, and when a file of it was last written."""
+        if self.path is None:
+            return 0, 0
+        records = [file for file in (self.path / inventory.TILES).glob("[0-9]*.json")]
+        files = [*records, self.path / "zarr.json", self.path / inventory.LIST]
+        return len(records), max((file.stat().st_mtime_ns for file in files if file.exists()), default=0)
+
+    def plane(self) -> ExploredPlane:
+        """Read the map, or give what was read if nothing has changed since.
+
+        Raises:
+            ValueError, OSError: What is wrong with it.
+        """
+        stamp = self.stamp()
+        if self._read is None or self._read[0] != stamp:
+            self._read = stamp, explored(self._found())
+        return self._read[1]
+
+    def _found(self) -> "xr.Dataset":
+        if self.path is not None:
+            return load(self.path)
+        if self._dataset is None:
+            self._dataset = sweep(d=np.linspace(0.05, 0.3, 64), kappa=np.geomspace(3.0, 400.0, 64))
+        return self._dataset
