@@ -362,12 +362,12 @@ def test_basin_map_lists_its_attractors():
     (mesh,) = figure.axes[0].collections
     colours = mesh.cmap(mesh.norm(mesh.get_array()))
     assert [tuple(colours[0, column]) for column in (0, 4, 7)] == list(shown.values())
-    assert shown[chaos] == to_rgba(kind_maps._NO_ORBIT["aperiodic"])
+    assert shown[chaos] == to_rgba(kind_maps.NO_ORBIT["aperiodic"])
     assert figure.axes[0].get_xlabel() == "$u0$"
 
 
 def test_more_attractors_than_colours_are_others():
-    many, most = 40, kind_maps._MOST_NAMED
+    many, most = 40, kind_maps.MOST_NAMED
     found = basin_table().isel(attractor=np.zeros(many, int))
     found["fraction"] = ("attractor", np.full(many, 1 / many))
     found["basin"] = (("u0", "v0"), np.arange(80).reshape(8, 10) % many)
