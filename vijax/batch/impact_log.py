@@ -21,8 +21,6 @@ from vijax.runtime.programs import jitted
 # No result depends on these: how many balls fly together, how many at phase 0 are found together, and after how many
 # impacts of each those that have arrived make room. Fewer are more calls, more are more rows that nobody needs.
 _TILE, _STROBES, _STEPS = 256, 4096, 16
-# So many balls at most take the careful step alone, which costs less than to compile another.
-_FEW = _TILE
 
 
 class Record(NamedTuple):
@@ -66,7 +64,8 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     pair, starts = jax.tree.map(np.asarray, (pair, starts))
     count = starts.u.size
     live, states = np.flatnonzero(wanted), jax.tree.map(lambda x: x[wanted], starts)
-    many = ground_of(pair.gamma) if live.size > _FEW else None
+    # A single call of balls takes the careful step alone, which costs less than to compile another.
+    many = ground_of(pair.gamma) if live.size > _TILE else None
     balls: list[np.ndarray] = [np.zeros(0, int)]
     parts: list[_Step] = []
 

@@ -74,7 +74,7 @@ def disagreement(plane: ExploredPlane, view_values: dict[str, float], pick: tupl
     return "" if kept == found.name else f"the store has {kept} here: it was made by another version or precision"
 
 
-def basin_rows(found: CellBasin, colours: tuple[str, ...]) -> Rows:
+def basin_rows(found: CellBasin, colours: list[str]) -> Rows:
     """List the attractors of a cell; the first column is their colour."""
     rows = [["", "attractor", "share", "P [J]"]]
     listed = zip(colours, found.labels, found.fractions, found.powers, strict=True)

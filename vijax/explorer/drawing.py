@@ -84,11 +84,11 @@ class Drawing:
         """Draw the impacts of the picks that were dragged along."""
         self.tables.visited.data = _points(points)
 
-    def basin(self, found: CellBasin | None) -> tuple[str, ...]:
+    def basin(self, found: CellBasin | None) -> list[str]:
         """Draw basins, and give the colours of the attractors."""
         if found is None:
             self.tables.basin.data = {name: [] for name in ("image", "x", "y", "dw", "dh")}
-            return ()
+            return []
         colours = attractor_colours(found.labels)
         shades = np.array([[*bytes.fromhex(colour[1:]), 255] for colour in colours], np.uint8)
         image = shades[found.place].view(np.uint32)[..., 0]

@@ -68,9 +68,10 @@ class ExplorerPage:
         self.exports: dict[str, Any] = {}
         self._trail: list[tuple[float, float]] = []
         self._made = False
-        self._opened: set[str] = set()  # panels of the picked cell that hold or compute something
-        self._wait: Any = None  # for the line
-        self._pending = shown.panels  # to be computed once the first motion is there
+        # Panels of the picked cell that hold or compute something; and those of the address, which wait for a motion.
+        self._opened: set[str] = set()
+        self._pending = shown.panels
+        self._wait: Any = None  # The timer after which the line is computed.
         self._stamp = source.stamp()
         self.channel.on_change("asked", lambda attribute, old, new: self.heard(new))
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vijax.model.device import Harvester, with_constants, with_pair
+from vijax.model.device import Harvester, told_device, with_constants, with_pair
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.quantities import AXES, START, START_REACH, synonyms
 from vijax.planes.axes import cells
+from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots.cells import edges
 from vijax.plots.style import LABEL_NEEDS
 from vijax.runtime import checks
@@ -18,9 +19,6 @@ from vijax.runtime.context import door
 
 if TYPE_CHECKING:
     import xarray as xr
-
-# Constants of the device that a map has among its attributes.
-_TOLD = ("m_b", "g", "w0", "R0", "eps_M", "C_T", "V", "r_b", "penetration_limit")
 
 
 @dataclass(frozen=True)
@@ -91,12 +89,8 @@ class ExploredPlane:
 
     def settings(self) -> dict[str, Any]:
         """Give the arguments of `sweep` that say how the map was run, where they are not its defaults."""
-        told: dict[str, Any] = {}
-        if self.wall != "soft":
-            told["wall"] = self.wall
-        if self.periods != 400:
-            told["periods"] = self.periods
-        return told
+        ran = {"wall": self.wall, "periods": self.periods}
+        return {name: value for name, value in ran.items() if value != getattr(SweepSettings, name)}
 
     def stored(self, name: str, pick: tuple[int, int], values: Mapping[str, float]) -> Any:
         """Read what the map holds of a cell, at the values of its further axes that are nearest to those shown."""
@@ -154,9 +148,9 @@ def explored(dataset: "xr.Dataset") -> ExploredPlane:
         y=y,
         further={name: np.asarray(dataset[name].values, float) for name in along[2:]},
         fixed=_fixed(dataset, along),
-        device=_device(dataset),
-        wall=str(dataset.attrs.get("wall", "soft")),
-        periods=int(dataset.attrs.get("periods", 400)),
+        device=told_device(dataset.attrs),
+        wall=str(dataset.attrs.get("wall", SweepSettings.wall)),
+        periods=int(dataset.attrs.get("periods", SweepSettings.periods)),
         variables=(*sorted(shown, key=lambda name: name != "P"), *labelled),
     )
 
@@ -168,35 +162,26 @@ def _axis(dataset: "xr.Dataset", name: str) -> Axis:
     return Axis(name, values, around, scale, bool(np.ptp(steps) < 1e-6 * max(abs(steps).max(), 1e-300) * values.size))
 
 
-def _device(dataset: "xr.Dataset") -> Harvester:
-    """Read the constants of the device that no axis stands for."""
-    told = {name: float(dataset.attrs[f"harvester_{name}"]) for name in _TOLD if f"harvester_{name}" in dataset.attrs}
-    # The limit is told as a number even where it is the radius of the membrane, as a device says by None.
-    if told.get("penetration_limit") == told.get("R0", Harvester().R0):
-        told.pop("penetration_limit", None)
-    return Harvester(**told)
-
-
 def _fixed(dataset: "xr.Dataset", along: list[str]) -> dict[str, float]:
     """Find what the map holds fixed: as d, kappa and gamma or, where these vary with omega or A, as s, omega0, beta."""
 
     def first(name: str) -> float:
         return float(dataset[name].values.flat[0])
 
-    omega, amplitude = first("omega"), first("A")
-    inner = {
-        "d": ("s", lambda: first("d") * amplitude * (math.pi / omega) ** 2),
-        "kappa": ("omega0", lambda: first("kappa") * omega / math.pi),
-        "gamma": ("beta", lambda: math.asin(first("gamma") * amplitude / float(_device(dataset).g))),
-    }
+    # Read where it is needed: no inclination gives some gamma of a plane.
+    def device() -> Harvester:
+        given = with_constants(told_device(dataset.attrs), A=first("A"), omega=first("omega"))
+        return with_pair(given, impact_pair(*(first(name) for name in ("d", "kappa", "r", "gamma"))))
+
+    inner = {"d": "s", "kappa": "omega0", "gamma": "beta"}
     found = {}
-    for name, (constant, value) in inner.items():
+    for name, constant in inner.items():
         if set(synonyms(name)) & set(along):
             continue
         if dataset[name].ndim == 0:
             found[name] = first(name)
         else:
-            found[constant] = value()
+            found[constant] = float(getattr(device(), constant))
     found |= {name: first(name) for name in ("r", "omega", "A") if name not in along}
     starts = {name: dataset[name] for name in ("u0", "v0") if name not in along and dataset[name].ndim == 0}
     usual = {"u0": min(START[0], START_REACH * found["d"]) if "d" in found else None, "v0": START[1]}

@@ -1,6 +1,5 @@
 """The command and the Python lines that reproduce a panel, to copy."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,11 +7,13 @@ from typing import Any
 from vijax.explorer import basin, branch, line, motion, optimum
 from vijax.explorer.motion import CellMotion
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
-from vijax.model.device import Harvester
+from vijax.model.device import CONSTANTS, Harvester
+from vijax.model.quantities import AXES
 from vijax.planes.sweep_settings import SPEED
 
+_DEVICE = Harvester()
 # Axes that need not be told where they are the device's own.
-_USUAL = {"r": 0.5, "gamma": 0.0, "omega": math.pi, "A": 1.0}
+_USUAL = {"gamma": 0.0} | {name: float(getattr(_DEVICE, name)) for name in ("r", "omega", "A")}
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,15 @@ def told(arguments: Mapping[str, float]) -> dict[str, float]:
 
 def _constants(cell: ExploredCell) -> dict[str, float]:
     """Name the constants that differ from those of Tables I and II, other than those that axes stand for."""
-    usual = Harvester()
-    names = ("m_b", "g", "w0", "R0", "eps_M", "C_T", "V", "r_b")
-    found = {name: float(getattr(cell.device, name)) for name in names}
+    found = {name: float(getattr(cell.device, name)) for name in CONSTANTS if name not in AXES}
     if cell.device.penetration_limit is not None:
         found["penetration_limit"] = float(cell.device.penetration_limit)
-    return {name: value for name, value in found.items() if value != getattr(usual, name, None)}
+    return {name: value for name, value in found.items() if value != getattr(_DEVICE, name)}
+
+
+def _named(arguments: Mapping[str, Any]) -> str:
+    """Write named arguments of a call."""
+    return ", ".join(f"{name}={value!r}" for name, value in arguments.items())
 
 
 def _options(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
@@ -58,8 +62,7 @@ def _arguments(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
     given: dict[str, Any] = {name: value for name, value in told(cell.arguments).items() if name not in without}
     parts = [f"{name}={value!r}" for name, value in (given | cell.settings).items() if name not in without]
     if constants := _constants(cell):
-        named = ", ".join(f"{name}={value!r}" for name, value in constants.items())
-        parts.append(f"device=vijax.Harvester({named})")
+        parts.append(f"device=vijax.Harvester({_named(constants)})")
     return ", ".join(parts)
 
 
@@ -114,12 +117,10 @@ def of_basin(cell: ExploredCell) -> Recipe:
 def of_branch(cell: ExploredCell, found: CellMotion, axis: Axis) -> Recipe:
     """Say how the branch through a cell is had; its lines go on from those of the motion."""
     low, high = float(axis.values[0]), float(axis.values[-1])
-    device = (
-        f"device = vijax.Harvester(A={float(cell.device.A)!r}, omega={float(cell.device.omega)!r}, "
-        f"omega0={float(cell.device.omega0)!r})\n"
-    )
+    constants = {name: float(getattr(cell.device, name)) for name in ("A", "omega", "omega0")} | _constants(cell)
     more = (
-        f"{device}branches = vijax.follow_families(orbit, {axis.name!r}, ({low!r}, {high!r}), device=device, "
+        f"device = vijax.Harvester({_named(constants)})\n"
+        f"branches = vijax.follow_families(orbit, {axis.name!r}, ({low!r}, {high!r}), device=device, "
         f"max_switches={branch.MOST_SWITCHES}, points={branch.MOST_POINTS}, "
         f"settings=vijax.ContinuationSettings(max_grazings={branch.MOST_GRAZINGS}))"
     )
@@ -132,16 +133,14 @@ def of_optimum(cell: ExploredCell, axis: Axis) -> Recipe:
     device = cell.device
     names = ("s", "omega0", "r", "A", "omega", "beta")
     constants = {name: float(getattr(device, name)) for name in names} | _constants(cell)
-    named = ", ".join(f"{name}={value!r}" for name, value in constants.items())
-    effort = ", ".join(f"{name}={value!r}" for name, value in optimum.EFFORT.items())
     options = " ".join(
         f"--{name} {value!r}" if name in names else f"--set {name}={value!r}" for name, value in constants.items()
     )
     words = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in optimum.EFFORT.items())
     return Recipe(
         f"vijax design {options} --tune {axis.name} --bounds {axis.name}={low!r}:{high!r} {words}",
-        f"import vijax\nvijax.optimise(vijax.Harvester({named}), tune={axis.name!r}, "
-        f"bounds={{{axis.name!r}: ({low!r}, {high!r})}}, {effort})",
+        f"import vijax\nvijax.optimise(vijax.Harvester({_named(constants)}), tune={axis.name!r}, "
+        f"bounds={{{axis.name!r}: ({low!r}, {high!r})}}, {_named(optimum.EFFORT)})",
     )
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlencode
 
-import numpy as np
-
 from vijax.explorer.plane import ExploredPlane
 from vijax.model.quantities import AXES
 from vijax.planes.dataset import best
@@ -18,7 +16,8 @@ PANELS = ("basin", "branch", "optimum")
 """What is computed on demand, and opened again by the address of a view."""
 
 _KNOWN = ("variable", "scale", "cell", "along", "open", "follow", "token")
-_MOST_SPEED, _MOST_TILT = 1.5, 0.35  # of a start, in units of A pi/omega; of an inclination [rad]
+# Speed of a start in units of A pi/omega, and inclination in radians, up to which sliders go.
+_MOST_SPEED, _MOST_TILT = 1.5, 0.35
 
 
 @dataclass(frozen=True)
@@ -134,8 +133,3 @@ def _pick(plane: ExploredPlane, text: str) -> tuple[int, int]:
     if not (0 <= column < columns and 0 <= row < rows):
         raise ValueError(f"cell must be column,row of a map of {columns} x {rows} cells; got {checks.shown(text)}")
     return column, row
-
-
-def log_colours(view: View, positive: np.ndarray) -> bool | None:
-    """Say whether colours are logarithmic; None where the values decide."""
-    return None if view.scale == "auto" else view.scale == "log" and bool(positive.any())

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -123,6 +124,16 @@ class Harvester(eqx.Module):
 
 CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field.name != "penetration_limit")
 """Constants of the device; the penetration limit is none, but a choice of who builds it."""
+
+
+def told_device(attributes: Mapping[Any, Any]) -> Harvester:
+    """Read the device that a map's attributes tell; what they do not tell, as its axes, is that of Tables I and II."""
+    names = (*CONSTANTS, "penetration_limit")
+    told = {name: float(attributes[f"harvester_{name}"]) for name in names if f"harvester_{name}" in attributes}
+    # The limit is told as a number even where it is the radius of the membrane, as a device says by None.
+    if told.get("penetration_limit") == told.get("R0"):
+        told.pop("penetration_limit", None)
+    return Harvester(**told)
 
 
 @door

@@ -1,13 +1,13 @@
 """Borders between differently labelled cells of a map, and which of them lie at a curve."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vijax.model.device import Harvester, with_constants
+from vijax.model.device import Harvester, told_device, with_constants
 from vijax.model.label import label
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import PARAMETERS
@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _PAIR = ("d", "kappa", "r", "gamma")
-# Constants of the device that a map has among its attributes, and those that it has as coordinates.
-_TOLD = ("m_b", "g", "w0", "R0", "eps_M", "C_T", "V", "r_b", "penetration_limit")
+# Constants of the device that a map has as coordinates.
 _MOVED = ("A", "omega", "kappa", "s", "r", "beta")
 _NEEDED = ("period", "impacts_left", "impacts_right", "status")
 
@@ -52,9 +51,8 @@ class LabelledPlane:
 
 def device_of(dataset: "xr.Dataset") -> Harvester:
     """Read the device of a map, as far as the map says; along its axes it is that of the first cell."""
-    told = {name: dataset.attrs[f"harvester_{name}"] for name in _TOLD if f"harvester_{name}" in dataset.attrs}
     first = {name: float(dataset[name].values.flat[0]) for name in _MOVED if name in dataset.coords}
-    device = Harvester(**told | {name: first[name] for name in first if name != "kappa"})
+    device = replace(told_device(dataset.attrs), **{name: first[name] for name in first if name != "kappa"})
     if "kappa" in first:
         device = with_constants(device, omega0=first["kappa"] * device.omega / math.pi)
     return device

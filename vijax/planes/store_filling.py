@@ -22,7 +22,7 @@ def compile_ahead(planned: SweepPlan) -> None:
     """Begin to compile what the tiles of a new store need: XLA needs no Python, and importing zarr a core."""
     most = math.prod(tiled_store.blocks(planned.cells).values())
     whole = Call(planned, np.arange(min(most, planned.count)), dispatch.rows_for(most), 0)
-    context.pool(1).submit(dispatch.prepare, whole, places()[0])
+    context.beside(dispatch.prepare, whole, places()[0])
 
 
 def fill(plane: tiled_store.Study, tell: Callable[[int, int], None], workers: cluster.Workers | None) -> None:

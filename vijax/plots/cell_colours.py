@@ -1,24 +1,22 @@
 """A map as colours of its cells, marks and a legend, in numbers: what a screen draws that is not matplotlib's."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.colors import LogNorm, Normalize, to_hex, to_rgba_array
+from matplotlib.colors import LogNorm, Normalize, to_hex, to_rgba, to_rgba_array
 
 from vijax.model.records import Status
 from vijax.planes.dataset import best
-from vijax.plots.cells import borders, edges, marked_places
-from vijax.plots.kind_maps import COLOURS, MOST_NAMED, NO_ORBIT, OTHERS, Category, of_flags, of_labels
+from vijax.plots.cells import BARE, borders, edges, marked_places
+from vijax.plots.kind_maps import Category, of_flags, of_labels, table_colours
 from vijax.plots.number_maps import POWER, Mark, has_colour, kind_of
 from vijax.plots.style import NEEDS, is_kind
 
 if TYPE_CHECKING:
     import xarray as xr
-
-BARE_CELL = (0.75, 0.75, 0.75, 1.0)
-"""Of cells without a value."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ def _of_numbers(dataset: "xr.Dataset", name: str, x: str, y: str, log: bool | No
     values = np.minimum(dataset[name].values.astype(float), np.finfo(float).max)
     shown = has_colour(values, norm) & ~np.isnan(values)
     colours = np.asarray(mpl.colormaps["viridis"](norm(np.where(shown, values, norm.vmin))))
-    colours[~shown] = BARE_CELL
+    colours[~shown] = to_rgba(BARE["color"])
     run = dataset["status"].values != Status.NOT_RUN
     marks = [mark._replace(mask=mark.mask & run) for mark in kind.marks(dataset)]
     found = _marked(marks, dataset, x, y)
@@ -188,7 +186,9 @@ _SIGNS = {"veil": "veil", "border": "border", "most": "dot", "any": "cross", "ba
 
 
 def _entry(mark: Mark) -> LegendEntry:
-    colour = {"veil": "#4d4d4d", "border": "#ffffff", "most": "#000000", "any": "#ff0000"}.get(mark.how, to_hex("0.75"))
+    colour = {"veil": "#4d4d4d", "border": "#ffffff", "most": "#000000", "any": "#ff0000"}.get(
+        mark.how, to_hex(BARE["color"])
+    )
     return LegendEntry(_SIGNS[mark.how], colour, mark.text, int(mark.mask.sum()))
 
 
@@ -196,12 +196,6 @@ def _bytes(colours: np.ndarray) -> np.ndarray:
     return np.round(255 * np.asarray(colours)).astype(np.uint8)
 
 
-def attractor_colours(labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Give the colours of attractors by their place in a table, as `basins` draws them; those beyond are one colour."""
-    strong, found = iter(COLOURS), []
-    for place, word in enumerate(labels):
-        if place >= MOST_NAMED:
-            found.append(to_hex(OTHERS))
-        else:
-            found.append(to_hex(NO_ORBIT[word] if word in NO_ORBIT else next(strong)))
-    return tuple(found)
+def attractor_colours(labels: Sequence[str]) -> list[str]:
+    """Give the colours of attractors by their place in a table, as `basins` draws them."""
+    return [to_hex(colour) for colour in table_colours(labels)]

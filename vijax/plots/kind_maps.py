@@ -1,5 +1,6 @@
 """Maps coloured by kinds: attractors and their number, basins, flags."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import matplotlib as mpl
@@ -193,15 +194,20 @@ def _named(words: np.ndarray, periods: int) -> tuple[np.ndarray, list[Category]]
     return codes[which].reshape(words.shape), categories
 
 
+def table_colours(labels: Sequence[str]) -> list[Any]:
+    """Give the colours of attractors by their place in a table; those beyond the named ones have one."""
+    strong = iter(COLOURS)
+    named = [NO_ORBIT[word] if word in NO_ORBIT else next(strong) for word in labels[:MOST_NAMED]]
+    return [*named, *[OTHERS] * (len(labels) - len(named))]
+
+
 def _table_categories(panel: "xr.Dataset") -> list[Category]:
     """Name the attractors of one table, the commonest by name."""
     found = panel.isel(attractor=panel["starts"].values > 0)
-    colours = iter(COLOURS)
+    words = [str(word) for word in found["label"].values]
     categories = []
-    for n in range(min(found.sizes["attractor"], MOST_NAMED)):
-        entry = found.isel(attractor=n)
-        word = str(entry["label"].values)
-        colour = NO_ORBIT[word] if word in NO_ORBIT else next(colours)
+    for n, colour in enumerate(table_colours(words)[:MOST_NAMED]):
+        entry, word = found.isel(attractor=n), words[n]
         if word == "aperiodic":
             word += f" within {float(entry['periods_run']):g} periods"
         power = f", $P$ = {EngFormatter('J', places=2)(float(entry['P']))}" if entry["P"] > 0 else ""

@@ -60,6 +60,13 @@ def pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, initializer=lambda: _held().__enter__())
 
 
+def beside(work: Callable[..., Any], *args: Any, **named: Any) -> None:
+    """Begin a piece of work in a thread of its own, under these settings; what it returns, or raises, is dropped."""
+    thread = pool(1)
+    thread.submit(work, *args, **named)
+    thread.shutdown(wait=False)
+
+
 def _held(*given: Any) -> ExitStack:
     """Set the settings that differ from those of the program, which come back at the end."""
     stack = ExitStack()

@@ -80,9 +80,7 @@ def begin(work: Callable[..., Any], *args: Any, **static: Any) -> None:
     key = work, tree, shapes, tuple(static.items())
     if key not in _begun:
         _begun.add(key)
-        elsewhere = context.pool(1)
-        elsewhere.submit(work, *args, **static)
-        elsewhere.shutdown(wait=False)
+        context.beside(work, *args, **static)
 
 
 def _place(work: Callable[..., Any]) -> str | None:
