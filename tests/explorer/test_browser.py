@@ -6,13 +6,16 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import vijax
+from tests.explorer.drawn_curves import FOLD_AT, drawn_curves
 from vijax.model.label import label
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -20,14 +23,15 @@ pytestmark = [
     pytest.mark.browser,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed to look at the page with"),
 ]
-WAIT = 30_000  # milliseconds: a program may be compiled first, on a machine that does other things
+WAIT = 120_000  # milliseconds: a program may be compiled first, on a machine that does other things
 # Mostly 1:1 orbits: each size of orbits that the map has is compiled ahead.
 AXES = {"d": np.linspace(0.2, 0.3, 8), "kappa": np.geomspace(50.0, 400.0, 8)}
 PICK = (6, 5)  # a 1:1 orbit, the same for every test
+ORBITS = "<i>1:1</i>"  # of the curves, as a store may say it that wants to be more than text
 
 
 class ServedStore:
-    """A process that serves a store, as a shell would start it."""
+    """A process that serves a store and the curves beside it, as a shell would start it."""
 
     def __init__(self, store: Path) -> None:
         self.store, self.page, self.port = store, "", 0
@@ -35,7 +39,16 @@ class ServedStore:
 
     def start(self) -> None:
         """Start it, on the port that it had, and wait until it says where its page is."""
-        line = [sys.executable, "-m", "vijax", "explore", str(self.store), "--no-browser", "--port", str(self.port)]
+        line = [
+            sys.executable,
+            "-m",
+            "vijax",
+            "explore",
+            str(self.store),
+            "--curves",
+            str(self.store / "../curves.zarr"),
+        ]
+        line += ["--no-browser", "--port", str(self.port)]
         self.process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         self.page = self.process.stdout.readline().strip()
@@ -54,6 +67,7 @@ def dataset(tmp_path_factory):
     """The map that is served, in its store."""
     folder = tmp_path_factory.mktemp("served")
     vijax.sweep(**AXES, out=folder / "plane.zarr")
+    vijax.save(drawn_curves(ORBITS), folder / "curves.zarr")
     return vijax.load(folder / "plane.zarr").assign_attrs(path=str(folder / "plane.zarr"))
 
 
@@ -242,13 +256,15 @@ def test_pictures_are_saved(one):
 
 
 def test_the_address_restores_the_view(tab, dataset):
-    one = tab("?variable=label&cell=6%2C5&along=d&r=0.6&open=basin").shown()
+    one = tab("?variable=label&cell=6%2C5&along=d&r=0.6&open=basin&curves=unstable").shown()
     assert "1:1" in one.state("basin", "done", "failed")
     assert one.page.input_value("#variable") == "label"
     assert one.page.input_value("#along") == "d"
+    assert one.page.input_value("#curves") == "unstable"
+    assert "grazing" in one.page.inner_text("#curvelegend")
     assert one.page.input_value('[data-name="r"] input[type="number"]') == "0.6"
     assert one.heading() == said_of(dataset, PICK, r=0.6)
-    asked = {"variable": "label", "cell": "6,5", "along": "d", "r": "0.6", "open": "basin"}
+    asked = {"variable": "label", "cell": "6,5", "along": "d", "r": "0.6", "open": "basin", "curves": "unstable"}
     assert one.view() | asked == one.view()
 
 
@@ -256,6 +272,33 @@ def test_what_an_address_cannot_say_is_said_as_text(tab):
     one = tab("?variable=<img src=x onerror=alert(1)>").shown()
     assert "variable must be among" in one.page.inner_text("#note")
     assert one.page.query_selector("#note img") is None
+
+
+def red(one: Tab) -> int:
+    """Count the pixels of the map that have the colour of a fold."""
+    shot = imread(BytesIO(one.page.locator("#map").screenshot()))[..., :3]
+    return int((np.abs(255 * shot - [0xD6, 0x27, 0x28]).max(axis=2) < 12).sum())
+
+
+def test_curves_lie_over_the_map_are_told_and_can_be_hidden(one):
+    one.click((5, 6)).shown()
+    assert f"fold of {ORBITS}" in one.page.inner_text("#rows")
+    assert one.page.inner_text("#curvelegend").split() == ["fold", "1"]
+    there = red(one)
+    assert there > 100
+    left, top = one.place((0, 6))
+    across = AXES["d"][1] - AXES["d"][0]
+    one.page.mouse.move(left + (one.place((1, 6))[0] - left) * (FOLD_AT - AXES["d"][0]) / across, top)
+    one.page.wait_for_selector(f"text=fold of {ORBITS}", timeout=WAIT)
+    one.page.select_option("#curves", "unstable")
+    one.page.wait_for_function("document.getElementById('curvelegend').textContent.includes('grazing')", timeout=WAIT)
+    one.page.select_option("#curves", "hidden")
+    one.page.wait_for_function("location.search.includes('curves=hidden')", timeout=WAIT)
+    one.page.wait_for_function("document.getElementById('curvelegend').children.length === 0", timeout=WAIT)
+    one.page.wait_for_timeout(200)
+    assert red(one) < there / 10
+    one.page.select_option("#curves", "shown")
+    one.page.wait_for_function("!location.search.includes('curves')", timeout=WAIT)
 
 
 def test_two_tabs_do_not_disturb_each_other(one, tab, dataset):

@@ -3,12 +3,14 @@
 import click
 
 from vijax.cli import process
-from vijax.cli.kinds import Whole
+from vijax.cli.kinds import NewFile, Whole
 from vijax.cli.page import Page
 from vijax.explorer.address import MOST_PORT, PORT
 
 
-def explored(store: str | None, address: str, port: int, allow_origin: tuple[str, ...], no_browser: bool) -> None:
+def explored(
+    store: str | None, curves: str | None, address: str, port: int, allow_origin: tuple[str, ...], no_browser: bool
+) -> None:
     """Look into a map in the browser.
 
     A click on a cell shows its motion, the line through it, its basins, its branch and the nearest optimum. STORE is
@@ -23,9 +25,9 @@ def explored(store: str | None, address: str, port: int, allow_origin: tuple[str
         from vijax.runtime import checks
 
         checks.whole("port", port, 0, MOST_PORT)
-        source = Source(store)
-        if store is not None:
-            source.plane()
+        source = Source(store, curves)
+        if store is not None or curves is not None:
+            source.check()
         server, crew, page = serve(source, address, port, allow_origin)
     try:
         run(server, crew, page, not no_browser)
@@ -39,8 +41,13 @@ explore = Page(
     "explore",
     explored,
     {
-        "Server": [
+        "Map": [
             click.Argument(["store"], required=False, metavar="[STORE]"),
+            click.Option(
+                ["--curves"], type=NewFile(), metavar="FILE.zarr", help="curves of its plane, which vijax curves wrote"
+            ),
+        ],
+        "Server": [
             click.Option(["--port"], type=Whole(0), default=PORT, show_default=True, help="0 for any that is free"),
             click.Option(["--address"], default="127.0.0.1", show_default=True, help="that the server binds"),
             click.Option(
@@ -55,6 +62,7 @@ explore = Page(
     examples=[
         "",
         "power_map.zarr",
+        "power_map.zarr --curves curves.zarr",
         "power_map.zarr --no-browser --port 0",
         "power_map.zarr --address 0.0.0.0 --allow-origin lab.example.org:5006",
     ],

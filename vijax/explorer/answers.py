@@ -1,14 +1,18 @@
 """What a page says in words and numbers: of the picked cell, of its attractors, of its branch, of its optima."""
 
+from typing import Any
+
 from vijax.explorer.basin import CellBasin
 from vijax.explorer.branch import CellBranch
 from vijax.explorer.line import CellLine
 from vijax.explorer.motion import MOST_IMPACTS, CellMotion
 from vijax.explorer.optimum import NearOptimum
+from vijax.explorer.overlay import LaidCurves, through
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
 from vijax.explorer.theme import amount, symbol, unit_of
 from vijax.model.label import label
 from vijax.model.records import Status
+from vijax.plots.curve_lines import screen_style
 from vijax.plots.style import LABEL_NEEDS
 
 Rows = list[list[str]]
@@ -46,6 +50,23 @@ def cell_rows(plane: ExploredPlane, cell: ExploredCell, found: CellMotion) -> Ro
     if numbers["P_stderr"] > 0:
         rows[1][1] += f" \u00b1 {amount(numbers['P_stderr'], 'J', 2)}"
     return rows + place
+
+
+def curves_row(found: LaidCurves, plane: ExploredPlane, pick: tuple[int, int]) -> Rows:
+    """Say which curves pass through a cell; nothing where none are drawn."""
+    return [["curves here", ", ".join(through(found, plane, pick)) or "none"]] if found.pieces else []
+
+
+def curves_legend(found: LaidCurves) -> list[list[Any]]:
+    """List the kinds of curves that are drawn: colour, dashes, name and how many."""
+    kinds = [one.kind for one in found.pieces]
+    return [[*screen_style(kind), kind, kinds.count(kind)] for kind in dict.fromkeys(kinds)]
+
+
+def curves_points(found: LaidCurves, plane: ExploredPlane) -> Rows:
+    """List what of codimension 2 the curves meet, by the numbers on the map; nothing where they meet none."""
+    rows = [[str(one.number), one.kind, *(amount(value, "", 6) for value in one.place)] for one in found.points]
+    return [["no.", "codimension 2", symbol(plane.x.name), symbol(plane.y.name)], *rows] if rows else []
 
 
 def _without(found: CellMotion) -> str:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 def explore(
     source: "xr.Dataset | str | Path | None" = None,
     *,
+    curves: "xr.Dataset | str | Path | None" = None,
     address: str = "127.0.0.1",
     port: int = PORT,
     allow_origin: str | tuple[str, ...] = (),
@@ -30,6 +31,7 @@ def explore(
 
     Args:
         source: What `sweep` returned, over two axes at least, or a store of it; a small plane is made unless given.
+        curves: Of bifurcations, which are laid over the map: what `curve_dataset` returned, or a store of it.
         address: That the server binds: this machine alone unless given. Any other needs `allow_origin`, and a token in
             the address of the page.
         port: Of the server; 0 for any that is free.
@@ -38,14 +40,15 @@ def explore(
 
     Raises:
         ModuleNotFoundError: Without bokeh.
-        ValueError, OSError: A map that cannot be looked into, an address without an origin, a port that is taken.
+        ValueError, OSError: A map that cannot be looked into, curves that are not of it, an address without an origin,
+            a port that is taken.
     """
     check_bokeh()
     checks.flag("browser", browser)
     origins = (allow_origin,) if isinstance(allow_origin, str) else tuple(allow_origin)
     port = checks.whole("port", port, 0, MOST_PORT)
-    given = import_module("vijax.explorer.source").Source(source)
-    given.plane()
+    given = import_module("vijax.explorer.source").Source(source, curves)
+    given.check()
     if _in_notebook():
         import_module("vijax.explorer.notebook").show(given, address, port, origins)
         return

@@ -9,9 +9,11 @@ from vijax.explorer.branch import CellBranch
 from vijax.explorer.figures import PageFigures, PageTables, Walls, mapper
 from vijax.explorer.line import CellLine
 from vijax.explorer.motion import CellMotion
+from vijax.explorer.overlay import LaidCurves
 from vijax.explorer.plane import Axis, ExploredPlane
 from vijax.plots.cell_colours import ColouredMap, attractor_colours
 from vijax.plots.cells import runs
+from vijax.plots.curve_lines import FAINT
 
 MOST_PIXELS = 1024
 """Colours of a map along an axis, at most: a larger map is shown by every so many-th cell."""
@@ -39,6 +41,22 @@ class Drawing:
         self.bar.visible = found.span is not None
         if found.span is not None:
             self.bar.color_mapper = mapper(found.span, found.log, found.palette)
+
+    def curves(self, found: LaidCurves) -> None:
+        """Draw curves over the map: those of unstable orbits alone faintly, and without an edge."""
+        of, pieces = self.tables, found.pieces
+        of.curves.data = {
+            "xs": [one.x for one in pieces],
+            "ys": [one.y for one in pieces],
+            "kind": [one.kind for one in pieces],
+            "label": [one.label for one in pieces],
+            "width": [_STRONG if one.stable else _WEAK for one in pieces],
+            "alpha": [1.0 if one.stable else FAINT for one in pieces],
+            "edge": [float(one.stable) for one in pieces],
+        }
+        of.points.data = _points([one.place for one in found.points]) | {
+            "number": [str(one.number) for one in found.points]
+        }
 
     def pick(self, x: float, y: float) -> None:
         """Move the crosshair."""
@@ -121,6 +139,7 @@ class Drawing:
         self.tables.optima.data = _points(places)
 
 
+_STRONG, _WEAK = 1.8, 1.2  # pixels that curves are wide
 _MICRO = 1e6  # energies are drawn in microjoules
 
 
@@ -141,7 +160,7 @@ def _decades(where: Any, values: np.ndarray) -> None:
         where.update(start=float(values.min()) / margin, end=float(values.max()) * margin)
 
 
-def _points(places: list[tuple[float, float]]) -> dict[str, list[float]]:
+def _points(places: list[tuple[float, float]]) -> dict[str, list[Any]]:
     return {"x": [x for x, _ in places], "y": [y for _, y in places]}
 
 

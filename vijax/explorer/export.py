@@ -10,6 +10,7 @@ from vijax.batch.trajectory import trajectory
 from vijax.explorer.motion import CellMotion
 from vijax.explorer.plane import ExploredCell
 from vijax.plots.branch_diagrams import branches
+from vijax.plots.curve_maps import curves
 from vijax.plots.figure import save
 from vijax.plots.kind_maps import basins, label_map
 from vijax.plots.motions import trajectory as motion_figure
@@ -27,7 +28,7 @@ def picture(what: str, found: Any, ending: str) -> str:
 
     Args:
         what: "map", "motion", "line", "basin" or "branch".
-        found: The map and the variable that it shows, the cell and its motion, or what a panel was computed to.
+        found: The map, what it shows and its curves, the cell and its motion, or what a panel was computed to.
         ending: Of `FORMATS`.
 
     Raises:
@@ -48,12 +49,20 @@ def picture(what: str, found: Any, ending: str) -> str:
         return base64.b64encode(file.read_bytes()).decode()
 
 
-def _map(dataset: Any, name: str) -> Any:
+def map_function(dataset: Any, name: str) -> str:
+    """Name the function of `vijax.plots` that draws a variable of a map."""
     if name == "label":
-        return label_map(dataset)
-    if name == "P" and set(NEEDS) <= set(map(str, dataset.data_vars)):
-        return power_map(dataset)
-    return variable_map(dataset, name)
+        return "label_map"
+    return "power_map" if name == "P" and set(NEEDS) <= set(map(str, dataset.data_vars)) else "variable_map"
+
+
+def _map(dataset: Any, name: str, over: Any, unstable: bool) -> Any:
+    if over is not None:
+        return curves(over, dataset, ground=name, unstable=unstable)
+    drawn = map_function(dataset, name)
+    if drawn == "variable_map":
+        return variable_map(dataset, name)
+    return label_map(dataset) if drawn == "label_map" else power_map(dataset)
 
 
 def _motion(cell: ExploredCell, found: CellMotion) -> Any:

@@ -7,8 +7,11 @@ from typing import Any
 from bokeh.models import (
     BasicTicker,
     BasicTickFormatter,
+    CDSView,
     ColumnDataSource,
     FixedTicker,
+    GroupFilter,
+    HoverTool,
     LinearColorMapper,
     LinearScale,
     LogColorMapper,
@@ -21,6 +24,7 @@ from bokeh.plotting import figure
 
 from vijax.explorer.plane import Axis, ExploredPlane
 from vijax.explorer.theme import AXIS, COLOURS, written
+from vijax.plots.curve_lines import screen_style
 
 _LEFT = 66  # pixels left of figures that share their axis of time
 _EMPTY: dict[str, list[Any]] = {"x": [], "y": []}
@@ -52,6 +56,8 @@ class PageTables:
     border: ColumnDataSource
     dots: ColumnDataSource
     crosses: ColumnDataSource
+    curves: ColumnDataSource
+    points: ColumnDataSource
     star: ColumnDataSource
     optima: ColumnDataSource
     pick: ColumnDataSource
@@ -76,6 +82,8 @@ def tables() -> PageTables:
         "cells": ("image", "x", "y", "dw", "dh"),
         "veil": ("left", "right", "bottom", "top"),
         "border": ("x0", "y0", "x1", "y1"),
+        "curves": ("xs", "ys", "kind", "label", "width", "alpha", "edge"),
+        "points": ("x", "y", "number"),
         "basin": ("image", "x", "y", "dw", "dh"),
         "course": ("t", "x", "v"),
         "membranes": ("t", "left", "right"),
@@ -136,9 +144,9 @@ def _line(where: Any, dimension: Any, colour: str, width: float = 1.0, **style: 
     return span
 
 
-def figures(plane: ExploredPlane, of: PageTables) -> tuple[PageFigures, Walls, ColorBar]:
-    """Make the figures of a page, with the lines in them that move."""
-    shown_map, bar = _map(plane, of)
+def figures(plane: ExploredPlane, of: PageTables, kinds: tuple[str, ...] = ()) -> tuple[PageFigures, Walls, ColorBar]:
+    """Make the figures of a page, with the lines in them that move; `kinds` are those of the curves over its map."""
+    shown_map, bar = _map(plane, of, kinds)
     across = Span(dimension="height", line_color="white", line_dash="dotted", level="overlay")
     up = Span(dimension="width", line_color="white", line_dash="dotted", level="overlay")
     shown_map.add_layout(across)
@@ -189,7 +197,7 @@ def ranged(axis: Axis) -> dict[str, Any]:
     return {"start": float(axis.edges[0]), "end": float(axis.edges[-1])}
 
 
-def _map(plane: ExploredPlane, of: PageTables) -> tuple[Any, ColorBar]:
+def _map(plane: ExploredPlane, of: PageTables, kinds: tuple[str, ...]) -> tuple[Any, ColorBar]:
     made = _bare(
         "map",
         x_range=Range1d(**ranged(plane.x)),
@@ -216,6 +224,8 @@ def _map(plane: ExploredPlane, of: PageTables) -> tuple[Any, ColorBar]:
         made.segment("x0", "y0", "x1", "y1", source=of.border, line_color=colour, line_width=width, line_cap="square")
     made.scatter("x", "y", source=of.dots, size=2, color="black")
     made.scatter("x", "y", source=of.crosses, marker="x", size=5, color="red")
+    if kinds:
+        _curves(made, of, kinds)
     made.scatter("x", "y", source=of.star, marker="star", size=15, fill_color="#d62728", line_color="white")
     made.scatter("x", "y", source=of.optima, marker="diamond", size=13, fill_color="#ff7f0e", line_color="white")
     bar = ColorBar(
@@ -228,6 +238,25 @@ def _map(plane: ExploredPlane, of: PageTables) -> tuple[Any, ColorBar]:
     )
     made.add_layout(bar, "right")
     return made, bar
+
+
+def _curves(made: Any, of: PageTables, kinds: tuple[str, ...]) -> None:
+    """Draw curves of bifurcations, a kind at a time, as dashes are of a kind; who points at one is told what it is."""
+    made.multi_line("xs", "ys", source=of.curves, line_color="white", line_width=3.6, line_alpha="edge")
+    lines = []
+    for kind in kinds:
+        colour, dashes = screen_style(kind)
+        style = {"line_color": colour, "line_width": "width", "line_alpha": "alpha"}
+        view = CDSView(filter=GroupFilter(column_name="kind", group=kind))
+        dash = " ".join(str(round(_DASH * part)) for part in dashes) or "solid"
+        lines.append(made.multi_line("xs", "ys", source=of.curves, view=view, line_dash=dash, **style))
+    made.scatter("x", "y", source=of.points, size=6, fill_color="white", line_color="black")
+    words = {"text_font_size": "12px", "text_outline_color": "white", "x_offset": 5, "y_offset": -3}
+    made.text("x", "y", "number", source=of.points, **words)
+    made.add_tools(HoverTool(renderers=lines, tooltips=[("", "@kind of @label")], description="Curves"))
+
+
+_DASH = 1.8  # pixels that a curve is wide
 
 
 def mapper(span: tuple[float, float], log: bool, palette: tuple[str, ...]) -> Any:

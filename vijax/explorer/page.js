@@ -120,6 +120,7 @@ window.vijax = (() => {
       state = told;
       id("variable").value = told.variable;
       id("scale").value = told.scale;
+      id("curves").value = told.curves;
       id("along").value = told.along;
       id("follow").checked = told.follow;
       all(".value").forEach((row) => {
@@ -144,6 +145,28 @@ window.vijax = (() => {
         line.append(mark, make("span", text), make("span", sign === "star" ? "" : count.toLocaleString("en"), "count"));
         return line;
       }));
+    },
+    curves({ text, entries, points }) {
+      hide(id("curvechoice"), false);
+      hide(id("overlay"), false);
+      id("curvenote").textContent = text;
+      hide(id("curvenote"), !text);
+      id("curvelegend").replaceChildren(...entries.map(([colour, dashes, kind, count]) => {
+        const line = make("li"), mark = make("span", undefined, "sign curve");
+        let end = 0;
+        const parts = dashes.map((length, index) => {
+          const begin = end;
+          end += 1.8 * length;
+          return `${index % 2 ? "transparent" : colour} ${begin}px ${end}px`;
+        });
+        mark.style.background = parts.length ? `repeating-linear-gradient(90deg, ${parts.join(", ")})` : colour;
+        line.append(mark, make("span", kind), make("span", count.toLocaleString("en"), "count"));
+        return line;
+      }));
+      const [summary, place] = id("points").children;
+      hide(id("points"), !points.length);
+      summary.textContent = `Points of codimension 2: ${Math.max(points.length - 1, 0)}`;
+      place.replaceChildren(...(points.length ? [table(points)] : []));
     },
     cell({ number: request, heading, rows, note }) {
       id("heading").textContent = heading;
@@ -245,6 +268,7 @@ window.vijax = (() => {
     id("map").addEventListener("pointermove", pointed);
     id("variable").addEventListener("change", colour);
     id("scale").addEventListener("change", colour);
+    id("curves").addEventListener("change", colour);
     id("along").addEventListener("change", () => ask("along", { along: id("along").value }));
     id("follow").addEventListener("change", () => ask("follow", { follow: id("follow").checked, number: ++number }));
     id("make").addEventListener("click", () => ask("make"));
@@ -255,6 +279,6 @@ window.vijax = (() => {
     ["map", "motion"].forEach((name) => files(name, true));
     ask("ready");
   };
-  const colour = () => ask("colour", { variable: id("variable").value, scale: id("scale").value });
+  const colour = () => ask("colour", { variable: id("variable").value, scale: id("scale").value, curves: id("curves").value });
   return { begin, told, lost, get number() { return number; } };
 })();

@@ -14,11 +14,12 @@ from bokeh.core.properties import Dict, String
 from bokeh.document import Document
 from bokeh.model import DataModel
 
-from vijax.explorer import answers, export, recipes, view
+from vijax.explorer import answers, export, overlay, recipes, view
 from vijax.explorer.drawing import Drawing
 from vijax.explorer.figures import figures, ranged, scale, tables
 from vijax.explorer.jobs import Crew, Jobs
 from vijax.explorer.motion import CellMotion, motion
+from vijax.explorer.overlay import LaidCurves
 from vijax.explorer.panels import PANEL_KINDS, PanelRequest
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane, cell, explored
 from vijax.explorer.recipes import Recipe
@@ -62,7 +63,8 @@ class ExplorerPage:
         self.crew, self.jobs = crew, Jobs(crew, document.add_next_tick_callback)
         self.channel = Channel(name="channel")
         made = tables()
-        self.drawing = Drawing(made, *figures(plane, made))
+        self.drawing = Drawing(made, *figures(plane, made, source.curves.kinds if source.curves else ()))
+        self.laid = LaidCurves()
         self.cell: ExploredCell | None = None
         self.motion: CellMotion | None = None
         self.exports: dict[str, Any] = {}
@@ -124,9 +126,8 @@ class ExplorerPage:
         self._run(int(message.get("number", 0)))
 
     def _colour(self, message: dict[str, Any]) -> None:
-        arguments = {"variable": message["variable"], "scale": message["scale"]}
-        asked = view.from_query(self.plane, arguments)
-        self.view = replace(self.view, variable=asked.variable, scale=asked.scale)
+        asked = view.from_query(self.plane, {name: message[name] for name in ("variable", "scale", "curves")})
+        self.view = replace(self.view, variable=asked.variable, scale=asked.scale, curves=asked.curves)
         self._draw_map()
         self._tell_view()
 
@@ -202,6 +203,8 @@ class ExplorerPage:
         self.drawing.visited(self._trail if self.view.follow else [])
         note = answers.disagreement(self.plane, dict(self.view.values), self.view.pick, found)
         rows = answers.cell_rows(self.plane, self.cell, found)
+        if not self.plane.differs(self.view.values):
+            rows += answers.curves_row(self.laid, self.plane, self.view.pick)
         self.tell("cell", number=number, heading=answers.heading(found), rows=rows, note=note)
         self._tell_recipe("motion", recipes.of_motion(self.cell, found))
         self.exports["motion"] = (self.cell, found)
@@ -281,8 +284,6 @@ class ExplorerPage:
         self._tell_page()
         self._draw_map()
         self.tell("panel", name="plane", state="done", text="The map is of these values.", rows=[])
-        if self.cell is not None:
-            self._tell_recipe("plane", recipes.of_plane(plane, self.cell))
         self._run(0)
 
     def refresh(self) -> None:
@@ -306,9 +307,21 @@ class ExplorerPage:
         log = None if self.view.scale == "auto" else self.view.scale == "log"
         found = coloured(shown, self.view.variable, self.plane.x.name, self.plane.y.name, log)
         self.drawing.map(self.plane, found)
-        self.exports["map"] = (shown, self.view.variable)
+        self.exports["map"] = (shown, self.view.variable, *self._lay(shown))
+        self._tell_recipe("map", recipes.of_map(self.source, self.plane, self.view, self._made, bool(self.laid.pieces)))
         entries = [[one.sign, one.colour, one.text, one.count] for one in found.legend]
         self.tell("legend", title=found.title, entries=entries)
+
+    def _lay(self, shown: Any) -> tuple[Any, bool]:
+        """Lay the curves over the part of the map that is shown; give what a picture of it draws of them."""
+        curves = self.source.curves
+        if curves is None:
+            return None, False
+        found = self.laid = overlay.laid(curves, self.plane, shown, self.view.curves)
+        self.drawing.curves(found)
+        legend, points = answers.curves_legend(found), answers.curves_points(found, self.plane)
+        self.tell("curves", text=found.said, entries=legend, points=points)
+        return (curves.dataset if found.pieces else None), self.view.curves == "unstable"
 
     def _scale_diagrams(self) -> None:
         """Put the axes of line and branch on the axis that they go along."""
@@ -349,6 +362,7 @@ class ExplorerPage:
             query=view.query(shown),
             variable=shown.variable,
             scale=shown.scale,
+            curves=shown.curves,
             pick=list(shown.pick),
             values=dict(shown.values),
             along=shown.along,

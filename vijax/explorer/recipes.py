@@ -2,11 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vijax.explorer import basin, branch, line, motion, optimum
+from vijax.explorer.export import map_function
 from vijax.explorer.motion import CellMotion
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
+from vijax.explorer.source import Source
+from vijax.explorer.view import View
 from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.quantities import AXES
 from vijax.planes.sweep_settings import SPEED
@@ -29,12 +33,21 @@ class Recipe:
     python: str
 
 
+@dataclass(frozen=True)
+class _Run:
+    """What a call of `sweep` is told: axes, settings and the device, as an `ExploredCell` has them."""
+
+    arguments: dict[str, Any]
+    settings: dict[str, Any]
+    device: Harvester
+
+
 def told(arguments: Mapping[str, float]) -> dict[str, float]:
     """Leave out what a device has unless it is told otherwise."""
     return {name: value for name, value in arguments.items() if value != _USUAL.get(name)}
 
 
-def _constants(cell: ExploredCell) -> dict[str, float]:
+def _constants(cell: ExploredCell | _Run) -> dict[str, float]:
     """Name the constants that differ from those of Tables I and II, other than those that axes stand for."""
     found = {name: float(getattr(cell.device, name)) for name in CONSTANTS if name not in AXES}
     if cell.device.penetration_limit is not None:
@@ -47,7 +60,7 @@ def _named(arguments: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value!r}" for name, value in arguments.items())
 
 
-def _options(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
+def _options(cell: ExploredCell | _Run, without: tuple[str, ...] = ()) -> str:
     words = [
         f"--{name}={value!r}" if value < 0 else f"--{name} {value!r}"
         for name, value in told(cell.arguments).items()
@@ -58,7 +71,7 @@ def _options(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
     return " ".join(words)
 
 
-def _arguments(cell: ExploredCell, without: tuple[str, ...] = ()) -> str:
+def _arguments(cell: ExploredCell | _Run, without: tuple[str, ...] = ()) -> str:
     given: dict[str, Any] = {name: value for name, value in told(cell.arguments).items() if name not in without}
     parts = [f"{name}={value!r}" for name, value in (given | cell.settings).items() if name not in without]
     if constants := _constants(cell):
@@ -101,7 +114,7 @@ def of_line(cell: ExploredCell, axis: Axis) -> Recipe:
 def _options_of(cell: ExploredCell, without: tuple[str, ...]) -> str:
     """Write the options of a cell without some, settings among them."""
     kept = {name: value for name, value in cell.settings.items() if name not in without}
-    return _options(ExploredCell(cell.pair, cell.device, cell.u0, cell.v0, cell.arguments, kept), without)
+    return _options(_Run(cell.arguments, kept, cell.device), without)
 
 
 def of_basin(cell: ExploredCell) -> Recipe:
@@ -144,24 +157,69 @@ def of_optimum(cell: ExploredCell, axis: Axis) -> Recipe:
     )
 
 
-def of_plane(plane: ExploredPlane, cell: ExploredCell) -> Recipe:
-    """Say how the plane with the values of the sliders is made."""
-    axes = (plane.x.name, plane.y.name)
-    spans = {}
-    for axis in (plane.x, plane.y):
-        if not axis.even:
-            return Recipe("", f"import vijax\n# {axis.name} is not evenly spaced: its values are those of the store")
-        log = ":log" if axis.scale == "log" else ""
-        spans[axis.name] = f"{float(axis.values[0])!r}:{float(axis.values[-1])!r}:{axis.values.size}{log}"
-    options = " ".join(f"--{name} {span}" for name, span in spans.items())
-    spaces = {
-        axis.name: f"np.{'geomspace' if axis.scale == 'log' else 'linspace'}"
-        f"({float(axis.values[0])!r}, {float(axis.values[-1])!r}, {axis.values.size})"
-        for axis in (plane.x, plane.y)
-    }
-    arrays = ", ".join(f"{name}={text}" for name, text in spaces.items())
-    rest = _arguments(cell, axes)
-    return Recipe(
-        f"vijax sweep {options} {_options(cell, axes)} --out plane.zarr".replace("  ", " "),
-        f"import numpy as np\nimport vijax\nvijax.sweep({arrays}{', ' + rest if rest else ''})",
-    )
+def of_map(source: Source, plane: ExploredPlane, shown: View, made: bool, curves: bool) -> Recipe:
+    """Say how the picture of a map is had: that of its store, or run anew where the page has made it.
+
+    Args:
+        source: Where the map and its curves come from.
+        plane: The map.
+        shown: What the page shows of it.
+        made: Whether the page has made it.
+        curves: Whether curves are drawn over it.
+    """
+    further = {name: float(plane.further[name][at]) for name, at in plane.slices(shown.values).items()}
+    run = _Run(plane.arguments((0, 0), further), plane.settings(), plane.device)
+    axes, path = (plane.x, plane.y), None if made else source.path
+    name, even = shown.variable, all(axis.even for axis in axes)
+    spans = " ".join(f"--{axis.name} {_span(axis)}" for axis in axes)
+    words = " ".join(filter(None, (spans, _options(run, (plane.x.name, plane.y.name)))))
+    if curves:
+        words = f"--map {path}" if path and not further else words
+        picture = f"--ground {name} --unstable" if shown.curves == "unstable" else f"--ground {name}"
+        command = f"vijax curves {words} {picture} --plot map.png"
+    else:
+        command = f"vijax sweep {words} --show {name} --plot map.png"
+    if not even and not (curves and path and not further):
+        command = ""  # no option of the command says such values
+    lines = ["import vijax", *_dataset(path, plane, run, further)]
+    if curves:
+        lines += [_curves(source), _drawn("curves", f"curves, dataset, ground={name!r}", shown.curves == "unstable")]
+    else:
+        function = map_function(plane.dataset, name)
+        lines.append(_drawn(function, f"dataset, {name!r}" if function == "variable_map" else "dataset", False))
+    return Recipe(command, "\n".join(lines))
+
+
+def _dataset(path: Path | None, plane: ExploredPlane, run: _Run, further: Mapping[str, float]) -> list[str]:
+    """Write the lines that give a map, what is shown of it alone."""
+    if path is not None:
+        place = ", ".join(f"{name}={value!r}" for name, value in further.items())
+        return [f"dataset = vijax.load({str(path)!r})" + (f".sel({place})" if place else "")]
+    spaces = ", ".join(f"{axis.name}={_space(axis)}" for axis in (plane.x, plane.y))
+    rest = _arguments(run, (plane.x.name, plane.y.name))
+    return ["import numpy as np", f"dataset = vijax.sweep({', '.join(filter(None, (spaces, rest)))})"]
+
+
+def _curves(source: Source) -> str:
+    """Write the line that gives the curves of a map."""
+    if source.curves is not None and source.curves.path is not None:
+        return f"curves = vijax.load({str(source.curves.path)!r})"
+    return "curves = vijax.curve_dataset(vijax.bifurcation_curves(dataset))"
+
+
+def _drawn(function: str, given: str, unstable: bool) -> str:
+    return f"vijax.plots.save(vijax.plots.{function}({given}{', unstable=True' if unstable else ''}), 'map.png')"
+
+
+def _span(axis: Axis) -> str:
+    """Write an axis as an option has it."""
+    log = ":log" if axis.scale == "log" else ""
+    return f"{float(axis.values[0])!r}:{float(axis.values[-1])!r}:{axis.values.size}{log}"
+
+
+def _space(axis: Axis) -> str:
+    """Write an axis as Python has it; one that is not evenly spaced by all its values."""
+    if not axis.even:
+        return f"np.array({axis.values.tolist()})"
+    space = "geomspace" if axis.scale == "log" else "linspace"
+    return f"np.{space}({float(axis.values[0])!r}, {float(axis.values[-1])!r}, {axis.values.size})"

@@ -1,10 +1,11 @@
-"""Where the map of a page comes from: a dataset, or a store that may be growing, damaged, or gone."""
+"""Where the map of a page and its curves come from: datasets, or stores; that of the map may grow, be damaged or go."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vijax.explorer import overlay
 from vijax.explorer.plane import ExploredPlane, explored
 from vijax.planes import inventory
 from vijax.planes.store import load
@@ -15,18 +16,25 @@ if TYPE_CHECKING:
 
 
 class Source:
-    """A map, read again when its files have changed.
+    """A map, read again when its files have changed, and curves over it, which are read once.
 
     `name` says what it is in a few words.
 
     Args:
         given: A dataset, the path of a store, or None for a small plane that is made when it is first read.
+        curves: What `curve_dataset` returned, the path of a store of it, or None.
+
+    Raises:
+        ValueError, OSError: What is wrong with the curves.
     """
 
-    def __init__(self, given: "xr.Dataset | str | Path | None") -> None:
+    def __init__(
+        self, given: "xr.Dataset | str | Path | None", curves: "xr.Dataset | str | Path | None" = None
+    ) -> None:
         self.path = Path(given) if isinstance(given, str | Path) else None
         self._dataset: xr.Dataset | None = None if isinstance(given, str | Path) else given
         self.name = self.path.name if self.path else "the default plane" if given is None else "a dataset"
+        self.curves = None if curves is None else overlay.taken(curves)
         self._read: tuple[tuple[int, int], ExploredPlane] | None = None
 
     def stamp(self) -> tuple[int, int]:
@@ -47,6 +55,12 @@ class Source:
         if self._read is None or self._read[0] != stamp:
             self._read = stamp, explored(self._found())
         return self._read[1]
+
+    def check(self) -> None:
+        """Read the map, and raise ValueError or OSError unless it can be shown, and the curves are of it."""
+        plane = self.plane()
+        if self.curves is not None:
+            overlay.check(self.curves, plane, self.path)
 
     def _found(self) -> "xr.Dataset":
         if self.path is not None:

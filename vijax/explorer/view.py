@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlencode
 
+from vijax.explorer.overlay import CURVES
 from vijax.explorer.plane import ExploredPlane
 from vijax.model.quantities import AXES
 from vijax.planes.dataset import best
@@ -15,7 +16,7 @@ SCALES = ("auto", "log", "linear")
 PANELS = ("basin", "branch", "optimum")
 """What is computed on demand, and opened again by the address of a view."""
 
-_KNOWN = ("variable", "scale", "cell", "along", "open", "follow", "token")
+_KNOWN = ("variable", "scale", "cell", "along", "open", "follow", "curves", "token")
 # Speed of a start in units of A pi/omega, and inclination in radians, up to which sliders go.
 _MOST_SPEED, _MOST_TILT = 1.5, 0.35
 
@@ -32,6 +33,7 @@ class View:
         along: The axis of the map along which line and branch go.
         panels: Of `PANELS`, those that are open.
         follow: Whether a picked motion starts where the last one ended.
+        curves: What is shown of curves, one of `CURVES`.
     """
 
     variable: str
@@ -41,6 +43,7 @@ class View:
     along: str = ""
     panels: tuple[str, ...] = ()
     follow: bool = False
+    curves: str = CURVES[0]
 
 
 def first_view(plane: ExploredPlane) -> View:
@@ -79,6 +82,7 @@ def query(view: View) -> str:
     """Write a view as the query of an address."""
     told = {"variable": view.variable, "scale": view.scale, "cell": f"{view.pick[0]},{view.pick[1]}"}
     told |= {"along": view.along, "open": ",".join(view.panels), "follow": "1" if view.follow else ""}
+    told |= {"curves": "" if view.curves == CURVES[0] else view.curves}
     numbers = {name: repr(float(value)) for name, value in view.values.items()}
     return urlencode({name: text for name, text in (told | numbers).items() if text})
 
@@ -101,6 +105,7 @@ def from_query(plane: ExploredPlane, arguments: Mapping[str, str]) -> View:
         along=checks.choice("along", arguments.get("along", start.along), _along(plane)),
         panels=tuple(checks.choice("open", one, PANELS) for one in arguments.get("open", "").split(",") if one),
         follow=arguments.get("follow") == "1",
+        curves=checks.choice("curves", arguments.get("curves", start.curves), CURVES),
     )
 
 

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
-from vijax.orbits.curve_rows import NEEDED, numbered_points
+from vijax.orbits.curve_rows import NEEDED
+from vijax.plots.curve_lines import FAINT, KINDS, curve_pieces, misfit, placed_points
 from vijax.plots.figure import label_logs, styled
 from vijax.plots.kind_maps import label_map
 from vijax.plots.number_maps import power_map, variable_map
@@ -19,16 +20,6 @@ from vijax.runtime import checks
 if TYPE_CHECKING:
     import xarray as xr
 
-# Kinds of curves: told apart by their dashes too, as a paper may be printed in black.
-_KINDS: dict[str, dict[str, Any]] = {
-    "fold": {"color": "tab:red"},
-    "flip": {"color": "tab:blue", "dashes": (5, 1.2)},
-    "pitchfork": {"color": "black"},
-    "grazing": {"color": "tab:green", "dashes": (1.6, 1.0)},
-    "grazing contact": {"color": "tab:olive", "dashes": (1.6, 1.0)},
-    "penetration limit": {"color": "tab:purple", "dashes": (6, 1.2, 1.2, 1.2)},
-    "energy limit": {"color": "tab:orange", "dashes": (6, 1.2, 1.2, 1.2)},
-}
 _EDGE: dict[str, Any] = {"color": "white", "linewidth": 2.4, "solid_capstyle": "butt"}
 _POINT: dict[str, Any] = {"marker": "o", "markersize": 3.6, "color": "white", "mec": "black", "linestyle": "none"}
 _NUMBER: dict[str, Any] = {
@@ -42,7 +33,6 @@ _NUMBER: dict[str, Any] = {
 # Where a number may stand beside its point, in points: where there is most room, the first of these at equal room.
 _BESIDE = ((6, 5), (-6, 5), (6, -5), (-6, -5), (0, 8), (0, -8), (11, 0), (-11, 0))
 _MOST_LISTED = 24  # points beside a picture; all of them stand in the dataset
-_FAINT = 0.35
 # Columns of the legend; the height of a line and the width of the list, in inches.
 _COLUMNS, _LINE_HEIGHT, _LIST_WIDTH = 3, 0.17, 2.2
 
@@ -60,14 +50,14 @@ def curves(
         unstable: Whether what is met by unstable orbits alone is drawn too, faintly: grazings and limits.
 
     Raises:
-        ValueError: A map with other axes, or without such a variable.
+        ValueError: A map with other axes, with other walls or constants than the curves, or without such a variable.
     """
     checks.variables("dataset", dataset, NEEDED, "vijax.curve_dataset")
     names = dataset.attrs["along"].split()
     if over is None:
         figure, x, y = _bare(dataset, names), names[0], names[1]
     else:
-        figure, x, y = _ground(over, names, ground)
+        figure, x, y = _ground(dataset, over, names, ground)
     axes = figure.axes[0]
     kinds = draw_curves(axes, dataset, x, y, unstable)
     handles = kind_handles(kinds)
@@ -86,15 +76,21 @@ def curves(
     return figure
 
 
-def _ground(over: "xr.Dataset", names: list[str], ground: str) -> tuple[Figure, str, str]:
+def _ground(dataset: "xr.Dataset", over: "xr.Dataset", names: list[str], ground: str) -> tuple[Figure, str, str]:
     """Draw the map below curves in a plane of two parameters, and say which of them is across, which is up."""
-    checks.variables("over", over, ("period",), "vijax.sweep")
+    checks.variables("over", over, ("period",) if ground == "label" else (), "vijax.sweep")
     checks.choice("ground", ground, ["label", *map(str, over)])
     over = over.squeeze()
     dims = [str(dim) for dim in over["period" if ground == "label" else ground].dims]
     if set(dims) != set(names):
         got = ", ".join(dims) or "none"
         raise ValueError(f"over must be a map over {names[0]} and {names[1]} alone; got one over {got}")
+    other = misfit(dataset, over, (dims[0], dims[1]))
+    if other is not None:
+        raise ValueError(
+            f"over must be a map with the {other.what} of the curves, {other.of_curves}; got {other.of_map}; "
+            "vijax.bifurcation_curves finds those of this map"
+        )
     if ground in ("label", "P"):
         return (label_map if ground == "label" else power_map)(over), dims[0], dims[1]
     return variable_map(over, ground), dims[0], dims[1]
@@ -115,41 +111,33 @@ def _bare(dataset: "xr.Dataset", names: list[str]) -> Figure:
 
 def kind_handles(kinds: Collection[str]) -> list[Line2D]:
     """Give the entries of a legend for kinds of curves."""
-    return [Line2D([], [], label=kind, **style) for kind, style in _KINDS.items() if kind in kinds]
+    return [Line2D([], [], label=kind, **style) for kind, style in KINDS.items() if kind in kinds]
 
 
 def draw_curves(axes: Axes, dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> set[str]:
     """Draw every curve, and say which kinds there are."""
     drawn = set()
-    for index in range(dataset.sizes["curve"]):
-        one = dataset.isel(curve=index)
-        kind, stable = str(one["kind"].item()), one["stable"].values == 1
-        across, up = one[x].values, one[y].values
-        faint: dict[str, Any] = {"linewidth": 0.8, "alpha": _FAINT}
-        strong: dict[str, Any] = {"linewidth": 1.2}
-        for shown, style in ((stable, strong), (~stable & unstable, faint)):
-            if (shown & np.isfinite(across)).any():
-                line = np.where(shown, across, np.nan)
-                if shown is stable:
-                    axes.plot(line, up, **_EDGE)
-                axes.plot(line, up, **_KINDS[kind], **style)
-                drawn.add(kind)
+    for one in curve_pieces(dataset, x, y, unstable):
+        width: dict[str, Any] = {"linewidth": 1.2} if one.stable else {"linewidth": 0.8, "alpha": FAINT}
+        if one.stable:
+            axes.plot(one.x, one.y, **_EDGE)
+        axes.plot(one.x, one.y, **KINDS[one.kind], **width)
+        drawn.add(one.kind)
     return drawn
 
 
 def _number(axes: Axes, dataset: "xr.Dataset", x: str, y: str) -> list[tuple[int, str]]:
     """Mark and number the points of codimension 2, each place once, and tell what they are."""
-    turned = dataset.attrs["along"].split() != [x, y]
-    numbered = [(one, one.place[::-1] if turned else one.place) for one in numbered_points(dataset)]
-    taken = [axes.transData.transform(place) * 72 / axes.figure.dpi for _, place in numbered]
+    numbered = placed_points(dataset, x, y)
+    taken = [axes.transData.transform(one.place) * 72 / axes.figure.dpi for one in numbered]
     points = list(taken)
-    for (one, place), at in zip(numbered, points, strict=True):
-        axes.plot(*place, **_POINT, zorder=6)
+    for one, at in zip(numbered, points, strict=True):
+        axes.plot(*one.place, **_POINT, zorder=6)
         room = [min(np.abs(at + beside - other).max() for other in taken) for beside in _BESIDE]
         best = _BESIDE[int(np.argmax(np.minimum(room, 8)))]
         taken.append(at + best)
-        axes.annotate(str(one.number), place, xytext=best, **_NUMBER)
-    return [(one.number, f"{one.kind} ({place[0]:.4g}, {place[1]:.4g})") for one, place in numbered]
+        axes.annotate(str(one.number), one.place, xytext=best, **_NUMBER)
+    return [(one.number, f"{one.kind} ({one.place[0]:.4g}, {one.place[1]:.4g})") for one in numbered]
 
 
 def _listed(number: int) -> dict[str, Any]:
