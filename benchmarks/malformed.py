@@ -88,6 +88,13 @@ def a_map() -> xr.Dataset:
     return xr.Dataset({"mass": ("d", [1.0, 2.0])})
 
 
+def a_plane() -> xr.Dataset:
+    """Make a map of two axes whose cells were not run."""
+    axes = {"d": [0.1, 0.2], "kappa": [3.0, 40.0]}
+    still = {"r": 0.5, "gamma": 0.0, "omega": 6.0, "A": 1.0, "u0": 0.05, "v0": -0.4}
+    return xr.Dataset({"status": (("d", "kappa"), np.zeros((2, 2), int))}, coords=axes | still)
+
+
 # --- kinds of bad values ---------------------------------------------------------------------------------------------
 
 # 0 and -1 stand apart, as some counts may be 0.
@@ -547,6 +554,18 @@ CALLS: Table = {
         nodes,
         {"tolerances": (Tolerance("omega0", 0.05),)},
         {"tolerances": (3, "omega0", [3]), "samples": COUNT, "seed": SEED},
+    ),
+    "explore": (
+        vijax.explore,
+        {"source": a_plane(), "browser": False, "port": 0},
+        {
+            "source": (3, [], {}, b"map.zarr", "", "nowhere.zarr", "/dev/null", a_map(), xr.Variable("d", [1.0])),
+            "curves": (3, [], {}, b"curves.zarr", "", "nowhere.zarr", "/dev/null", a_map(), a_plane()),
+            "address": (3, None, "", [], "0.0.0.0", "nowhere"),
+            "port": (True, 1.5, NAN, "80", [80], -1, 65536, HUGE),
+            "allow_origin": (3, None, "", "*", ["lab", 3], [""], "http://lab:5006", "lab:port", "lab:70000", "a b"),
+            "browser": FLAG,
+        },
     ),
     "curve": (
         motion.curve,

@@ -169,8 +169,14 @@ LINES: Lines = {
         {
             "port": ("-1", "x", "1.5", "65536"),
             "address": ("", "nowhere", "0.0.0.0"),
+            "curves": ("", ".", "nowhere.zarr", "curves.csv", "/dev/null", "\0.zarr"),
+            "allow-origin allow_origin": ("", "*", "http://lab:5006", "lab:port", "lab:70000", "a b"),
             "unknown": ("1",),
         },
+    ),
+    "explore elsewhere": (
+        ("--no-browser", "--port", "0", "--allow-origin", "lab:5006"),
+        {"address": ("nowhere.invalid", "203.0.113.1", "1.2.3.4.5")},
     ),
     "design": (
         ("--d", "0.2", "--survey-points", "8"),

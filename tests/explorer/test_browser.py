@@ -89,6 +89,16 @@ def browser():
         made.close()
 
 
+# Presses a button as soon as it is there: a job may be done before a hand is at it.
+PRESS = """(selector) => {
+    const press = (_, seen) => {
+        const stop = document.querySelector(selector);
+        if (stop && !stop.hidden) { seen.disconnect(); stop.click(); }
+    };
+    new MutationObserver(press).observe(document.body, { attributes: true, childList: true, subtree: true });
+}"""
+
+
 class Tab:
     """A page in the browser, with all that it asked for and complained of."""
 
@@ -217,7 +227,24 @@ def test_a_slider_changes_the_motion_and_a_plane_of_its_value_is_made(tab, datas
     one.page.keyboard.press("Enter")
     one.page.wait_for_function("location.search.includes('r=0.6')", timeout=WAIT)
     assert one.shown().heading() == said_of(dataset, PICK, r=0.6)
+    one.page.evaluate(PRESS, "[data-panel='plane'] button")
     one.page.click("#make")
+    assert "Cancelled" in one.state("plane", "cancelled", "done", "failed")
+    one.page.click("#make")
+    assert "The map is of these values" in one.state("plane", "done", "failed")
+    assert "their r is 0.5, here it is 0.6" in one.page.inner_text("#curvenote")
+
+
+def test_a_plane_that_is_asked_for_twice_is_made_if_the_answer_is_yes(tab):
+    """What the server tells of a plane beyond a million cells; test_page has when it does."""
+    one, answers = tab("?r=0.6").shown(), []
+    for answer in ("dismiss", "accept"):
+        one.page.once("dialog", lambda asked, answer=answer: (answers.append(asked.message), getattr(asked, answer)()))
+        one.page.evaluate("vijax.told({ section: 'ask', text: 'This plane has 1,001,000 cells. Make it?' })")
+        assert answers[-1].startswith("This plane has")
+        if answer == "dismiss":
+            one.page.wait_for_timeout(300)
+            assert one.page.inner_text("[data-panel='plane']") == ""
     assert "The map is of these values" in one.state("plane", "done", "failed")
 
 
@@ -237,11 +264,7 @@ def test_basin_and_branch_are_computed_on_demand_and_cancelled(one):
     one.compute("branch")
     assert "The branch has" in one.state("branch", "done", "failed")
     assert one.view()["open"] == "basin,branch"
-    one.page.evaluate("""() => {
-        const stop = document.querySelector('.cancel[data-name="basin"]');
-        const press = (_, seen) => { if (!stop.hidden) { seen.disconnect(); stop.click(); } };
-        new MutationObserver(press).observe(stop, { attributes: true });
-    }""")
+    one.page.evaluate(PRESS, '.cancel[data-name="basin"]')
     one.compute("basin")
     assert "Cancelled" in one.state("basin", "cancelled")
 

@@ -53,6 +53,9 @@ def test_the_legend_counts_kinds_in_the_colours_of_the_pictures_and_points_are_l
         ["#d62728", (), "fold", 1],
         ["#2ca02c", KINDS["grazing"]["dashes"], "grazing", 1],
     ]
+    twice = drawn_curves()
+    twice["stable"][0, 0] = 0  # a curve of both is one curve
+    assert [row[2:] for row in answers.curves_legend(laid(plane, "unstable", twice))] == [["fold", 1], ["grazing", 1]]
     assert answers.curves_points(found, plane)[1:] == [["1", "cusp", "0.272", "80"]]
 
 

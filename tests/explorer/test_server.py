@@ -73,6 +73,27 @@ def test_an_open_address_needs_an_origin(dataset):
         server.serve(Source(dataset), "0.0.0.0", 0, ())
 
 
+@pytest.mark.parametrize(
+    ("port", "address", "must"),
+    [
+        (1, "127.0.0.1", "port must be free at 127.0.0.1; got {port}: .*; 0 is any that is free"),
+        (0, "203.0.113.1", "address must be one that this machine has; got 203.0.113.1"),
+        (0, "nowhere.invalid", "address must be one that this machine has; got nowhere.invalid"),
+    ],
+)
+def test_where_no_server_can_listen_is_said_in_a_line(serving, dataset, port, address, must):
+    one, _, _ = serving("127.0.0.1")
+    port = port and one.port
+    with pytest.raises(OSError, match=must.format(port=port)):
+        server.serve(Source(dataset), address, port, ("lab:1",))
+
+
+@pytest.mark.parametrize("origin", ["*", "*:5006", "http://lab", "lab/", "lab:99999", ""])
+def test_an_origin_is_one_machine(dataset, origin):
+    with pytest.raises(ValueError, match="allow_origin must be HOST or HOST:PORT"):
+        server.serve(Source(dataset), "0.0.0.0", 0, (origin,))
+
+
 def test_what_a_damaged_store_says_is_text(serving, monkeypatch):
     _, page, ask = serving("127.0.0.1")
 

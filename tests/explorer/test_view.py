@@ -8,7 +8,8 @@ import pytest
 
 import vijax
 from vijax.cli.main import main
-from vijax.explorer import recipes, view
+from vijax.explorer import answers, recipes, view
+from vijax.explorer.branch import CellBranch
 from vijax.explorer.plane import cell, explored
 from vijax.explorer.view import View
 
@@ -101,6 +102,22 @@ def test_a_further_axis_and_what_is_fixed_can_be_moved(physical):
 def test_what_cannot_be_looked_into_is_said_at_the_door(power, changed, must):
     with pytest.raises(ValueError, match=must):
         explored(changed(power))
+
+
+@pytest.mark.parametrize(
+    ("ends", "said"),
+    [
+        (("low", "high"), "it ends at the low end of the range and at the high end of the range."),
+        (("high", "high"), "it ends at the high end of the range, either way."),
+        (("closed", "closed"), "it is closed."),
+        (("grazing flight", "points"), "it ends at a grazing flight and after 600 orbits."),
+    ],
+)
+def test_how_a_branch_ends_is_a_sentence(ends, said):
+    met = (("fold", 0.2, 0.1), ("fold", 0.2, 0.3), ("flip", 0.1, 0.1))
+    found = CellBranch("kappa", (), met, ends, None)
+    assert answers.branch_text(found) == f"The branch has folds at \u03ba = 0.2; {said}"
+    assert answers.branch_rows(found) == [["met", "\u03ba"], ["flip", "0.1"], ["fold", "0.2"]]
 
 
 def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, monkeypatch):

@@ -5,7 +5,7 @@ import click
 from vijax.cli import process
 from vijax.cli.kinds import NewFile, Whole
 from vijax.cli.page import Page
-from vijax.explorer.address import MOST_PORT, PORT
+from vijax.explorer.address import PORT, check_listener
 
 
 def explored(
@@ -22,9 +22,8 @@ def explored(
         check_bokeh()
         from vijax.explorer.server import serve
         from vijax.explorer.source import Source
-        from vijax.runtime import checks
 
-        checks.whole("port", port, 0, MOST_PORT)
+        check_listener(address, port, allow_origin)
         source = Source(store, curves)
         if store is not None or curves is not None:
             source.check()

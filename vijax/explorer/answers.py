@@ -3,7 +3,7 @@
 from typing import Any
 
 from vijax.explorer.basin import CellBasin
-from vijax.explorer.branch import CellBranch
+from vijax.explorer.branch import MOST_POINTS, CellBranch
 from vijax.explorer.line import CellLine
 from vijax.explorer.motion import MOST_IMPACTS, CellMotion
 from vijax.explorer.optimum import NearOptimum
@@ -12,7 +12,7 @@ from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
 from vijax.explorer.theme import amount, symbol, unit_of
 from vijax.model.label import label
 from vijax.model.records import Status
-from vijax.plots.curve_lines import screen_style
+from vijax.plots.curve_lines import KINDS, screen_style
 from vijax.plots.style import LABEL_NEEDS
 
 Rows = list[list[str]]
@@ -59,8 +59,8 @@ def curves_row(found: LaidCurves, plane: ExploredPlane, pick: tuple[int, int]) -
 
 def curves_legend(found: LaidCurves) -> list[list[Any]]:
     """List the kinds of curves that are drawn: colour, dashes, name and how many."""
-    kinds = [one.kind for one in found.pieces]
-    return [[*screen_style(kind), kind, kinds.count(kind)] for kind in dict.fromkeys(kinds)]
+    numbers = {kind: {one.curve for one in found.pieces if one.kind == kind} for kind in KINDS}
+    return [[*screen_style(kind), kind, len(there)] for kind, there in numbers.items() if there]
 
 
 def curves_points(found: LaidCurves, plane: ExploredPlane) -> Rows:
@@ -118,8 +118,19 @@ def branch_text(found: CellBranch) -> str:
     name = symbol(found.along)
     folds = ", ".join(amount(value, "", 7) for value in found.folds)
     said = f"folds at {name} = {folds}" if folds else f"no fold in this range of {name}"
-    ends = {"low": "the low end of the range", "high": "the high end of the range"}
-    return f"The branch has {said}; it ends at {' and '.join(ends.get(end, end) for end in found.ends)}."
+    if "closed" in found.ends:
+        return f"The branch has {said}; it is closed."
+    first, last = (_ENDS.get(end, f"at a {end}") for end in found.ends)
+    return f"The branch has {said}; it ends {first}{', either way' if first == last else f' and {last}'}."
+
+
+_ENDS = {
+    "low": "at the low end of the range",
+    "high": "at the high end of the range",
+    "start": "at this cell",
+    "points": f"after {MOST_POINTS} orbits",
+    "lost": "where no step is short enough",
+}
 
 
 def optimum_rows(axis: Axis, found: list[NearOptimum]) -> Rows:

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vijax.explorer.address import MOST_PORT, PORT
+from vijax.explorer.address import PORT, check_listener
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -45,8 +45,7 @@ def explore(
     """
     check_bokeh()
     checks.flag("browser", browser)
-    origins = (allow_origin,) if isinstance(allow_origin, str) else tuple(allow_origin)
-    port = checks.whole("port", port, 0, MOST_PORT)
+    origins = check_listener(address, port, allow_origin)
     given = import_module("vijax.explorer.source").Source(source, curves)
     given.check()
     if _in_notebook():

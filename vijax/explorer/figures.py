@@ -251,8 +251,13 @@ def _curves(made: Any, of: PageTables, kinds: tuple[str, ...]) -> None:
         dash = " ".join(str(round(_DASH * part)) for part in dashes) or "solid"
         lines.append(made.multi_line("xs", "ys", source=of.curves, view=view, line_dash=dash, **style))
     made.scatter("x", "y", source=of.points, size=6, fill_color="white", line_color="black")
-    words = {"text_font_size": "12px", "text_outline_color": "white", "x_offset": 5, "y_offset": -3}
-    made.text("x", "y", "number", source=of.points, **words)
+    # The edge of letters is drawn over them, so that they are drawn once more.
+    words = {"text_font_size": "12px", "x_offset": 5, "y_offset": -3}
+    for edge in (
+        {"text_color": "white", "text_outline_color": "white", "text_outline_width": 3},
+        {"text_color": "black"},
+    ):
+        made.text("x", "y", "number", source=of.points, **words, **edge)
     made.add_tools(HoverTool(renderers=lines, tooltips=[("", "@kind of @label")], description="Curves"))
 
 

@@ -174,7 +174,10 @@ window.vijax = (() => {
       hide(id("cellnote"), !note);
       id("rows").replaceChildren(...rows.map(([name, text]) => {
         const line = make("div");
-        line.append(make("dt", name), make("dd", text));
+        // A number is never broken at its sign.
+        const value = make("dd");
+        value.append(...text.split(/(?<=, )/).map((part) => make("span", part)));
+        line.append(make("dt", name), value);
         return line;
       }));
       answered(request);

@@ -17,7 +17,7 @@ from jinja2 import Template
 from tornado.web import RequestHandler
 
 from vijax.explorer import view
-from vijax.explorer.address import LOCAL, free_port
+from vijax.explorer.address import LOCAL, bound_port, check_listener
 from vijax.explorer.jobs import Crew
 from vijax.explorer.page import ExplorerPage
 from vijax.explorer.source import Source
@@ -169,14 +169,10 @@ def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> 
 
     Raises:
         ValueError: An address that others can reach without origins.
-        OSError: The port is taken.
+        OSError: The port is taken, or the address is none of this machine's.
     """
-    if address not in LOCAL and not origins:
-        raise ValueError(
-            f"address must come with allow_origin where others can reach it; got {address} alone; "
-            f"add --allow-origin HOST:PORT, as it stands in the browser"
-        )
-    port = port or free_port(address)
+    check_listener(address, port, origins)
+    port = bound_port(address, int(port))
     own = tuple(f"{host}:{port}" for host in ("127.0.0.1", "localhost"))
     crew, warmth = Crew(), Warmth()
     token = "" if address in LOCAL else secrets.token_urlsafe(24)

@@ -58,7 +58,10 @@ class Source:
 
     def check(self) -> None:
         """Read the map, and raise ValueError or OSError unless it can be shown, and the curves are of it."""
-        plane = self.plane()
+        try:
+            plane = self.plane()
+        except (ValueError, OSError) as error:
+            raise type(error)(f"source: {error}") from None
         if self.curves is not None:
             overlay.check(self.curves, plane, self.path)
 

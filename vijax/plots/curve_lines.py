@@ -33,8 +33,9 @@ _EQUAL = 1e-9  # parts within which a constant of two datasets is the same: both
 
 
 class CurvePiece(NamedTuple):
-    """What is drawn alike of one curve: its points across and up, NaN across where it is drawn otherwise or not."""
+    """What is drawn alike of a curve, by its number: points across and up, NaN across where it is drawn otherwise."""
 
+    curve: int
     kind: str
     label: str
     stable: bool
@@ -58,7 +59,7 @@ def curve_pieces(dataset: "xr.Dataset", x: str, y: str, unstable: bool) -> Itera
         across, up = one[x].values, one[y].values
         for shown, strong in ((stable, True), (~stable & unstable, False)):
             if (shown & np.isfinite(across)).any():
-                yield CurvePiece(kind, label, strong, np.where(shown, across, np.nan), up)
+                yield CurvePiece(index, kind, label, strong, np.where(shown, across, np.nan), up)
 
 
 def placed_points(dataset: "xr.Dataset", x: str, y: str) -> list[NumberedPoint]:

@@ -1,0 +1,114 @@
+"""A page without a browser: what it is asked, what it tells, and which jobs it begins."""
+
+import threading
+
+import numpy as np
+import pytest
+from bokeh.document import Document
+
+import vijax
+from tests.explorer.drawn_curves import drawn_curves
+from tests.helpers import stand_in
+from vijax.batch import simulate
+from vijax.explorer import page as room
+from vijax.explorer import view
+from vijax.explorer.jobs import Crew
+from vijax.explorer.page import ExplorerPage
+from vijax.explorer.plane import explored
+from vijax.explorer.source import Source
+
+
+@pytest.fixture(scope="module")
+def power():
+    """A map whose cells are not run: a page computes none of it by itself."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "summarise", stand_in)
+        return vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4))
+
+
+def widened(power, columns: int, rows: int):
+    """Make a map of so many cells, of which nothing but the status is kept."""
+    wide = power[["status"]].isel(d=np.zeros(columns, int), kappa=np.zeros(rows, int))
+    return wide.assign_coords(d=np.linspace(0.1, 0.3, columns), kappa=np.geomspace(3, 400, rows))
+
+
+@pytest.fixture
+def opened():
+    """Open pages of maps; give each with all that it tells."""
+    crews = []
+
+    def open_page(dataset, curves=None, query=None) -> tuple[ExplorerPage, list[dict]]:
+        crew, told = Crew(), []
+        crews.append(crew)
+        source = Source(dataset, curves)
+        shown = view.from_query(source.plane(), query or {})
+        made = ExplorerPage(Document(), source, source.plane(), shown, crew)
+        made.channel.on_change("told", lambda attribute, old, new: told.append(new))
+        return made, told
+
+    yield open_page
+    for crew in crews:
+        crew.close()
+
+
+@pytest.mark.parametrize(("columns", "asks"), [(1000, False), (1001, True)])
+def test_a_plane_beyond_a_million_cells_is_made_only_if_it_is_asked_for_twice(
+    power, opened, monkeypatch, columns, asks
+):
+    begun = threading.Event()
+    monkeypatch.setattr(room, "sweep", lambda **_: begun.set())
+    monkeypatch.setattr(room, "explored", lambda found: found)
+    one, told = opened(widened(power, columns, 1000))
+    one.heard({"kind": "make"})
+    assert [message["section"] for message in told] == (["ask"] if asks else ["panel"])
+    if asks:
+        assert told[0]["text"] == "This plane has 1,001,000 cells and may take long. Make it?"
+        assert one.jobs.running() == ()
+        assert not begun.is_set()
+        one.heard({"kind": "make", "sure": True})
+    assert begun.wait(10)
+
+
+def test_what_is_asked_of_a_plane_is_all_that_its_sliders_say(power, opened, monkeypatch):
+    asked, begun = {}, threading.Event()
+    monkeypatch.setattr(room, "sweep", lambda **given: asked.update(given) or begun.set())
+    monkeypatch.setattr(room, "explored", lambda found: found)
+    one, _ = opened(power, query={"r": "0.6"})
+    one.heard({"kind": "make"})
+    assert begun.wait(10)
+    assert asked["r"] == 0.6
+    assert asked["d"].tolist() == power["d"].values.tolist()
+    assert asked["kappa"].tolist() == power["kappa"].values.tolist()
+
+
+def test_a_value_beyond_its_slider_is_never_run(power, opened):
+    one, told = opened(power)
+    for message in ({"name": "r", "value": 1.5}, {"name": "omega", "value": 1e9}, {"name": "r", "value": [3]}):
+        one.heard({"kind": "value", **message})
+        assert told[-2]["section"] == "note"
+        assert told[-2]["error"]
+    assert one.view.values == {}
+    assert one.jobs.running() == ()
+
+
+def test_a_picture_is_of_what_the_page_shows(power, opened):
+    one, _ = opened(power, drawn_curves(), {"variable": "P"})
+    one._draw_map()
+    dataset, name, curves, unstable = one.exports["map"]
+    assert (name, unstable) == ("P", False)
+    assert dataset["P"].equals(power["P"])
+    assert curves is one.source.curves.dataset
+    one.heard({"kind": "colour", "variable": "status", "scale": "auto", "curves": "hidden"})
+    assert one.exports["map"][1:] == ("status", None, False)
+    one.heard({"kind": "colour", "variable": "status", "scale": "auto", "curves": "unstable"})
+    assert one.exports["map"][3]
+
+
+def test_curves_of_another_value_leave_the_map_with_a_word(power, opened):
+    one, told = opened(power, drawn_curves())
+    one._draw_map()
+    assert len(one.drawing.tables.curves.data["xs"]) == 1
+    one._remade(explored(power.assign_coords(r=0.6)))
+    (said,) = (message["text"] for message in told if message["section"] == "curves" and message["text"])
+    assert "their r is 0.5, here it is 0.6" in said
+    assert one.drawing.tables.curves.data["xs"] == []
