@@ -257,9 +257,11 @@ window.vijax = (() => {
   // --- the server ----------------------------------------------------------------------------------------------
   const lost = () => {
     hide(id("lost"), false);
+    // A page with a token is asked for itself, as another server has another token; any other would be made in vain.
+    const asked = new URLSearchParams(location.search).has("token") ? location.href : "static/js/bokeh.min.js";
     const again = setInterval(async () => {
       try {
-        const answer = await fetch(location.href, { cache: "no-store" });
+        const answer = await fetch(asked, { cache: "no-store" });
         if (answer.ok) { clearInterval(again); location.reload(); }
       } catch { /* not yet */ }
     }, 1000);
