@@ -18,4 +18,8 @@ failed=0
 pytest -n 2 --dist loadfile "$@" || failed=$?
 wait "$types" || failed=$?
 cat .venv/types.txt
+# Said last, as a line among the reasons of skipped tests is overlooked.
+if ! command -v chromium chromium-browser google-chrome >/dev/null; then
+  echo "SKIPPED: pages were not looked at in a browser (tests/explorer/test_browser.py), as no Chromium is installed; apt-get install chromium brings it on Debian"
+fi
 exit "$failed"
