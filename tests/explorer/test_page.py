@@ -1,6 +1,8 @@
 """A page without a browser: what it is asked, what it tells, and which jobs it begins."""
 
 import threading
+from base64 import b64decode
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +12,13 @@ import vijax
 from tests.explorer.drawn_curves import drawn_curves
 from tests.helpers import stand_in
 from vijax.batch import simulate
+from vijax.explorer import export, server, view
 from vijax.explorer import page as room
-from vijax.explorer import view
 from vijax.explorer.jobs import Crew
 from vijax.explorer.page import ExplorerPage
 from vijax.explorer.plane import explored
 from vijax.explorer.source import Source
+from vijax.explorer.warming import Warmth, warm
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +105,47 @@ def test_a_picture_is_of_what_the_page_shows(power, opened):
     assert one.exports["map"][1:] == ("status", None, False)
     one.heard({"kind": "colour", "variable": "status", "scale": "auto", "curves": "unstable"})
     assert one.exports["map"][3]
+
+
+def test_a_picture_is_drawn_by_the_function_of_its_panel(power, monkeypatch):
+    """Each function of `vijax.plots` gives its own name here, which is what the file then holds."""
+    drawn = ("curves", "label_map", "power_map", "variable_map", "motion_figure", "orbit_diagram", "basins", "branches")
+    for name in drawn:
+        monkeypatch.setattr(export, name, lambda *_, name=name, **__: name)
+    monkeypatch.setattr(export, "trajectory", lambda *_, **__: None)
+    monkeypatch.setattr(export, "save", lambda figure, file: file.write_text(f"{figure}{file.suffix}"))
+    panel = SimpleNamespace(dataset=power, span=2.0, end=(0.0, 0.1), pair=None)
+    for what, found, name in (
+        ("map", (power, "P", None, False), "power_map"),
+        ("map", (power[["P"]], "P", None, False), "variable_map"),
+        ("map", (power, "label", None, False), "label_map"),
+        ("map", (power, "P", drawn_curves(), False), "curves"),
+        ("motion", (panel, panel), "motion_figure"),
+        ("line", panel, "orbit_diagram"),
+        ("basin", panel, "basins"),
+        ("branch", panel, "branches"),
+    ):
+        assert b64decode(export.picture(what, found, "svg")).decode() == f"{name}.svg"
+    with pytest.raises(ValueError, match="format must be"):
+        export.picture("map", (power, "P", None, False), "exe")
+
+
+def test_what_is_compiled_is_told_until_all_is(power, opened):
+    one, told = opened(power)
+    warmth, before = Warmth("compiling: lines"), [""]
+    for _ in range(2):
+        server._tell_of_warmth(one, warmth, before)
+    warmth.said = ""
+    server._tell_of_warmth(one, warmth, before)
+    assert [message["text"] for message in told] == ["compiling: lines", ""]
+
+
+def test_compiling_ends_whatever_goes_wrong(power):
+    warmth = Warmth()
+    broken = Source(power)
+    broken.plane = lambda: 1 / 0
+    warm(broken, Crew(), warmth)
+    assert warmth.said == ""
 
 
 def test_curves_of_another_value_leave_the_map_with_a_word(power, opened):

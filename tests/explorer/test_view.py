@@ -143,5 +143,13 @@ def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, 
     assert float(made["found"]["P"]) == moved.numbers["P"]
     if moved.orbit is not None:
         assert np.array_equal(np.asarray(made["orbit"].multipliers), np.asarray(moved.orbit.multipliers))
+    rows = dict(answers.cell_rows(plane, found, moved))
+    assert rows["P"].startswith(f"{float(made['found']['P']):.6g} J per half period")
+    assert rows["power"] == f"{float(made['found']['power']):.6g} W"
+    assert rows["penetration"].startswith(f"{1e3 * float(made['found']['max_penetration']):.6g} mm (limit 6.3 mm)")
+    assert rows["label"] == moved.name
+    if moved.orbit is not None:
+        first = complex(np.asarray(made["orbit"].multipliers)[0, 0])
+        assert rows["multipliers"].startswith(f"{first.real:.6g}")
     assert main([*shlex.split(recipe.command)[1:], "--out", "cell.zarr"]) == 0
     assert f"{moved.numbers['P']:.6g}" in capsys.readouterr().out
