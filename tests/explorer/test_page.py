@@ -94,6 +94,29 @@ def test_a_value_beyond_its_slider_is_never_run(power, opened):
     assert one.jobs.running() == ()
 
 
+def test_a_motion_that_is_dragged_starts_where_the_last_one_ended_within_bounds(power, opened, monkeypatch):
+    monkeypatch.setattr(room, "motion", lambda cell: None)
+    one, told = opened(power)
+    one.motion = SimpleNamespace(end=(0.9, 0.2))
+    one.heard({"kind": "pick", "column": 1, "row": 1})
+    assert one.view.values == {}
+    one.heard({"kind": "follow", "follow": True})
+    one.heard({"kind": "pick", "column": 2, "row": 1})
+    assert one.view.values == {"u0": 0.5 * float(power["d"][2]), "v0": 0.2}
+    assert told[-1]["query"].endswith("follow=1&u0=0.11666666666666667&v0=0.2")
+    one.heard({"kind": "follow", "follow": False})
+    assert one.view.values == {}
+
+
+def test_line_and_branch_go_along_the_axis_that_is_chosen(power, opened):
+    one, _ = opened(power)
+    assert one.axis.name == "kappa"
+    one.heard({"kind": "along", "along": "d"})
+    assert one.axis.name == "d"
+    assert one.drawing.figures.line.x_range.end == one.plane.x.edges[-1]
+    assert one.drawing.figures.branch.below[0].axis_label.startswith("d")
+
+
 def test_a_picture_is_of_what_the_page_shows(power, opened):
     one, _ = opened(power, drawn_curves(), {"variable": "P"})
     one._draw_map()

@@ -32,8 +32,10 @@ def optima(cell: ExploredCell, axis: Axis) -> list[NearOptimum]:
     """Find the optima of a cell's device along an axis of its map, the nearest to the cell first.
 
     Raises:
-        ValueError: An axis that no design can tune: a start is none.
+        ValueError: An axis that no design can tune: a start is none. Rigid walls, which no design has.
     """
+    if cell.pair.kappa is None:
+        raise ValueError("wall must be soft for an optimum, as designs are of membranes; got rigid; explore a soft map")
     if axis.name not in NAMES:
         raise ValueError(f"along must be an axis that a design can tune; got {axis.name}; choose the other axis")
     bounds = {axis.name: (float(axis.values[0]), float(axis.values[-1]))}

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+MOST_PERIODS = 100_000
+"""Forcing periods of a cell, at most: what a store says must not keep a page busy without an end."""
+
+
 @dataclass(frozen=True)
 class Axis:
     """An axis of the map as it is drawn: ascending.
@@ -138,6 +142,12 @@ def explored(dataset: "xr.Dataset") -> ExploredPlane:
             raise ValueError(
                 f"dataset must be made with {name}={needed!r}, as the page runs its cells; got {got!r}; make it anew"
             )
+    periods = int(dataset.attrs.get("periods", SweepSettings.periods))
+    if not 1 <= periods <= MOST_PERIODS:
+        raise ValueError(
+            f"dataset must be run for 1 to {MOST_PERIODS:,} periods, as the page runs its cells at a click; "
+            f"got {periods:,}; make it anew with fewer"
+        )
     dataset = dataset.squeeze([str(dim) for dim in single]).sortby(along[:2])
     x, y = (_axis(dataset, name) for name in along[:2])
     shown = [str(name) for name in dataset.data_vars if {x.name, y.name} & set(map(str, dataset[name].dims))]
@@ -150,7 +160,7 @@ def explored(dataset: "xr.Dataset") -> ExploredPlane:
         fixed=_fixed(dataset, along),
         device=told_device(dataset.attrs),
         wall=str(dataset.attrs.get("wall", SweepSettings.wall)),
-        periods=int(dataset.attrs.get("periods", SweepSettings.periods)),
+        periods=periods,
         variables=(*sorted(shown, key=lambda name: name != "P"), *labelled),
     )
 

@@ -1,5 +1,6 @@
 """The command and the Python lines that reproduce a panel, to copy."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -174,7 +175,7 @@ def of_map(source: Source, plane: ExploredPlane, shown: View, made: bool, curves
     spans = " ".join(f"--{axis.name} {_span(axis)}" for axis in axes)
     words = " ".join(filter(None, (spans, _options(run, (plane.x.name, plane.y.name)))))
     if curves:
-        words = f"--map {path}" if path and not further else words
+        words = f"--map {shlex.quote(str(path))}" if path and not further else words
         picture = f"--ground {name} --unstable" if shown.curves == "unstable" else f"--ground {name}"
         command = f"vijax curves {words} {picture} --plot map.png"
     else:
