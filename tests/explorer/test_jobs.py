@@ -61,6 +61,24 @@ def test_the_newest_wins_and_the_older_ends_at_its_next_word(jobs):
     assert steps == [0]
 
 
+@pytest.mark.parametrize("succeeds", [True, False])
+def test_what_is_cancelled_and_tells_no_progress_delivers_nothing(jobs, succeeds):
+    begun, go, heard = threading.Event(), threading.Event(), []
+
+    def silent(tell):
+        begun.set()
+        assert go.wait(10)
+        return "old" if succeeds else 1 / 0
+
+    old = jobs.start("one", silent, heard.append, heard.append)
+    assert begun.wait(10)
+    new = jobs.start("one", lambda tell: "new", heard.append, heard.append)
+    go.set()
+    for job in (old, new):
+        finished(job)
+    assert heard == ["new"]
+
+
 def test_kinds_do_not_wait_for_each_other_and_all_end_with_their_page(jobs):
     go, heard = threading.Event(), []
     slow = jobs.start("slow", lambda tell: go.wait(10) and tell(0, 1), heard.append, heard.append)
