@@ -9,7 +9,7 @@ import vijax
 from tests.explorer.drawn_curves import drawn_curves
 from tests.helpers import stand_in
 from vijax.batch import simulate
-from vijax.explorer import answers, overlay, recipes, view
+from vijax.explorer import answers, door, overlay, recipes, view
 from vijax.explorer.plane import explored
 from vijax.explorer.source import Source
 from vijax.plots.curve_lines import KINDS
@@ -78,7 +78,8 @@ def test_a_cell_tells_the_curves_that_enter_it(plane):
         (lambda one: one.assign_attrs(wall="rigid"), "the wall of the map, soft; got rigid"),
     ],
 )
-def test_curves_of_another_pair_are_refused_at_the_door_with_what_to_do(power, tmp_path, change, must):
+def test_curves_of_another_pair_are_refused_at_the_door_with_what_to_do(power, tmp_path, monkeypatch, change, must):
+    monkeypatch.setattr(door, "run", lambda *_: None)  # a server that is made would not end
     vijax.save(power, tmp_path / "plane.zarr")
     for source, advice in (
         (power, "vijax.bifurcation_curves"),

@@ -145,6 +145,7 @@ def test_a_process_that_is_cancelled_ends_and_the_next_work_has_another():
 
     with pytest.raises(KeyError):
         one.run(time.sleep, (60,), until_third)
+    assert one._process is None
     assert one.run(divmod, (7, 2), lambda done, total: None) == (3, 1)
     with pytest.raises(worker.WorkerError, match="division"):
         one.run(divmod, (7, 0), lambda done, total: None)
