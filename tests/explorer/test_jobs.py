@@ -79,6 +79,18 @@ def test_what_is_cancelled_and_tells_no_progress_delivers_nothing(jobs, succeeds
     assert heard == ["new"]
 
 
+def test_two_pages_wait_for_each_other_and_cancel_nothing_of_each_other():
+    crew, go, heard = Crew(), threading.Event(), {"one": [], "other": []}
+    pages = {name: Jobs(crew, lambda then: then()) for name in heard}
+    work = {"one": lambda tell: (go.wait(10) and tell(0, 1)) or 1, "other": lambda tell: 2}
+    jobs = [pages[name].start("motion", work[name], heard[name].append, heard[name].append) for name in heard]
+    go.set()
+    for job in jobs:
+        finished(job)
+    assert heard == {"one": [1], "other": [2]}
+    crew.close()
+
+
 def test_kinds_do_not_wait_for_each_other_and_all_end_with_their_page(jobs):
     go, heard = threading.Event(), []
     slow = jobs.start("slow", lambda tell: go.wait(10) and tell(0, 1), heard.append, heard.append)
