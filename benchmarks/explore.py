@@ -74,7 +74,7 @@ def opened(address: str, width: int = 1280, height: int = 800) -> Iterator[Any]:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": width, "height": height})
-        page.goto(address)
+        page.goto(address, timeout=_WAIT)
         settle(page)
         yield page
         browser.close()
@@ -170,7 +170,7 @@ def measure(clicks: int, long: int) -> Iterator[str]:
                 spent.append(seconds(page, name))
             yield f"{name}, {len(spent)} cells: median {np.median(spent):.2f} s, at most {max(spent):.2f} s"
         before = time.perf_counter()
-        page.goto(address)
+        page.goto(address, timeout=_WAIT)
         page.wait_for_function("document.body.dataset.shown !== undefined", timeout=_WAIT)
         yield f"load until the first motion is shown, all compiled: {time.perf_counter() - before:.2f} s"
         if long:
