@@ -222,6 +222,46 @@ def cubic() -> None:
     say("square of their amplitude over m/b, at the flip: off 1 by", f"{fitted - 1:.1e}")
 
 
+def resonant() -> None:
+    """Compare where a fold and a flip begin at a resonant graze, and with what power they depart from the graze.
+
+    They do so as the square of the way along it (Simpson, Ghosh, arXiv 2602.22797).
+    """
+    points = met(symmetric(0.2, 0.5), Line("d", "r", 0.5), (0.1, 0.32))
+    curves = vijax.follow_curves(points, "d", {"d": (0.02, 0.4), "r": R}, max_switches=1, settings=FINE)
+    for graze in (curve for curve in curves if curve.kind == "grazing"):
+        for place in (np.array(point.values) for point in graze.points if point.kind == "resonant graze"):
+            begun = [
+                (curve, point.values)
+                for curve in curves
+                for point in curve.points
+                if point.test == "impact" and np.abs(place - point.values).max() < SAME
+            ]
+            if len(begun) == 2:
+                what = f"resonant graze at d = {place[0]:.6f}, r = {place[1]:.6f}"
+                sides = [place, *(np.array(values) for _, values in begun)]
+                apart = max(np.abs(np.subtract(one, other)).max() for one in sides for other in sides)
+                say(f"{what}: fold, flip and graze, largest difference", f"{apart:.1e}")
+                for curve, _ in begun:
+                    say(f"{what}: exponent, coefficient of the {curve.kind}", departure(graze, curve, place))
+
+
+def departure(graze: BifurcationCurve, curve: BifurcationCurve, place: np.ndarray) -> str:
+    """Fit how a curve departs from that of a graze along r: the exponent, and the coefficient of the square."""
+
+    def near(one: BifurcationCurve, reach: float) -> np.ndarray:
+        away = one.values - place
+        return away[(np.abs(away) < reach).all(axis=1) & (np.abs(away[:, 1]) > SAME)].T
+
+    beside, along = near(graze, 0.02)
+    d, r = near(curve, 0.01)
+    off = d - np.polyval(np.polyfit(along / 0.02, beside, 10), r / 0.02)
+    far = np.abs(off) > 1e-10  # Beyond that rounding is a part of it.
+    power = np.diff(np.log(np.abs(off[far]))) / np.diff(np.log(np.abs(r[far])))
+    middle = 0.5 * (np.abs(r[far])[1:] + np.abs(r[far])[:-1])
+    return f"{at_zero(middle, power):.4f}, {at_zero(np.abs(r[far]), off[far] / r[far] ** 2):.6f}"
+
+
 def lines(number: int = LINES) -> None:
     """Follow branches along random lines through planes, and compare what they locate with where curves cross."""
     seeds = [point for r in (0.3, 0.5, 0.7) for point in met(symmetric(0.2, r), Line("d", "r", r), PLANE["d"])]
@@ -396,6 +436,7 @@ def described(where: np.ndarray, dataset: Any) -> str:
 PARTS: dict[str, Callable[..., None]] = {
     "known": known,
     "cubic": cubic,
+    "resonant": resonant,
     "lines": lines,
     "speed": speed,
     "limits": limits,

@@ -33,7 +33,7 @@ ONLY_IN = {
 KNOWN = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in PACKAGE}
 NO_ROOMS = {"vijax.waiting", "vijax.json"}  # a logger, a file
 NOT_AT_IMPORT = ["bokeh", "matplotlib", "xarray", "diffrax", "optax", "distributed", "pint"]
-IMPORT_SECONDS = 1.5
+IMPORTS_OF_JAX = 2.5  # how many of them importing vijax may take: machines differ by more than imports do
 
 # Built here, so that this line is not what it looks for.
 MACHINE_PATH = re.compile(r"(?<![\w.:/])/({})/\w".format("|".join(["home", "root", "tmp", "work", "Users", "mnt"])))
@@ -204,7 +204,8 @@ def test_a_room_of_plots_is_loaded_when_it_is_asked_for():
 
 def test_import_is_quick():
     # Time of the process, as other tests hold the cores; the least of three, as the first import compiles bytecode.
-    assert min(seconds for seconds, _ in (first_import(), fresh_import(), fresh_import())) < IMPORT_SECONDS
+    own = min(seconds for seconds, _ in (first_import(), fresh_import(), fresh_import()))
+    assert own < IMPORTS_OF_JAX * min(fresh_import("jax.numpy")[0] for _ in range(3))
 
 
 def said(code: str) -> str:

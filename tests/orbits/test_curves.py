@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.interpolate import CubicSpline
 
 import vijax
 from vijax.model.device import Harvester
@@ -13,6 +14,7 @@ from vijax.model.energy import rigid_penetration
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
 from vijax.orbits import curve_rows, curves, limits, orbit_search, periodic, shooting, switching
+from vijax.orbits.events import Point
 from vijax.orbits.shooting import Sequence
 
 PLANE = {"d": (0.05, 0.35), "r": (0.02, 0.98)}
@@ -68,9 +70,44 @@ def test_every_point_is_an_orbit_with_the_multiplier_that_makes_it_one(found):
 def test_a_flip_meets_the_graze_of_its_orbit_where_the_graze_meets_the_flip(found):
     (end,) = found["flip"].points
     assert (end.kind, end.test) == ("flip-graze", "flight")
-    (passed, last) = found["grazing"].points
-    assert (passed.kind, last.kind) == ("flip-graze", "double graze")
+    passed, _, last = sorted(found["grazing"].points, key=lambda point: -point.values[1])
+    # Where the mirror pair comes back to the symmetric orbit both of its impacts touch.
+    assert (passed.kind, last.kind) == ("flip-graze", "pitchfork-graze")
     np.testing.assert_allclose(passed.values, end.values, rtol=0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def grown(found):
+    """The graze of the mirror pair, and the curves that begin at the points of codimension 2 which it meets."""
+    graze = found["grazing"]
+    place = int(np.abs(graze.values[:, 1] - 0.29).argmin())
+    start = Point("grazing flight", float(graze.values[place, 0]), graze.orbit[place : place + 1])
+    return curves.follow_curves([start], "d", {"d": (0.05, 0.35), "r": (0.2, 0.55)}, max_switches=1)
+
+
+def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
+    told = sorted((one.kind, int(one.orbit.count[0]), int(one.orbit.sequence.span[0])) for one in grown)
+    # At the flip-graze the flip and the graze of the doubled orbit, at the resonant graze orbits with an impact more.
+    assert told == [("flip", 2, 2), ("flip", 3, 2), ("fold", 3, 2), ("grazing", 2, 2), ("grazing", 4, 4)]
+    for curve in grown:
+        assert (np.asarray(curve.orbit.residual) < 1e-12).all()
+        assert (np.asarray(curve.orbit.status)[1:-1] == Status.OK).all()
+
+
+def test_a_fold_and_a_flip_touch_their_graze_at_its_resonance(grown):
+    """Their distance grows as the square of the way along it (Simpson, Ghosh, arXiv 2602.22797)."""
+    graze = next(one for one in grown if (one.kind, one.points[0].test) == ("grazing", "") and one.orbit.count[0] == 2)
+    (resonant,) = (point.values for point in graze.points if point.kind == "resonant graze")
+    along = graze.values[np.argsort(graze.values[:, 1])]
+    for curve in grown:
+        if curve.orbit.count[0] == 3:
+            (end,) = (point for point in curve.points if point.test == "impact")
+            np.testing.assert_allclose(end.values, resonant, rtol=0, atol=1e-12)
+            d, r = curve.values[np.abs(curve.values[:, 1] - resonant[1]) < 0.05].T
+            away = np.abs(r - resonant[1])
+            off = np.abs(d - CubicSpline(along[:, 1], along[:, 0])(r))[away > 5e-3]
+            power = np.polyfit(np.log(away[away > 5e-3]), np.log(off), 1)[0]
+            assert power == pytest.approx(2, abs=0.1)
 
 
 def test_the_stable_side_of_a_graze_is_told_by_the_orbit_that_touches(found):
@@ -175,7 +212,7 @@ def test_a_picture_has_a_line_a_kind_and_a_mark_a_point(found):
     assert len(drawn - {"white"}) == 3  # white is the edge around each
     marks = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 1]
     # The flip's end and the point of the graze there are one place.
-    assert len(marks) == len({point.kind + f"{point.values[0]:.4g}" for c in found.values() for point in c.points})
+    assert len(marks) == len({point.kind + f"{point.values[0]:.3f}" for c in found.values() for point in c.points})
 
 
 def made_map(label=lambda d, r: d < pitchfork(r)):
@@ -233,13 +270,13 @@ def test_rows_have_every_point_and_what_was_met(found, tmp_path):
     np.testing.assert_array_equal(rows[["d", "r"]], np.concatenate([curve.values for curve in listed]))
     met = rows[rows["event"] != ""]
     assert sorted(met["event"]) == sorted(point.kind for curve in listed for point in curve.points)
-    places = {point.kind: point.values for curve in listed for point in curve.points}
+    places = {(curve.kind, point.kind): point.values for curve in listed for point in curve.points}
     for row in met.itertuples():
-        np.testing.assert_allclose((row.d, row.r), places[row.event], rtol=0, atol=1e-8)
+        np.testing.assert_allclose((row.d, row.r), places[row.kind, row.event], rtol=0, atol=1e-8)
     # The flip's end and the point of the graze there are one point.
     numbered = curve_rows.numbered_points(table)
     assert [one.number for one in numbered] == list(range(1, len(numbered) + 1))
-    assert sorted(one.kind for one in numbered) == ["double graze", "flip-graze", "pitchfork-graze"]
+    assert sorted(one.kind for one in numbered) == ["flip-graze", "pitchfork-graze", "resonant graze"]
     curve_rows.write_rows(table.assign_coords(d=table["d"].assign_attrs(units="m")), tmp_path / "curves.csv")
     assert (tmp_path / "curves.csv").read_text().startswith("curve,point,kind,label,d [m],r,multiplier,")
 

@@ -13,7 +13,7 @@ from vijax.design.tolerance import Tolerance, check_tolerances
 from vijax.model.device import with_constants
 from vijax.model.quantities import QUANTITIES
 from vijax.model.records import Status
-from vijax.orbits import curves, periodic
+from vijax.orbits import curve_lanes, periodic
 from vijax.orbits.curves import BifurcationCurve
 from vijax.orbits.limits import LIMITS
 from vijax.orbits.orbit_curves import curves_about
@@ -153,8 +153,8 @@ def _meets(optimum: Optimum, piece: _Piece) -> bool:
         orbit = periodic.solve(pair, orbit.sequence, jnp.nan_to_num(orbit.knots))
         if int(orbit.status[0]) == Status.NO_ORBIT:
             return False
-    own = curves.traits(orbit, images=True)
-    theirs = curves.traits(piece.curve.orbit[piece.place : piece.place + 2])
+    own = curve_lanes.traits(orbit, images=True)
+    theirs = curve_lanes.traits(piece.curve.orbit[piece.place : piece.place + 2])
     return bool(min(np.abs(one - other).max() for one in own for other in theirs) < _ALIKE)
 
 

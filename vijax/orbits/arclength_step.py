@@ -13,15 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting
+from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings
 from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import ring_solve, tiles
 from vijax.runtime.arrays import AnyArray
-from vijax.runtime.programs import begin, jitted
+from vijax.runtime.programs import jitted
 from vijax.runtime.ring_solve import Ring
 
 BATCHES = (8, 64, 512)  # lanes of one compiled call
@@ -117,6 +118,22 @@ class Arc(eqx.Module):
             high=self.high - x,
         )
 
+    @property
+    def test_names(self) -> tuple[str, ...]:
+        """Name the test functions, in columns."""
+        return Tests._fields
+
+    @property
+    def first_end(self) -> int:
+        """Give the column from which on they are positive on real orbits."""
+        return FIRST_END
+
+    def happenings(self, before, after) -> Int[Array, ""]:
+        """Count what happens between two points; a multiplier that passes +1 at a fold is one such thing."""
+        passed = Tests(*(jnp.sign(before) * jnp.sign(after) < 0))
+        things = [passed.fold | passed.plus, passed.minus, jnp.stack(passed[FIRST_END:]).any()]
+        return jnp.stack(things).sum(dtype=jnp.int32)
+
 
 @runtime_checkable
 class Path(Protocol):
@@ -137,6 +154,14 @@ class Path(Protocol):
     def sequence(self) -> Sequence:
         """Walls of the orbits."""
 
+    @property
+    def test_names(self) -> tuple[str, ...]:
+        """Names of the test functions, in columns."""
+
+    @property
+    def first_end(self) -> int:
+        """The column from which on they are positive on real orbits."""
+
     def pair_and_knots(self, y) -> tuple[ImpactPair, Float[AnyArray, "*orbit impact 3"]]:
         """Give the orbits of points, many along a leading axis."""
 
@@ -145,6 +170,9 @@ class Path(Protocol):
 
     def tests(self, y, tangent, former) -> Iterable[Array]:
         """Compute the test functions at a point with its tangent, reached along a former tangent."""
+
+    def happenings(self, before, after) -> Int[Array, ""]:
+        """Count what happens between two points, by their test functions."""
 
 
 class _Corrected(NamedTuple):
@@ -188,28 +216,130 @@ class BranchPlace(NamedTuple):
     corrections: np.ndarray
 
 
-@partial(jitted, often=True)
-def _corrected(paths: Path, y, tangent, length) -> _Corrected:
-    """Go on from points of paths by an arclength each."""
-    guess = y + length[:, None] * tangent
-    return jax.vmap(_correct)(paths, guess, tangent)
+class Walker(NamedTuple):
+    """A lane on its way, or a row a lane.
+
+    Attributes:
+        y, tangent, tests: Its last point.
+        length: Of the next step.
+        passed: Points until then.
+        going: Whether there is to be a next step.
+        closed: Whether it has come by its start again.
+        start, began: Unknowns and tangent of its first point.
+        points: How many there may be.
+    """
+
+    y: Float[AnyArray, "*lane unknown"]
+    tangent: Float[AnyArray, "*lane unknown"]
+    tests: Float[AnyArray, "*lane test"]
+    length: Float[AnyArray, "*lane"]
+    passed: Int[AnyArray, "*lane"]
+    going: Bool[AnyArray, "*lane"]
+    closed: Bool[AnyArray, "*lane"]
+    start: Float[AnyArray, "*lane unknown"]
+    began: Float[AnyArray, "*lane unknown"]
+    points: Int[AnyArray, "*lane"]
+
+
+class Pace(NamedTuple):
+    """How long steps are, and which are refused; see `ContinuationSettings`."""
+
+    max_step: Any
+    min_step: Any
+    min_cosine: Any
+    crowded_step: Any
+    growth: Any
+    easy_corrections: Any
+    easy_bend: Any
+    closing_steps: Any
+
+
+def pace(settings: ContinuationSettings) -> Pace:
+    """Read the pace of a walk."""
+    given = {name: getattr(settings, name) for name in Pace._fields}
+    return Pace(**{name: np.int32(x) if isinstance(x, int) else np.float64(x) for name, x in given.items()})
+
+
+_ANY = pace(DEFAULT)  # That of a step that is not judged does not matter.
+
+
+class Strides(NamedTuple):
+    """Steps that lanes tried, in order: where they led, how long they were, whether they were taken."""
+
+    place: BranchPlace
+    length: np.ndarray
+    taken: np.ndarray
+
+
+def _try(path: Path, rules: Pace, at: Walker) -> tuple[Walker, Strides]:
+    """Try a step; one that does not do is halved."""
+    corrected: Any = _correct(path, at.y + at.length * at.tangent, at.tangent)
+    y, tangent, size, corrections = corrected
+    tests: Any = jnp.stack([*path.tests(y, tangent, at.tangent)])
+    straight = tangent @ at.tangent
+    # Newton may end on another path, or far along this one: neither its direction nor its distance fits then.
+    near = jnp.linalg.norm(y - at.y) < 2 * at.length
+    # Of two things within a step one may hide the other's change of sign, so that each gets a step of its own.
+    single = (path.happenings(at.tests, tests) <= 1) | (at.length < rules.crowded_step)
+    # A path that sets out from a graze does not know yet what is clear: all must be after the first step.
+    clear = ~(jnp.isnan(at.tests) & (tests <= 0))[path.first_end :].any()
+    taken = at.going & (size <= path.newton_tolerance) & (straight > rules.min_cosine) & near & single & clear
+    # Past a grazing or a bound there is no orbit. The first such point is kept: between it and the last is the end.
+    real = (tests[path.first_end :] > 0).all() | ~taken
+    easy = (corrections <= rules.easy_corrections) & (straight > 1 - rules.easy_bend * (1 - rules.min_cosine))
+    longer = jnp.where(easy, jnp.minimum(rules.growth * at.length, rules.max_step), at.length)
+    length, passed = jnp.where(taken, longer, 0.5 * at.length), at.passed + taken.astype(jnp.int32)
+    old, new = (at.y, at.tangent, at.tests), (y, tangent, tests)
+    on = [jnp.where(taken, *both) for both in zip(new, old, strict=True)]
+    # A closed path comes by its start again, in the same direction.
+    home = (jnp.linalg.norm(on[0] - at.start) < rules.max_step) & (on[1] @ at.began > rules.min_cosine)
+    home = at.going & home & (passed > rules.closing_steps)
+    going = at.going & (length > rules.min_step) & real & (passed < at.points) & ~home
+    walker = at._replace(
+        y=on[0], tangent=on[1], tests=on[2], length=length, passed=passed, going=going, closed=at.closed | home
+    )
+    tried: Any = BranchPlace(y, tangent, tests, size, corrections), at.length, taken
+    return walker, Strides(*tried)
+
+
+# Between two calls of a program a millisecond passes, as long as a step takes: one call tries so many steps.
+_TRIALS = 16
 
 
 @partial(jitted, often=True)
-def _tested(paths: Path, y, tangent, former) -> Array:
-    """Compute the test functions at points of paths, in columns."""
-    return jnp.stack([*jax.vmap(lambda path, *at: path.tests(*at))(paths, y, tangent, former)], axis=1)
+def _stride(paths: Path, at: Walker, rules: Pace, trials: Int[AnyArray, ""]) -> tuple[Walker, Strides]:
+    """Try so many steps with all lanes, or until none goes on; after that the rows [lane, trial] hold zeros."""
+    each = jax.vmap(_try, in_axes=(0, None, 0))
+    _, tried = jax.eval_shape(each, paths, rules, at)
+    none = jax.tree.map(lambda x: jnp.zeros((x.shape[0], _TRIALS, *x.shape[1:]), x.dtype), tried)
+
+    def once(carry):
+        trial, at, tried = carry
+        at, new = each(paths, rules, at)
+        return trial + 1, at, jax.tree.map(lambda rows, one: rows.at[:, trial].set(one), tried, new)
+
+    def going(carry):
+        trial, at, _ = carry
+        return (trial < trials) & at.going.any()
+
+    _, at, tried = lax.while_loop(going, once, (jnp.int32(0), at, none))
+    return at, tried
 
 
-def _advanced(rows: tuple[Path, Any, Any, Any]) -> BranchPlace:
-    paths, y, tangent, length = rows
-    # Two programs, compiled at the same time. Both are given NumPy's arrays: of JAX's the second would be another one.
-    begin(_tested, paths, y, tangent, tangent)
-    at = jax.tree.map(np.asarray, _corrected(paths, y, tangent, length))
-    tests = np.asarray(_tested(paths, at.y, at.tangent, tangent))
-    return BranchPlace(at.y, at.tangent, tests, at.size, at.corrections)
+def stride(paths: Path, at: Walker, rules: Pace, trials: int = _TRIALS) -> tuple[Walker, Strides]:
+    """Try a few steps with every lane: the compiled program behind every step and every search."""
+    number: Any = np.int32(trials)
+    return tiles.map_tiles(lambda rows: _stride(rows[0], rows[1], rules, number), (paths, at), BATCHES)
 
 
 def advance(paths: Path, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
-    """Go on from points of paths by an arclength each: the compiled programs behind every step and every search."""
-    return tiles.map_tiles(_advanced, (paths, y, tangent, length), BATCHES)
+    """Go on from points of paths by an arclength each, whatever comes of it."""
+    lanes = len(y)
+    zero, yes, unknown = (
+        np.zeros(lanes, np.int32),
+        np.full(lanes, True),
+        np.full((lanes, len(paths.test_names)), np.nan),
+    )
+    at: Any = y, tangent, unknown, length, zero, yes, ~yes, y, tangent, zero
+    _, tried = stride(paths, Walker(*at), _ANY, 1)
+    return jax.tree.map(lambda leaf: leaf[:, 0], tried.place)

@@ -13,9 +13,9 @@ from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import symmetry
 from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
-from vijax.orbits.arclength_walk import Walked, WalkRules
+from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
-from vijax.orbits.events import BranchEvent, Point, events, happenings, kind_of, locate, orbits_at
+from vijax.orbits.events import BranchEvent, Point, events, kind_of, locate, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
 from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit
 from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
@@ -162,8 +162,7 @@ def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings
         each = [jax.tree.map(lambda leaf, i=lane: leaf[i], arcs) for lane in range(len(walked))]
         return [_piece(arc, one, settings, first) for arc, one, first in zip(each, walked, begun, strict=True)]
 
-    followed = follow_pieces(arcs, first, making, points, WalkRules(settings, happenings, FIRST_END))
-    return [Branch(along, *one) for one in followed]
+    return [Branch(along, *one) for one in follow_pieces(arcs, first, making, points, settings)]
 
 
 def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool) -> Piece:

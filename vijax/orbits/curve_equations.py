@@ -41,6 +41,7 @@ class CurveTests(NamedTuple):
     cubic: Float[Array, ""]  # that of a flip, on which side doubled orbits lie; 1 until `curve_events` asks for it
     plus: Float[Array, ""]  # A multiplier of a grazing orbit passes +1 where it changes sign.
     minus: Float[Array, ""]  # One passes -1 here.
+    resonance: Float[Array, ""]  # at a graze of a rigid wall: how orbits with an impact there depart, as a square root
     # At a graze the acceleration away from the wall that is touched; at a limit how far off all other impacts are.
     push: Float[Array, ""]
     speed: Float[Array, ""]  # the clearances of `Tests`, but for the graze itself
@@ -177,12 +178,14 @@ class CurvePath(eqx.Module):
         """Compute the test functions at a point with its tangent, reached along a former tangent."""
         pair, knots = self.pair_and_knots(y)
         one = jnp.ones_like(pair.d)
-        plus, minus, push, touches = one, one, one, {}
+        plus, minus, push, resonance, touches = one, one, one, one, {}
         if self.condition in ("touch", "split"):
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
             here = jnp.arange(knots.shape[0], dtype=jnp.int32) == self.touch.impact
             touches = {self.condition: jnp.where(here, y[-3], jnp.nan)}
             push = self._push(pair, knots, y[-3])
+            if pair.rigid:
+                resonance = shooting.returned(pair, self.sequence, knots, self.touch.impact, y[-3])
         elif self.device is not None and self.touch.alike is not None:
             plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
             loads = self._loads(self.device, y[-2:], pair, knots)
@@ -195,6 +198,7 @@ class CurvePath(eqx.Module):
             cubic=one,
             plus=plus,
             minus=minus,
+            resonance=resonance,
             push=push,
             speed=room.speed,
             flight=room.flight,
@@ -206,15 +210,26 @@ class CurvePath(eqx.Module):
             high_second=1 - z[1],
         )
 
+    @property
+    def test_names(self) -> tuple[str, ...]:
+        """Name the test functions, in columns."""
+        return CurveTests._fields
+
+    @property
+    def first_end(self) -> int:
+        """Give the column from which on they are positive on real orbits."""
+        return FIRST_CURVE_END
+
+    def happenings(self, before, after) -> Int[Array, ""]:
+        """Count what happens between two points; of ends the first alone matters."""
+        # A step begins the way that it goes.
+        met = jnp.sign(before.at[TURN].set(1.0)) * jnp.sign(after) < 0
+        things = jnp.append(met[:FIRST_CURVE_END], met[FIRST_CURVE_END:].any())
+        return things.sum(dtype=jnp.int32)
+
 
 def passed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Say which test functions change sign between rows of them; a step begins the way that it goes."""
     begun = np.sign(before)
     begun[:, TURN] = 1.0
     return begun * np.sign(after) < 0
-
-
-def happenings_on_curves(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Count what happens between two rows of test functions; of ends the first alone matters."""
-    met = passed(before, after)
-    return met[:, :FIRST_CURVE_END].sum(axis=1) + met[:, FIRST_CURVE_END:].any(axis=1)

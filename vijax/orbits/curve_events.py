@@ -35,8 +35,9 @@ class CurvePoint(NamedTuple):
 
     Attributes:
         kind: "cusp", "generalised flip", "degenerate pitchfork", "fold-graze", "flip-graze", "pitchfork-graze", "double
-            graze", "degenerate graze" (no acceleration where the ball touches); on a limit "fold", "flip", "pitchfork"
-            and "graze at a limit", "double limit" (another impact is there, too).
+            graze", "degenerate graze" (no acceleration where the ball touches), "resonant graze" (at a rigid wall: no
+            root of the parameter's change is in the orbits with an impact there, whose folds and flips begin); on a
+            limit "fold", "flip", "pitchfork" and "graze at a limit", "double limit" (another impact is there, too).
         test: What grazes besides, where orbits cease to be real: flight, impact, contact or exit; else "". At soft
             walls it has the name that fits the orbit with fewer impacts, as with a branch's `Point`.
         values: Of both parameters.
@@ -149,12 +150,18 @@ def _named(path: CurvePath, test: int, y: np.ndarray, kind: str, settings: Conti
     if name in ("plus", "minus"):
         flip = "pitchfork" if bool(path.sequence.mirrored) else "flip"
         return f"{'fold' if name == 'plus' else flip}{' at a limit' if limit else '-graze'}", False
+    if name == "resonance":
+        return "resonant graze", False
     if name == "push":
         return ("double limit" if limit else "degenerate graze"), True
     if name in _TEST and limit:
         return "graze at a limit", True
+    if name in _TEST and kind.startswith("grazing"):
+        # Where a simpler orbit touches, its mirror pair or doubled orbits touch twice.
+        simple = _bifurcated(orbits_at(path, y[None]), settings)
+        return (f"{simple}-graze" if simple else "double graze"), True
     if name in _TEST:
-        return ("double graze" if kind.startswith("grazing") else f"{kind}-graze"), True
+        return f"{kind}-graze", True
     bound, _, which = name.partition("_")
     return f"{path.along[which == 'second']} {bound}", True
 
@@ -164,8 +171,13 @@ def _turning(orbit: Orbit, settings: ContinuationSettings) -> tuple[str, bool]:
 
     There the curve goes on with the other one of the pair, or with the same orbit shifted, over the same places.
     """
+    simple = _bifurcated(orbit, settings)
+    return {"pitchfork": "degenerate pitchfork", "flip": "generalised flip"}.get(simple, "cusp"), bool(simple)
+
+
+def _bifurcated(orbit: Orbit, settings: ContinuationSettings) -> str:
+    """Say what a mirror pair, or doubled orbits, have come back to where they are a simpler orbit; else nothing."""
     if not bool(orbit.sequence.mirrored[0]) and bool(symmetry.symmetric(orbit, settings.asymmetry)[0]):
-        return "degenerate pitchfork", True
-    if int(orbit_properties.counts(orbit, settings.asymmetry).period[0]) < 0.5 * float(orbit.sequence.span[0]):
-        return "generalised flip", True
-    return "cusp", False
+        return "pitchfork"
+    period = int(orbit_properties.counts(orbit, settings.asymmetry).period[0])
+    return "flip" if period < 0.5 * float(orbit.sequence.span[0]) else ""

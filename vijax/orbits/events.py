@@ -59,13 +59,6 @@ def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.sign(before) * np.sign(after) < 0
 
 
-def happenings(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Count what happens between two points; a multiplier that passes +1 at a fold is one such thing."""
-    passed = Tests(*changed(before, after).T)
-    ends = np.any(passed[FIRST_END:], axis=0)
-    return (passed.fold | passed.plus).astype(int) + passed.minus + ends
-
-
 class BranchEvent(NamedTuple):
     """A sign change: the point before it, the arclength from there, of which test function, the point itself."""
 

@@ -11,12 +11,12 @@ from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
-from vijax.orbits.arclength_step import FIRST_END, Arc, Tests, advance
-from vijax.orbits.arclength_walk import Walked, WalkRules, walk
+from vijax.orbits.arclength_step import Arc, Tests, advance
+from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.continuation import arcs_from, heading
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start
-from vijax.orbits.events import Point, changed, happenings, locate
+from vijax.orbits.events import Point, changed, locate
 from vijax.orbits.limits import near_limits
 from vijax.orbits.map_borders import LabelledPlane
 from vijax.orbits.parameter import tilts
@@ -169,7 +169,7 @@ def _met(
     twice = np.tile(np.arange(size), 2)
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), heading(first, -1.0), heading(first, 1.0))
     paths = jax.tree.map(lambda leaf: leaf[twice], arcs)
-    walked = walk(paths, both, max_points, WalkRules(settings, happenings, FIRST_END))
+    walked = walk(paths, both, max_points, settings)
     still = plane.axes[1 - way][cells[twice, 1 - way]]
     return _starts(paths, walked, still, way, settings)
 

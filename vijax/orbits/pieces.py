@@ -12,7 +12,7 @@ import numpy as np
 from vijax.model.records import Status
 from vijax.orbits import periodic
 from vijax.orbits.arclength_step import BranchPlace, Path
-from vijax.orbits.arclength_walk import Walked, WalkRules, walk
+from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.orbit_properties import marks
 from vijax.orbits.periodic import Orbit
@@ -53,16 +53,17 @@ Of one that does not, the first point is the graze at which the piece before it 
 """
 
 
-def follow_pieces(paths: Path, first: BranchPlace, making: Making, points: int, rules: WalkRules) -> list[Followed]:
+def follow_pieces(
+    paths: Path, first: BranchPlace, making: Making, points: int, settings: ContinuationSettings
+) -> list[Followed]:
     """Follow one way from every start, through grazes at soft walls.
 
     Args:
         paths, first: What is followed, a lane a row, and where from.
         making: See `Making`.
         points: Most points of a path.
-        rules: See `walk`.
+        settings: Of the steps, and of how many grazes are gone through.
     """
-    settings = rules.settings
     ways: list[list[Piece]] = [[] for _ in first.y]
     going = [(lane, *jax.tree.map(lambda leaf, i=lane: leaf[i], (paths, first))) for lane in range(len(ways))]
     while going:
@@ -72,7 +73,7 @@ def follow_pieces(paths: Path, first: BranchPlace, making: Making, points: int, 
             lanes = list(chosen)
             some, places = (jax.tree.map(lambda *leaves: np.stack(leaves), *row) for row in rows)
             left = np.array([points - _size(ways[lane]) for lane in lanes])
-            walked = walk(some, places, left, rules)
+            walked = walk(some, places, left, settings)
             for lane, piece in zip(lanes, making(lanes, some, walked, [not ways[i] for i in lanes]), strict=True):
                 ways[lane].append(piece)
         on = [(lane, ways[lane][-1].beyond) for lane, _, _ in going if _goes_on(ways[lane], points, settings)]

@@ -301,6 +301,28 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
     return jnp.where(sequence.mirrored, -1.0, 1.0) * around
 
 
+def returned(pair: ImpactPair, sequence: Sequence, knots: Knots, impact: Int[Array, ""], wait) -> Float[Array, ""]:
+    """Compute how far u is off once around, over how far u' was, from so long after an impact at a rigid wall.
+
+    Where the ball just touches a wall then, orbits that hit it there depart from the graze by their speed times this.
+    """
+    side, _, joined = _joined(sequence, knots)
+    t, speed, _, next_t, _ = joined.T
+    flight, index = next_t - t, jnp.arange(side.size, dtype=jnp.int32)
+    count = sequence.real.sum(dtype=jnp.int32)
+
+    def one(before, here):
+        place, real = here
+        hit = flow.rigid_matrix(pair.r, flow.acceleration(pair.gamma, t[place]), side[place] * speed[place])
+        after = flow.flight_matrix(jnp.where(place == impact, wait, flight[place]))
+        return jnp.where(real, after @ hit @ before, before), None
+
+    # From there the impacts follow in their order, and that before it is the last.
+    order = (impact + 1 + index) % jnp.maximum(count, 1)
+    around, _ = lax.scan(one, flow.flight_matrix(flight[impact] - wait), (order, index < count))
+    return jnp.where(sequence.mirrored, -1.0, 1.0) * around[0, 1]
+
+
 # Speed into a rigid wall below which its matrix is weighed down. It is asked when weighted matrices vanish, no more, so
 # that it may be anything that is small beside an impact.
 _SLOW = 0.1
