@@ -1,8 +1,11 @@
 """Where the scripts are, and a stand-in for the engine."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from vijax.batch import simulate
 
@@ -18,3 +21,11 @@ def stand_in(pair, u0, v0, scale, device, *, count, **settings) -> simulate.Summ
     wide, narrow = ("P", "P_stderr", "energy_ratio"), ("period", "impacts_left", "impacts_right", "status")
     fields = {name: mark for name in simulate.Summary.__dataclass_fields__}
     return simulate.Summary(**fields | dict.fromkeys(wide, energy) | dict.fromkeys(narrow, 0 * whole))
+
+
+@contextmanager
+def no_cell_runs() -> Iterator[None]:
+    """Make maps whose cells are not run, where what a cell does is not asked."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "summarise", stand_in)
+        yield

@@ -7,8 +7,7 @@ import pytest
 
 import vijax
 from tests.explorer.drawn_curves import drawn_curves
-from tests.helpers import stand_in
-from vijax.batch import simulate
+from tests.helpers import no_cell_runs
 from vijax.explorer import answers, door, overlay, recipes, view
 from vijax.explorer.plane import explored
 from vijax.explorer.source import Source
@@ -20,8 +19,7 @@ AXES = {"d": np.linspace(0.2, 0.3, 3), "kappa": np.geomspace(20.0, 320.0, 3)}  #
 @pytest.fixture(scope="module", autouse=True)
 def _at_once():
     """Curves lie over a map whatever its cells do, so that no cell has to run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "summarise", stand_in)
+    with no_cell_runs():
         yield
 
 

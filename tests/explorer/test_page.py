@@ -10,8 +10,7 @@ from bokeh.document import Document
 
 import vijax
 from tests.explorer.drawn_curves import drawn_curves
-from tests.helpers import stand_in
-from vijax.batch import simulate
+from tests.helpers import no_cell_runs
 from vijax.explorer import export, server, view
 from vijax.explorer import page as room
 from vijax.explorer.jobs import Crew
@@ -24,8 +23,7 @@ from vijax.explorer.warming import Warmth, warm
 @pytest.fixture(scope="module")
 def power():
     """A map whose cells are not run: a page computes none of it by itself."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "summarise", stand_in)
+    with no_cell_runs():
         return vijax.sweep(d=np.linspace(0.1, 0.3, 4), kappa=np.geomspace(3, 400, 4))
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import vijax
-from tests.helpers import stand_in
-from vijax.batch import simulate
+from tests.helpers import no_cell_runs
 from vijax.cli.main import vijax as commands
 from vijax.explorer import answers, basin, branch, line, optimum, recipes, view
 from vijax.explorer.plane import cell, explored
@@ -41,8 +40,7 @@ def heard(monkeypatch):
 @pytest.fixture(scope="module")
 def found():
     """A cell of a rigid and of a soft map over quantities of a device that is not the usual one."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "summarise", stand_in)
+    with no_cell_runs():
         axes = {"s": np.linspace(0.1, 0.3, 3), "omega0": np.geomspace(40, 400, 3), "beta": -0.1, "r": 0.6}
         made = vijax.sweep(**axes, omega=4.0, device=vijax.Harvester(V=1500.0), periods=500)
     plane = explored(made)

@@ -11,8 +11,7 @@ from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 import vijax
-from tests.helpers import stand_in
-from vijax.batch import simulate
+from tests.helpers import no_cell_runs
 from vijax.explorer import door, server, worker
 from vijax.explorer.source import Source
 
@@ -20,8 +19,7 @@ from vijax.explorer.source import Source
 @pytest.fixture(scope="module", autouse=True)
 def _at_once():
     """Servers show a map whatever its cells do, so that no cell has to run."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "summarise", stand_in)
+    with no_cell_runs():
         yield
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import vijax
-from tests.helpers import stand_in
-from vijax.batch import simulate
+from tests.helpers import no_cell_runs
 from vijax.cli.main import main
 from vijax.explorer import answers, recipes, view
 from vijax.explorer.branch import CellBranch
@@ -20,8 +19,7 @@ COORDINATES = ("d", "kappa", "r", "gamma", "u0", "v0")
 
 def unrun(**axes):
     """Make a map without running it: what a cell is does not depend on what it does."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulate, "summarise", stand_in)
+    with no_cell_runs():
         return vijax.sweep(**axes)
 
 

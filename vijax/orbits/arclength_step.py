@@ -1,14 +1,9 @@
-"""A branch of periodic orbits as a path in the space of knots and one parameter, and one step along it or another path.
-
-The orbit's equations go on through grazing into orbits that are none (`shooting`). What makes an orbit real, and what
-marks a bifurcation, are smooth functions along the curve: its test functions.
-"""
+"""A step along a path of periodic orbits: a branch (`branch_path`), or a curve of bifurcations (`curve_equations`)."""
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,9 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax.model.pair import ImpactPair
-from vijax.orbits import grazing, shooting
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings
-from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import ring_solve, tiles
 from vijax.runtime.arrays import AnyArray
@@ -26,24 +19,6 @@ from vijax.runtime.programs import jitted
 from vijax.runtime.ring_solve import Ring
 
 BATCHES = (8, 64, 512)  # lanes of one compiled call
-
-
-class Tests(NamedTuple):
-    """Functions whose sign changes mark what happens on a branch; those from `speed` on are positive on real orbits."""
-
-    fold: Float[Array, ""]  # the parameter's share of the tangent; at soft walls over the least speed
-    plus: Float[Array, ""]  # det(M - 1): a multiplier passes +1
-    minus: Float[Array, ""]  # det(M + 1): a multiplier passes -1
-    speed: Float[Array, ""]  # least speed into a wall: an impact vanishes
-    flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
-    contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
-    exit: Float[Array, ""]  # least speed away from a wall, over that into it: the ball stays
-    low: Float[Array, ""]
-    high: Float[Array, ""]
-
-
-FOLD, PLUS = Tests._fields.index("fold"), Tests._fields.index("plus")
-FIRST_END = Tests._fields.index("speed")
 
 
 class PathEquations(NamedTuple):
@@ -54,93 +29,19 @@ class PathEquations(NamedTuple):
     ring: Ring
 
 
-class Arc(eqx.Module):
-    """What a lane follows: the orbit's parameters where it began, its walls, and which parameter moves.
-
-    Attributes:
-        start: The parameter where the orbit began.
-        steepest: g/A of the device, gamma of a vertical tube (along="beta" only).
-        low, high: Bounds of the parameter; their distance is the unit of its share of the arclength.
-        along: Which parameter moves.
-        newton_tolerance, max_corrections: When a step has arrived; see `ContinuationSettings`. Static, as all else that
-            the compiled loop asks before each correction.
-    """
-
-    pair: ImpactPair
-    sequence: Sequence
-    start: Values
-    steepest: Values
-    low: Values
-    high: Values
-    along: str = eqx.field(static=True)
-    newton_tolerance: float = eqx.field(static=True)
-    max_corrections: int = eqx.field(static=True)
-
-    def at(self, x: Values) -> ImpactPair:
-        """Give the pair at a value of the parameter."""
-        return moved(self.pair, self.along, x, self.start, self.steepest)
-
-    def unpack(self, y):
-        """Split a point of the branch, or many along leading axes, into knots and parameter."""
-        return y[..., :-1].reshape(*y.shape[:-1], -1, 3), y[..., -1] * (self.high - self.low)
-
-    def pair_and_knots(self, y) -> tuple[ImpactPair, Float[AnyArray, "*orbit impact 3"]]:
-        """Give the orbits of points, many along a leading axis."""
-        knots, x = self.unpack(y)
-        return self.at(x), knots
-
-    def equations(self, y) -> PathEquations:
-        """Compute the gap and its derivatives in knots and parameter."""
-        knots, x = self.unpack(y)
-        pair, moved = jax.jvp(self.at, (x,), (self.high - self.low,))
-        gap, ring = shooting.linearise(pair, self.sequence, knots, moved)
-        return PathEquations(gap, jnp.zeros(0, y.dtype), ring)
-
-    def tests(self, y, tangent, former) -> Tests:
-        """Compute the test functions; which way the step was that led here does not matter to them."""
-        knots, x = self.unpack(y)
-        pair = self.at(x)
-        around = shooting.monodromy(pair, self.sequence, knots)
-        trace = around[0, 0] + around[1, 1]
-        determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
-        room = grazing.between(pair, self.sequence, knots).clearance
-        # At a soft wall the parameter goes as the square of the speed of an impact that fades: at that graze its share
-        # of the tangent vanishes without a fold. Over the speed it does not, and has the same sign on real orbits.
-        return Tests(
-            fold=tangent[-1] if pair.rigid else tangent[-1] / room.speed,
-            plus=1 - trace + determinant,
-            minus=1 + trace + determinant,
-            speed=room.speed,
-            flight=room.flight,
-            contact=room.contact,
-            exit=room.exit,
-            low=x - self.low,
-            high=self.high - x,
-        )
-
-    @property
-    def test_names(self) -> tuple[str, ...]:
-        """Name the test functions, in columns."""
-        return Tests._fields
-
-    @property
-    def first_end(self) -> int:
-        """Give the column from which on they are positive on real orbits."""
-        return FIRST_END
-
-    def happenings(self, before, after) -> Int[Array, ""]:
-        """Count what happens between two points; a multiplier that passes +1 at a fold is one such thing."""
-        passed = Tests(*(jnp.sign(before) * jnp.sign(after) < 0))
-        things = [passed.fold | passed.plus, passed.minus, jnp.stack(passed[FIRST_END:]).any()]
-        return jnp.stack(things).sum(dtype=jnp.int32)
-
-
 @runtime_checkable
 class Path(Protocol):
-    """What a lane follows: a branch (`Arc`), or a curve of bifurcations in two parameters (`curve_equations`).
+    """What a lane follows: a branch (`branch_path`), or a curve of bifurcations in two parameters (`curve_equations`).
 
     Its points y are rows of unknowns, one more than there are equations.
+
+    Attributes:
+        test_names: Of the test functions, in columns.
+        first_end: The column from which on they are positive on real orbits.
     """
+
+    test_names: ClassVar[tuple[str, ...]]
+    first_end: ClassVar[int]
 
     @property
     def newton_tolerance(self) -> float:
@@ -153,14 +54,6 @@ class Path(Protocol):
     @property
     def sequence(self) -> Sequence:
         """Walls of the orbits."""
-
-    @property
-    def test_names(self) -> tuple[str, ...]:
-        """Names of the test functions, in columns."""
-
-    @property
-    def first_end(self) -> int:
-        """The column from which on they are positive on real orbits."""
 
     def pair_and_knots(self, y) -> tuple[ImpactPair, Float[AnyArray, "*orbit impact 3"]]:
         """Give the orbits of points, many along a leading axis."""

@@ -12,8 +12,9 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import symmetry
-from vijax.orbits.arclength_step import FIRST_END, FOLD, Arc, BranchPlace, Tests, advance
+from vijax.orbits.arclength_step import BranchPlace, advance
 from vijax.orbits.arclength_walk import Walked
+from vijax.orbits.branch_path import FIRST_END, FOLD, Arc, Tests
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import BranchEvent, Point, events, kind_of, locate, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts

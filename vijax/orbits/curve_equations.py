@@ -6,7 +6,7 @@ membrane, as may be. Past the end of real orbits the equations go on, as those o
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -87,6 +87,9 @@ class CurvePath(eqx.Module):
         condition: Whether a multiplier is given, a wall touched in flight or from inside, or an impact at a limit.
         newton_tolerance, max_corrections: See `ContinuationSettings`.
     """
+
+    test_names: ClassVar[tuple[str, ...]] = CurveTests._fields
+    first_end: ClassVar[int] = FIRST_CURVE_END
 
     pair: ImpactPair
     sequence: Sequence
@@ -209,16 +212,6 @@ class CurvePath(eqx.Module):
             low_second=z[1],
             high_second=1 - z[1],
         )
-
-    @property
-    def test_names(self) -> tuple[str, ...]:
-        """Name the test functions, in columns."""
-        return CurveTests._fields
-
-    @property
-    def first_end(self) -> int:
-        """Give the column from which on they are positive on real orbits."""
-        return FIRST_CURVE_END
 
     def happenings(self, before, after) -> Int[Array, ""]:
         """Count what happens between two points; of ends the first alone matters."""

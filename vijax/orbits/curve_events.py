@@ -18,6 +18,7 @@ from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.criticality import cubic_coefficient
 from vijax.orbits.curve_equations import CUBIC, TURN, CurvePath, CurveTests, passed
+from vijax.orbits.curve_merging import merged
 from vijax.orbits.events import locate, onward, orbits_at
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.shooting import Sequence
@@ -27,6 +28,7 @@ from vijax.runtime.programs import jitted
 # Part of a tangent that lies in the plane at which a curve stands still there: beside a cusp it is the distance from
 # it, along a curve that only bends it is what it was.
 _STILL = 1e-4
+_MERGED = {"flip-graze": "flip", "pitchfork-graze": "pitchfork"}
 _TEST = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
 
@@ -109,8 +111,10 @@ def curve_events(
             continue
         path = jax.tree.map(lambda leaf, i=number: leaf[i], own)
         name, ends = _named(path, which, there[number], kinds[lane[number]], settings)
-        what = _TEST.get(CurveTests._fields[which], "")
-        events.append(CurveEvent(int(place[number]), float(s[number]), name, what, there[number], ends))
+        what, at = _TEST.get(CurveTests._fields[which], ""), there[number]
+        if path.condition in ("touch", "split") and name in _MERGED and what:
+            at = merged(path, at, _MERGED[name], settings)
+        events.append(CurveEvent(int(place[number]), float(s[number]), name, what, at, ends))
     return found
 
 

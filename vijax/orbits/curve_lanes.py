@@ -57,7 +57,7 @@ def lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: C
     for batch in batches.values():
         paths, y = _set_out(batch, plane, device, settings)
         limit = paths.device is not None
-        first = _beside(paths, y) if limit else _on(paths, y)
+        first = _beside(paths, y) if limit else on_curve(paths, y)
         near = np.abs(first.y - y).max(axis=1) < (_BESIDE if limit else settings.max_step)
         real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
         for index, good in enumerate(real & (first.size <= settings.newton_tolerance)):
@@ -86,7 +86,7 @@ def lanes_aside(begun: list[Offshoot], plane: Plane, device: Harvester, settings
     for start, ahead in begun:
         paths, y = _set_out([start], plane, device, settings)
         if ahead is None:
-            place = _on(paths, y)
+            place = on_curve(paths, y)
             y, tangent = place.y, place.tangent
         else:
             tangent = np.pad(ahead, (0, y.size - ahead.size))[None]
@@ -101,7 +101,7 @@ def lanes_aside(begun: list[Offshoot], plane: Plane, device: Harvester, settings
     return found
 
 
-def _on(paths: CurvePath, y: np.ndarray) -> BranchPlace:
+def on_curve(paths: CurvePath, y: np.ndarray) -> BranchPlace:
     """Correct points that lie on their curves already, to find the tangents there."""
     # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
     across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)

@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 NEEDED = ("kind", "label", "multiplier", "stable", "event", "end_first", "end_last")
 _OF_POINT = ("multiplier", "multiplier_product", "residual", "status", "stable")
 # Parts of the plane within which two points of one kind are one: each is located on every curve that meets it, to
-# about 1e-10, or to 1e-5 where doubled orbits come back to the simpler one; no two that were ever seen are nearer
-# than 1e-4.
-_SAME = 5e-5
+# about 1e-10, and no two that were ever seen are nearer than 1e-4.
+_SAME = 1e-6
 
 
 class NumberedPoint(NamedTuple):

@@ -62,7 +62,7 @@ def curve_start(point: Point, place: tuple[float, float], asymmetry: float) -> C
         return "the graze of an exit is that of an impact, or of a contact, which begin curves"
     if kind in ("grazing flight", "grazing contact"):
         inside = kind == "grazing contact"
-        index, wait, wall = (_shallowest if inside else _closest)(*_only(orbit))
+        index, wait, wall = (_shallowest if inside else _closest)(*alone(orbit))
         return CurveStart(kind if inside else "grazing", orbit, place, int(index), float(wait), float(wall))
     if kind == "grazing impact":
         return _without_impact(orbit, place)
@@ -76,7 +76,7 @@ def curve_start(point: Point, place: tuple[float, float], asymmetry: float) -> C
 _closest, _shallowest = jitted(grazing.closest_turn), jitted(grazing.shallowest_turn)
 
 
-def _only(orbit: Orbit):
+def alone(orbit: Orbit):
     """Give pair, sequence and knots of an orbit that is alone."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[0], (orbit.pair, orbit.sequence, orbit.knots))
 
@@ -86,7 +86,7 @@ def _without_impact(orbit: Orbit, place: tuple[float, float]) -> CurveStart | st
 
     From inside where the forcing holds the ball on its wall: the contact before goes on through the impact.
     """
-    pair, sequence, knots = _only(orbit)
+    pair, sequence, knots = alone(orbit)
     count = int(sequence.real.sum())
     index = int(np.where(sequence.real, knots[:, 1], np.inf).argmin())
     side, (t, _, stay) = int(sequence.side[index]), knots[index]

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from vijax.orbits import periodic, symmetry
-from vijax.orbits.arclength_step import FIRST_END, FOLD, PLUS, Arc, BranchPlace, Path, Tests, advance
+from vijax.orbits.arclength_step import BranchPlace, Path, advance
+from vijax.orbits.branch_path import FIRST_END, FOLD, PLUS, Arc, Tests
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.periodic import Orbit
 

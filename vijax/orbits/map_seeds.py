@@ -11,8 +11,9 @@ from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
-from vijax.orbits.arclength_step import Arc, Tests, advance
+from vijax.orbits.arclength_step import advance
 from vijax.orbits.arclength_walk import Walked, walk
+from vijax.orbits.branch_path import Arc, Tests
 from vijax.orbits.continuation import arcs_from, heading
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start

@@ -18,7 +18,8 @@ import numpy as np
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing
-from vijax.orbits.arclength_step import FIRST_END, Arc, BranchPlace, Path, Tests, advance
+from vijax.orbits.arclength_step import BranchPlace, Path, advance
+from vijax.orbits.branch_path import FIRST_END, Arc, Tests
 from vijax.orbits.events import orbits_at
 from vijax.orbits.orbit_properties import counts
 from vijax.orbits.periodic import SAME, Orbit

@@ -8,7 +8,8 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import orbit_properties, shooting, symmetry
-from vijax.orbits.arclength_step import BranchPlace, Tests
+from vijax.orbits.arclength_step import BranchPlace
+from vijax.orbits.branch_path import Tests
 from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, heading, set_out
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
@@ -37,7 +38,7 @@ def switch(
     """Follow the branch that bifurcates at a flip (twice the period) or at a pitchfork of an orbit closed half way.
 
     The doubled orbit is the same one run through twice, and what leaves it there is the null vector that changes sign
-    from one half to the other.
+    from one half to the other (`leaving`).
 
     Args:
         point: A flip, or a pitchfork on a branch of orbits closed half way (`symmetry.halved`).
@@ -57,16 +58,21 @@ def switch(
             f"orbits closed {'half way' if point.orbit.sequence.mirrored[0] else 'in full'}"
         )
     check_bounds(point.orbit.pair, along, within, one_device(device))
-    doubled = symmetry.doubled(point.orbit)
+    doubled, ahead = leaving(point.orbit)
     arcs, y = set_out(doubled, along, within, device, settings)
     begin_proofs(doubled.pair, doubled.sequence, doubled.knots)
-    knots = y[0, :-1].reshape(-1, 3)
-    pair, sequence = jax.tree.map(lambda x: x[0], (doubled.pair, doubled.sequence))
-    slope = np.asarray(_linearised(pair, sequence, knots).slope)
-    away = np.append(np.linalg.svd(slope)[2][-1], 0.0)[None]
+    away = np.append(ahead, 0.0)[None]
     # Test functions that vanish here would be met again at once.
     first = BranchPlace(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
     return [follow_arcs(arcs, heading(first, sign), along, points, settings)[0] for sign in (1.0, -1.0)]
+
+
+def leaving(orbit: Orbit) -> tuple[Orbit, np.ndarray]:
+    """Run through an orbit twice, and find how the knots of what bifurcates from it there leave it at first."""
+    twice = symmetry.doubled(orbit)
+    pair, sequence, knots = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (twice.pair, twice.sequence, twice.knots))
+    padded: Any = np.where(sequence.real[:, None], knots, 0.0)
+    return twice, np.linalg.svd(np.asarray(_linearised(pair, sequence, padded).slope))[2][-1]
 
 
 def _begins(point: Point) -> bool:
