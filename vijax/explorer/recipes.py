@@ -84,15 +84,16 @@ def of_motion(cell: ExploredCell, found: CellMotion) -> Recipe:
     """Say how a motion, its label, P and multipliers are had."""
     pair = cell.pair
     kappa = None if pair.kappa is None else float(pair.kappa)
+    point = f"along='r', values=[{cell.arguments['r']!r}], direction='up', periods={motion.SETTLE}, recorded_periods=1"
     lines = [
         "import vijax",
         f"found = vijax.sweep({_arguments(cell)})",
         f"pair = vijax.impact_pair({float(pair.d)!r}, {kappa!r}, {float(pair.r)!r}, {float(pair.gamma)!r})",
-        f"path = vijax.trajectory(pair, {cell.u0!r}, {cell.v0!r}, periods={motion.SETTLE})",
+        f"end = vijax.orbit_diagram({point}, {_arguments(cell, ('r', 'periods'))}).isel(r=0, strobe=-1)",
     ]
     if found.orbit is not None:
         period = int(found.numbers["period"])
-        lines.append(f"orbit = vijax.orbits_from_states(pair, path.states.u[-1], path.states.v[-1], period={period})")
+        lines.append(f"orbit = vijax.orbits_from_states(pair, end.u_strobe, end.v_strobe, period={period})")
         lines.append("vijax.orbit_labels(orbit), orbit.multipliers")
     return Recipe(f"vijax sweep {_options(cell)}", "\n".join(lines))
 
