@@ -17,6 +17,7 @@ from vijax.model.records import State, Status
 from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.programs import jitted
+from vijax.runtime.xla import once
 
 # The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
 # call, and few enough that the host waits for no long one after every ball has arrived.
@@ -80,6 +81,7 @@ def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArr
         idle = over | (index > asked.max_impacts)
         horizon = jnp.where(idle, 0.0, 2.0 * (asked.periods - state.n).astype(state.t.dtype) - state.t)
 
+        @once
         def fly():
             return jax.vmap(partial(exact.step, rolled=True))(pair, state, horizon)
 

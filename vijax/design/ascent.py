@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.design.design_settings import DEFAULT, DesignSettings
 from vijax.runtime.arrays import choose
+from vijax.runtime.xla import once
 
 _CONVERGED = 1e-6  # At this weight of the barrier a maximum is right to six digits.
 _ARRIVED = 1e-8  # A step this short is the last.
@@ -110,7 +111,8 @@ def ascend(
     """
     import optax  # here, as importing vijax must not load it
 
-    task = _Task(look, box, max_evaluations, optax.scale_by_lbfgs(settings.curvature_pairs), settings)
+    # Traced once for the shapes of what is seen, and for the loop.
+    task = _Task(once(look), box, max_evaluations, optax.scale_by_lbfgs(settings.curvature_pairs), settings)
     start = _begun(task, z, memory)
     return lax.while_loop(lambda c: c.going.any() & (c.iteration < max_evaluations), partial(_advance, task), start)
 

@@ -17,6 +17,7 @@ from vijax.runtime import ring_solve, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.programs import jitted
 from vijax.runtime.ring_solve import Ring
+from vijax.runtime.xla import once
 
 BATCHES = (8, 64, 512)  # lanes of one compiled call
 
@@ -202,11 +203,11 @@ _TRIALS = 16
 @partial(jitted, often=True)
 def _stride(paths: Path, at: Walker, rules: Pace, trials: Int[AnyArray, ""]) -> tuple[Walker, Strides]:
     """Try so many steps with all lanes, or until none goes on; after that the rows [lane, trial] hold zeros."""
-    each = jax.vmap(_try, in_axes=(0, None, 0))
+    each = once(jax.vmap(_try, in_axes=(0, None, 0)))
     _, tried = jax.eval_shape(each, paths, rules, at)
     none = jax.tree.map(lambda x: jnp.zeros((x.shape[0], _TRIALS, *x.shape[1:]), x.dtype), tried)
 
-    def once(carry):
+    def onward(carry):
         trial, at, tried = carry
         at, new = each(paths, rules, at)
         return trial + 1, at, jax.tree.map(lambda rows, one: rows.at[:, trial].set(one), tried, new)
@@ -215,7 +216,7 @@ def _stride(paths: Path, at: Walker, rules: Pace, trials: Int[AnyArray, ""]) -> 
         trial, at, _ = carry
         return (trial < trials) & at.going.any()
 
-    _, at, tried = lax.while_loop(going, once, (jnp.int32(0), at, none))
+    _, at, tried = lax.while_loop(going, onward, (jnp.int32(0), at, none))
     return at, tried
 
 

@@ -167,17 +167,25 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
     def each(pair):
         return jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
 
-    pieces, blocks = each(pair)
-    changes = [jax.jvp(lambda pair: each(pair)[0], (pair,), (change,))[1] for change in moved]
+    def along(change):
+        return jax.jvp(each, (pair,), (change,), has_aux=True)
+
+    if moved:
+        # All in one: equations that each derivative computed anew would be most of what is compiled of a curve.
+        together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *moved)
+        pieces, changes, blocks = jax.vmap(along, out_axes=(None, -1, None))(together)
+    else:
+        pieces, blocks = each(pair)
+        changes = jnp.zeros((*pieces.shape, 0), knots.dtype)
     real, dtype = sequence.real[:, None, None], knots.dtype
     # Where there is no impact the identity keeps the matrix regular, and the step there zero.
     ring = Ring(
         here=jnp.where(real, blocks[..., :3], jnp.eye(3, dtype=dtype)),
         there=jnp.where(real, jnp.pad(blocks[..., 3:], ((0, 0), (0, 0), (0, 1))), 0.0),
         closes=_following(sequence)[2],
-        beside=jnp.where(real, jnp.stack(changes, axis=-1), 0.0) if changes else jnp.zeros((*pieces.shape, 0), dtype),
+        beside=jnp.where(real, changes, 0.0),
         below=jnp.zeros((0, *pieces.shape), dtype),
-        corner=jnp.zeros((0, len(changes)), dtype),
+        corner=jnp.zeros((0, len(moved)), dtype),
     )
     return LinearisedEquations(jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1), ring)
 
