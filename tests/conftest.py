@@ -40,3 +40,19 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 settings.register_profile("vijax", deadline=None, max_examples=50)
 settings.register_profile("vijax-ci", settings.get_profile("vijax"), derandomize=True, database=None, print_blob=True)
 settings.load_profile("vijax-ci" if os.environ.get("CI") else "vijax")
+
+
+def pytest_addoption(parser):
+    """Take the option that half of the time of all tests is kept for."""
+    parser.addoption(
+        "--long", action="store_true", help="run the tests marked long, too: they take as long as the rest"
+    )
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out what is marked long, unless it is asked for: by the option, or by the name of a test."""
+    if config.getoption("--long") or any("::" in argument for argument in config.args):
+        return
+    left = [item for item in items if "long" in item.keywords]
+    items[:] = [item for item in items if "long" not in item.keywords]
+    config.hook.pytest_deselected(items=left)

@@ -326,6 +326,7 @@ def test_inclined_cells_know_the_50_digit_orbit_and_run_into_attractors():
     np.testing.assert_allclose(found.P[0, 0], float(orbit["P_J"]), rtol=1e-11)
 
 
+@pytest.mark.long
 def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     """Its rounds failed again and again, each beginning its window anew: 7,678 periods for 400."""
     counts = ["period", "impacts_left", "impacts_right"]
@@ -335,6 +336,7 @@ def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     assert found.periods_run < 1000
 
 
+@pytest.mark.long
 def test_single_precision_finds_the_same_periods():
     # It had called every seventh of these cells by twice its period: the decay of a flip, taken for the orbit.
     axes = {"d": np.linspace(0.05, 0.3, 36), "kappa": np.geomspace(3, 400, 36), "r": 0.5, "gamma": 0.1}

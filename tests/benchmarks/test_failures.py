@@ -40,6 +40,7 @@ def test_the_stability_map_is_drawn(tmp_path):
         charts.stability_map(found, tmp_path / "map.csv")
 
 
+@pytest.mark.long
 def test_order():
     (rk4, _), (_, tsit5) = measured("order")
     assert 0.7 < rk4 < 1.3
@@ -95,6 +96,7 @@ def test_grazing():
     assert tangent < 1e-3
 
 
+@pytest.mark.long
 def test_chatter():
     usual, vijax = measured("chatter")
     coarse, fine = np.split(usual, 2)
@@ -126,6 +128,7 @@ def test_resonance():
     assert np.all(vijax < 1e-14)
 
 
+@pytest.mark.long
 def test_single_precision():
     (first, *_, worst, labels), (*_, double, _) = measured("single_precision")
     assert 1e-9 < first < 1e-6

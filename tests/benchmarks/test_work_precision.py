@@ -32,6 +32,7 @@ def by_method(rows):
     return found
 
 
+@pytest.mark.long
 def test_every_row_has_a_time_and_an_error(rows):
     assert {"exact", "ode Tsit5", "numba RK4", "numba DP5 + events", "SciPy DOP853"} == set(by_method(rows))
     for row in rows:
@@ -40,12 +41,14 @@ def test_every_row_has_a_time_and_an_error(rows):
         assert 0 <= row.error <= row.worst < 0.1
 
 
+@pytest.mark.long
 def test_exact_is_the_most_accurate(rows):
     (exact,) = by_method(rows)["exact"]
     assert exact.worst < EXACT
     assert all(row.error > 100 * exact.error for row in rows if row is not exact)
 
 
+@pytest.mark.long
 def test_errors_fall_with_the_tolerance_and_with_the_step(rows):
     for method, settings in by_method(rows).items():
         for coarse, fine in itertools.pairwise(settings):
@@ -69,6 +72,7 @@ def test_derivative_in_fifty_digits_is_that_of_nearby_runs():
     assert (tool.deviation((up - down) / (2 * step), true) < 1e-6 * np.hypot(*true)).all()
 
 
+@pytest.mark.long
 def test_the_chart_has_a_panel_a_scene_and_names_every_line(rows, tmp_path):
     chaotic = [row._replace(scene="chaotic", measure="power", noise=1e-3) for row in rows]
     lost = [row._replace(scene="lost", error=math.inf) if row.method == "numba RK4" else row for row in rows]

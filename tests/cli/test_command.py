@@ -77,7 +77,10 @@ def timeless(said):
     return re.sub(r"in [\d.]+ s(, [\d.,e+]+ (\w+)/s)?$|^[\d.]+ s from", "in T s", said, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("name", RUNS)
+_LONG = ("branch", "compare")
+
+
+@pytest.mark.parametrize("name", [pytest.param(one, marks=pytest.mark.long) if one in _LONG else one for one in RUNS])
 def test_the_command_and_the_script_write_and_say_the_same(folder, capsys, monkeypatch, name):
     arguments, script, given = RUNS[name]
     ends = []

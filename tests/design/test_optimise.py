@@ -222,6 +222,7 @@ def test_what_only_your_limit_forbids_is_called_physical(found, depth, ratio, sa
     assert says in "\n".join(lines(describe(found[0], diagram=diagram)))
 
 
+@pytest.mark.long
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = optimise.optimise(
@@ -274,6 +275,7 @@ def test_devices_that_cannot_be_designed_are_told():
         optimise.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
 
 
+@pytest.mark.long
 def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
     nominal = found[0].best
     best = around.weighted(found[0], starts=16, points=5)
@@ -386,6 +388,7 @@ def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys):
         assert text in said
 
 
+@pytest.mark.long
 def test_designs_along_an_axis(folder, capsys):
     arguments = [
         *SMALL,

@@ -96,6 +96,7 @@ def test_attractors_by_steps_are_those_of_the_exact_engine(exact):
     assert found.attrs["solver"] == "Dopri8"
 
 
+@pytest.mark.long
 def test_windows_by_steps(exact):
     window = {"until": "window", "periods": 4, "outputs": ["impacts_per_period", "max_impact_speed"]}
     true = sweep(**PLANE, **window)
@@ -295,6 +296,7 @@ def test_hunt_crossley_maps():
     assert "hunt-crossley" in found.attrs["membrane"]
 
 
+@pytest.mark.long
 def test_a_plane_by_an_implicit_solver():
     """Its linear systems are LAPACK's, which no kernel may call."""
     told = {

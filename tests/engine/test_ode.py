@@ -281,6 +281,7 @@ def vector(method):
     return run
 
 
+@pytest.mark.long
 def test_derivatives_forward_and_reverse_over_twenty_impacts():
     x = jnp.asarray([0.2, 40.0, 0.5, 0.05, 0.02, 0.3])
     directions = jnp.eye(6)

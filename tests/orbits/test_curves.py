@@ -87,6 +87,7 @@ def grown(found):
     return curves.follow_curves([start], "d", {"d": (0.05, 0.35), "r": (0.2, 0.55)}, max_switches=1)
 
 
+@pytest.mark.long
 def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
     told = sorted((one.kind, int(one.orbit.count[0]), int(one.orbit.sequence.span[0])) for one in grown)
     # At the flip-graze the flip and the graze of the doubled orbit, at the resonant graze orbits with an impact more.
@@ -96,6 +97,7 @@ def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
         assert (np.asarray(curve.orbit.status)[1:-1] == Status.OK).all()
 
 
+@pytest.mark.long
 def test_a_fold_and_a_flip_touch_their_graze_at_its_resonance(grown):
     """Their distance grows as the square of the way along it (Simpson, Ghosh, arXiv 2602.22797)."""
     graze = next(one for one in grown if (one.kind, one.points[0].test) == ("grazing", "") and one.orbit.count[0] == 2)
@@ -230,6 +232,7 @@ def made_map(label=lambda d, r: d < pitchfork(r)):
     return xr.Dataset(found, coords={"d": d, "r": r, **still}, attrs={"wall": "rigid"})
 
 
+@pytest.mark.long
 def test_a_map_is_explained_by_the_curve_on_its_border():
     dataset = made_map()
     found = vijax.bifurcation_curves(dataset, max_rounds=1, round_borders=4)
@@ -316,6 +319,7 @@ def test_a_limit_of_penetration_is_where_it_is_known_to_be(limited):
     assert np.ptp(r) > 0.1
 
 
+@pytest.mark.long
 def test_limits_of_a_map_begin_at_its_cells():
     dataset = made_map()
     within = dataset["d"].values[:, None] < deep_gap(dataset["r"].values)
@@ -337,6 +341,7 @@ def test_impacts_at_a_limit_are_flown_as_deep(limited):
     assert (np.asarray(curve.orbit.residual) < 1e-12).all()
 
 
+@pytest.mark.long
 def test_a_limit_of_energy_holds_on_soft_walls_as_the_device_changes():
     """Along omega units of length and energy change as well; the impact map flies what is on the curve."""
     device = Harvester(omega0=60.0, s=0.2)

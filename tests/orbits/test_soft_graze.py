@@ -135,6 +135,7 @@ def test_the_dataset_says_how_a_branch_goes_on(loop, tmp_path):
         assert np.nanmax(np.concatenate(steps)) < 0.05
 
 
+@pytest.mark.long
 def test_a_fold_goes_on_through_its_graze():
     found = vijax.find_orbits(vijax.impact_pair(0.2, 40.0, 0.5, 0.01), "RL", guesses=256)
     plain = replace(PLAIN, max_grazings=0)
@@ -162,6 +163,7 @@ def test_a_fold_goes_on_through_its_graze():
     assert np.abs(np.array(met) - d).min() < 1e-10
 
 
+@pytest.mark.long
 def test_a_curve_of_parting_contacts_is_where_branches_meet_them(orbits):
     half, low = symmetry.halved(orbits[0]), (0.02, 0.3)
     (down,) = vijax.follow_orbits(half, "d", low, direction="down")

@@ -477,6 +477,7 @@ def optimised(monkeypatch):
     simulate.compiled.cache_clear()
 
 
+@pytest.mark.long
 def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
     d, kappa = MIXED["d"], MIXED["kappa"]
     mixed = sweep(d=d, kappa=kappa, r=0.6)
@@ -495,6 +496,7 @@ def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
             np.testing.assert_array_equal(got, wanted, err_msg=f"{name}, {where}")
 
 
+@pytest.mark.long
 def test_periodic_cells_hardly_depend_on_what_else_is_wanted():
     mixed = sweep(**MIXED, r=0.6)
     other = sweep(**MIXED, r=0.6, outputs=["restitution", "contact_time", "period"])
@@ -513,6 +515,7 @@ def test_physical_and_dimensionless_axes_give_the_same_map(plane):
     np.testing.assert_array_equal(physical["period"], plane["period"])
 
 
+@pytest.mark.long
 def test_variants_are_what_separate_sweeps_give(plane):
     both = sweep(d=[0.2, 0.3], kappa=400.0, A=[1.0, 2.0], periods=LONG)
     np.testing.assert_allclose(both["P"].sel(A=1.0), plane["P"].sel(d=[0.2, 0.3], kappa=400.0), rtol=1e-12)

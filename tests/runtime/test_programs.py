@@ -116,7 +116,11 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("name", CALLS)
+# Each is several programs of many seconds.
+_LONG = ("continuation.follow", "optimise")
+
+
+@pytest.mark.parametrize("name", [pytest.param(one, marks=pytest.mark.long) if one in _LONG else one for one in CALLS])
 def test_other_numbers_compile_nothing(name, known):
     CALLS[name](0, known)
     with compilations() as programs:
@@ -125,6 +129,7 @@ def test_other_numbers_compile_nothing(name, known):
     assert not programs
 
 
+@pytest.mark.long
 def test_derivatives_and_batches_of_other_periods_compile_slices_alone():
     def moved(periods):
         slope = jax.jvp(lambda v: vijax.trajectory(pair(0), 0.02, v, periods), (0.3,), (1.0,))
