@@ -1,8 +1,9 @@
-"""Where the scripts are, and a stand-in for the engine."""
+"""Where the scripts are, a stand-in for the engine, and cases of which some are long."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,3 +30,8 @@ def no_cell_runs() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "summarise", stand_in)
         yield
+
+
+def cases(every: Iterable[str], long: tuple[str, ...]) -> list[Any]:
+    """List the cases of a test by name, some of them marked long."""
+    return [pytest.param(one, marks=pytest.mark.long) if one in long else one for one in every]

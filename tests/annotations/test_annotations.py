@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers import cases
+
 
 # The other kinds take a minute and more: `python tests/annotations/tour.py` is the whole tour.
-@pytest.mark.parametrize(
-    "kind", ["planes", *(pytest.param(one, marks=pytest.mark.long) for one in ("motions", "orbits"))]
-)
+@pytest.mark.parametrize("kind", cases(["planes", "motions", "orbits"], long=("motions", "orbits")))
 def test_annotations_are_true_of_a_run(kind):
     tour = Path(__file__).parent / "tour.py"
     done = subprocess.run([sys.executable, tour, kind], capture_output=True, text=True, check=False)

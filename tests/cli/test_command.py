@@ -13,7 +13,7 @@ import pytest
 
 import vijax
 from scripts import grid
-from tests.helpers import SCRIPTS
+from tests.helpers import SCRIPTS, cases
 from vijax.cli import main as command
 from vijax.engine.method_choice import choose, record
 from vijax.orbits import orbit_search, switching
@@ -77,10 +77,7 @@ def timeless(said):
     return re.sub(r"in [\d.]+ s(, [\d.,e+]+ (\w+)/s)?$|^[\d.]+ s from", "in T s", said, flags=re.MULTILINE)
 
 
-_LONG = ("branch", "compare")
-
-
-@pytest.mark.parametrize("name", [pytest.param(one, marks=pytest.mark.long) if one in _LONG else one for one in RUNS])
+@pytest.mark.parametrize("name", cases(RUNS, long=("basins", "branch", "compare")))
 def test_the_command_and_the_script_write_and_say_the_same(folder, capsys, monkeypatch, name):
     arguments, script, given = RUNS[name]
     ends = []

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import vijax
+from tests.helpers import cases
 from vijax.design import multistart, optimise, optimum
 from vijax.design.ascent import Box, Look, ascend
 from vijax.design.design_settings import DesignSettings
@@ -116,7 +117,7 @@ def test_every_setting_has_a_sentence_and_is_changed_here():
     assert [name for name in fields if f"\n        {name}: " not in (DesignSettings.__doc__ or "")] == []
 
 
-@pytest.mark.parametrize("name", CHANGED)
+@pytest.mark.parametrize("name", cases(CHANGED, long=("active_margin",)))
 def test_every_setting_is_read(name):
     value, others = CHANGED[name]
     kinds = ((SURVEYED, surveyed), (CLIMBED, climbed), (RIVALS, rivalled))

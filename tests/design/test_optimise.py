@@ -75,6 +75,7 @@ def test_the_small_fast_device(found):
     assert abs(best.gradient["omega0"]) < 1e-5
 
 
+@pytest.mark.long
 def test_a_device_that_loses_its_orbit_does_not_widen_the_margins(found):
     best = found[0].best
     cloud, none = nodes((Tolerance("omega0", 0.05),), None), jnp.zeros((1, 1))
@@ -359,6 +360,7 @@ def test_a_report_is_strict_json_whole_or_not_at_all(folder):
     assert [path.name for path in folder.iterdir()] == ["one.json"]
 
 
+@pytest.mark.long
 def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys):
     assert script.main(["--d", "0.2", *SMALL, *FEW, *SHOWN, "--tolerance", "omega0=5%"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["design.json", "design.png"]

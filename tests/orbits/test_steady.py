@@ -152,6 +152,7 @@ def pressed():
 
 
 @pytest.mark.parametrize("off", [1.0, 1.05])
+@pytest.mark.long
 def test_a_pressed_contact_is_what_the_impact_map_flies(pressed, off):
     pair, sequence, knots = pressed
     pair = dataclasses.replace(pair, d=off * pair.d)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import vijax
+from tests.helpers import cases
 from vijax.orbits import continuation, motion, orbit_properties, orbit_search, periodic, switching, symmetry
 
 DEVICE = vijax.Harvester()
@@ -116,11 +117,7 @@ CALLS = {
 }
 
 
-# Each is several programs of many seconds.
-_LONG = ("continuation.follow", "optimise")
-
-
-@pytest.mark.parametrize("name", [pytest.param(one, marks=pytest.mark.long) if one in _LONG else one for one in CALLS])
+@pytest.mark.parametrize("name", cases(CALLS, long=("continuation.follow", "optimise")))
 def test_other_numbers_compile_nothing(name, known):
     CALLS[name](0, known)
     with compilations() as programs:
