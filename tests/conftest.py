@@ -43,10 +43,8 @@ settings.load_profile("vijax-ci" if os.environ.get("CI") else "vijax")
 
 
 def pytest_addoption(parser):
-    """Take the option that half of the time of all tests is kept for."""
-    parser.addoption(
-        "--long", action="store_true", help="run the tests marked long, too: they take as long as the rest"
-    )
+    """Take the option by which long tests run."""
+    parser.addoption("--long", action="store_true", help="run the tests marked long, too")
 
 
 def pytest_collection_modifyitems(config, items):

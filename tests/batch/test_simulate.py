@@ -326,7 +326,6 @@ def test_inclined_cells_know_the_50_digit_orbit_and_run_into_attractors():
     np.testing.assert_allclose(found.P[0, 0], float(orbit["P_J"]), rtol=1e-11)
 
 
-@pytest.mark.long
 def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     """Its rounds failed again and again, each beginning its window anew: 7,678 periods for 400."""
     counts = ["period", "impacts_left", "impacts_right"]
@@ -346,7 +345,6 @@ def test_single_precision_finds_the_same_periods():
     assert (single != double)[periodic].mean() < 0.01
 
 
-@pytest.mark.long
 def test_a_long_period_is_kept_by_a_flight_of_thousands():
     # Orbits that attract from so near that chaos passes them: Newton alone would find them from there.
     for d, kappa, r in (

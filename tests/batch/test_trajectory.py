@@ -27,7 +27,6 @@ def test_first_and_second_derivatives(jets):
             assert errors[1] < 1e-6, (case, direction)
 
 
-@pytest.mark.long
 def test_reverse_is_forward(jets):
     rigid, _, directions, first, _, points = jets
     reverse = jax.jit(jax.vmap(jax.jacrev(events(rigid))))(points)

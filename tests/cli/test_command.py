@@ -77,7 +77,7 @@ def timeless(said):
     return re.sub(r"in [\d.]+ s(, [\d.,e+]+ (\w+)/s)?$|^[\d.]+ s from", "in T s", said, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("name", cases(RUNS, long=("basins", "branch", "compare")))
+@pytest.mark.parametrize("name", cases(RUNS, long=("branch", "compare")))
 def test_the_command_and_the_script_write_and_say_the_same(folder, capsys, monkeypatch, name):
     arguments, script, given = RUNS[name]
     ends = []

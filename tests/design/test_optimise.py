@@ -75,7 +75,6 @@ def test_the_small_fast_device(found):
     assert abs(best.gradient["omega0"]) < 1e-5
 
 
-@pytest.mark.long
 def test_a_device_that_loses_its_orbit_does_not_widen_the_margins(found):
     best = found[0].best
     cloud, none = nodes((Tolerance("omega0", 0.05),), None), jnp.zeros((1, 1))
@@ -223,7 +222,6 @@ def test_what_only_your_limit_forbids_is_called_physical(found, depth, ratio, sa
     assert says in "\n".join(lines(describe(found[0], diagram=diagram)))
 
 
-@pytest.mark.long
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = optimise.optimise(
@@ -276,7 +274,6 @@ def test_devices_that_cannot_be_designed_are_told():
         optimise.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
 
 
-@pytest.mark.long
 def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
     nominal = found[0].best
     best = around.weighted(found[0], starts=16, points=5)
@@ -360,7 +357,6 @@ def test_a_report_is_strict_json_whole_or_not_at_all(folder):
     assert [path.name for path in folder.iterdir()] == ["one.json"]
 
 
-@pytest.mark.long
 def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys):
     assert script.main(["--d", "0.2", *SMALL, *FEW, *SHOWN, "--tolerance", "omega0=5%"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["design.json", "design.png"]
@@ -390,7 +386,6 @@ def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys):
         assert text in said
 
 
-@pytest.mark.long
 def test_designs_along_an_axis(folder, capsys):
     arguments = [
         *SMALL,

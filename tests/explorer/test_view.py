@@ -140,6 +140,9 @@ def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, 
     made: dict = {}
     exec(recipe.python, made)
     assert float(made["found"]["P"]) == moved.numbers["P"]
+    assert (float(made["end"].u_strobe), float(made["end"].v_strobe)) == moved.end
+    flown = vijax.trajectory(found.pair, found.u0, found.v0, periods=400).states
+    assert moved.end == pytest.approx((float(flown.u[-1]), float(flown.v[-1])), abs=1e-9)
     if moved.orbit is not None:
         assert np.array_equal(np.asarray(made["orbit"].multipliers), np.asarray(moved.orbit.multipliers))
     rows = dict(answers.cell_rows(plane, found, moved))

@@ -125,7 +125,6 @@ def test_degrees_taken_for_radians_are_warned_of():
         axes.check_axis("beta", [0.1, -20.0])
 
 
-@pytest.mark.long
 def test_a_ball_that_gravity_holds_is_warned_of(tmp_path):
     kept = {"d": 0.2, "kappa": [30.0, 40.0], "periods": 30}
     for out in (None, tmp_path / "held.zarr"):

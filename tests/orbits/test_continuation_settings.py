@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import vijax
-from tests.helpers import cases
 from vijax.orbits import continuation, orbit_search, switching, symmetry
 from vijax.orbits.continuation_settings import ContinuationSettings
 
@@ -56,7 +55,7 @@ def test_every_setting_has_a_sentence_and_is_changed_here():
     assert [name for name in fields if f"\n        {name}: " not in (ContinuationSettings.__doc__ or "")] == []
 
 
-@pytest.mark.parametrize("name", cases(CHANGED, long=("max_grazings",)))
+@pytest.mark.parametrize("name", CHANGED)
 def test_every_setting_is_read(starts, name):
     value, others = CHANGED[name]
     start = starts.get(name, starts[""])

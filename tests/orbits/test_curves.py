@@ -87,7 +87,6 @@ def grown(found):
     return curves.follow_curves([start], "d", {"d": (0.05, 0.35), "r": (0.2, 0.55)}, max_switches=1)
 
 
-@pytest.mark.long
 def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
     told = sorted((one.kind, int(one.orbit.count[0]), int(one.orbit.sequence.span[0])) for one in grown)
     # At the flip-graze the flip and the graze of the doubled orbit, at the resonant graze orbits with an impact more.
@@ -97,7 +96,6 @@ def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
         assert (np.asarray(curve.orbit.status)[1:-1] == Status.OK).all()
 
 
-@pytest.mark.long
 def test_a_fold_and_a_flip_touch_their_graze_at_its_resonance(grown):
     """Their distance grows as the square of the way along it (Simpson, Ghosh, arXiv 2602.22797)."""
     graze = next(one for one in grown if (one.kind, one.points[0].test) == ("grazing", "") and one.orbit.count[0] == 2)

@@ -48,7 +48,6 @@ def test_every_orbit_on_both_sides_of_a_graze_is_one(loop):
         assert abs(loop.values[place + 1] - point.value) < 1e-5
 
 
-@pytest.mark.long
 def test_the_next_bifurcation_beyond_is_that_of_the_orbit_found_there(orbits, loop):
     (graze, *_) = grazes(branch := followed(orbits[1], max_grazings=1))
     assert (graze.kind, graze.onward) == ("grazing flight", f"one impact more at the {side_of(graze)} wall")

@@ -477,7 +477,6 @@ def optimised(monkeypatch):
     simulate.compiled.cache_clear()
 
 
-@pytest.mark.long
 def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
     d, kappa = MIXED["d"], MIXED["kappa"]
     mixed = sweep(d=d, kappa=kappa, r=0.6)

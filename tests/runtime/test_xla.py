@@ -142,7 +142,6 @@ def without_kernels(code: str, *arguments: str, switch: str = "0") -> subprocess
 
 
 @ON_CPU
-@pytest.mark.long
 def test_without_kernels_the_same_comes_out(tmp_path):
     done = without_kernels(WITHOUT_KERNELS, str(tmp_path / "plain.npz"))
     assert done.returncode == 0, done.stderr

@@ -44,18 +44,13 @@ def line(cell: ExploredCell, axis: Axis, tell: Callable[[int, int], None]) -> Ce
     Raises:
         ValueError: An axis of starts, along which nothing can be followed.
     """
-    others = {name: value for name, value in cell.arguments.items() if name != axis.name}
-    wall = {name: value for name, value in cell.settings.items() if name == "wall"}
     found = orbit_diagram(
-        along=axis.name,
         values=values(axis),
         direction="both",
         periods=PERIODS,
         recorded_periods=RECORDED,
-        device=cell.device,
         progress=tell,
-        **wall,
-        **others,
+        **cell.off(axis.name),
     )
     rows = {}
     for way in ("up", "down"):

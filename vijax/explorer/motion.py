@@ -105,17 +105,12 @@ def motion(cell: ExploredCell) -> CellMotion:
 def _settled(cell: ExploredCell) -> tuple[float, float]:
     """Fly the ball until it has settled: by a diagram of one point, in a third of the time that a trajectory takes."""
     # Any axis would do, as it has one value.
-    others = {name: value for name, value in cell.arguments.items() if name != "r"}
-    wall = {name: value for name, value in cell.settings.items() if name == "wall"}
     found = orbit_diagram(
-        along="r",
         values=[cell.arguments["r"]],
         direction="up",
         periods=SETTLE,
         recorded_periods=1,
-        device=cell.device,
-        **wall,
-        **others,
+        **cell.off("r"),
     )
     return float(found["u_strobe"].values[0, -1]), float(found["v_strobe"].values[0, -1])
 

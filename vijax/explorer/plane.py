@@ -216,6 +216,12 @@ class ExploredCell:
     arguments: dict[str, Any]
     settings: dict[str, Any]
 
+    def off(self, along: str) -> dict[str, Any]:
+        """Give the arguments of `orbit_diagram` along an axis through the cell, but for what is on that axis."""
+        others = {name: value for name, value in self.arguments.items() if name != along}
+        wall = {name: value for name, value in self.settings.items() if name == "wall"}
+        return {"along": along, "device": self.device} | wall | others
+
 
 def cell(plane: ExploredPlane, pick: tuple[int, int], values: Mapping[str, float]) -> ExploredCell:
     """Find what a picked cell is, with values of sliders in place of the map's.
