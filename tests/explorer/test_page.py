@@ -1,11 +1,13 @@
 """A page without a browser: what it is asked, what it tells, and which jobs it begins."""
 
+import asyncio
 import threading
 from base64 import b64decode
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bokeh.application.handlers.document_lifecycle import DocumentLifecycleHandler
 from bokeh.document import Document
 
 import vijax
@@ -18,6 +20,7 @@ from vijax.explorer.page import ExplorerPage
 from vijax.explorer.plane import explored
 from vijax.explorer.source import Source
 from vijax.explorer.warming import Warmth, warm
+from vijax.model.records import Status
 
 
 @pytest.fixture(scope="module")
@@ -179,3 +182,67 @@ def test_curves_of_another_value_leave_the_map_with_a_word(power, opened):
     (said,) = (message["text"] for message in told if message["section"] == "curves" and message["text"])
     assert "their r is 0.5, here it is 0.6" in said
     assert one.drawing.tables.curves.data["xs"] == []
+
+
+def test_hatching_marks_and_legend_are_of_the_cells_that_they_tell_of(power, opened):
+    admissible, period, status = np.ones((4, 4), bool), np.ones((4, 4), int), np.zeros((4, 4), int)
+    admissible[1:3, 0] = admissible[2, 3] = False  # two neighbours make one rectangle
+    period[0, 2] = period[3, 1] = 0
+    period[2, 2] = -1
+    status[3, 3] = Status.NOT_RUN  # of such a cell nothing is told
+    period[3, 3], admissible[3, 3] = -1, False
+    place = ("d", "kappa")
+    energies = np.where(period < 0, 0.0, 1e-6 * (1 + np.arange(16).reshape(4, 4)))
+    told_of = {"admissible": admissible, "period": period, "status": status, "P": energies}
+    one, told = opened(power.assign({name: (place, values) for name, values in told_of.items()}))
+    one._draw_map()
+    across, up = one.plane.x, one.plane.y
+    tables = one.drawing.tables
+
+    veiled = {
+        tuple(
+            int(np.argmin(abs(axis.edges - tables.veil.data[side][k])))
+            for axis, side in ((across, "left"), (across, "right"), (up, "bottom"), (up, "top"))
+        )
+        for k in range(len(tables.veil.data["left"]))
+    }
+    assert veiled == {(1, 3, 0, 1), (2, 3, 3, 4)}
+
+    def at(table):
+        return {(across.nearest(x), up.nearest(y)) for x, y in zip(table.data["x"], table.data["y"], strict=True)}
+
+    assert (at(tables.dots), at(tables.crosses), at(tables.star)) == ({(0, 2), (3, 1)}, {(2, 2)}, {(3, 2)})
+    (legend,) = (message for message in told if message["section"] == "legend")
+    counts = {text.partition(",")[0]: count for _, _, text, count in legend["entries"]}
+    assert counts == {
+        "inadmissible": 3,
+        "border of period 1": 12,
+        "aperiodic": 2,
+        "undecided": 1,
+        "no impact": 1,
+        "largest admissible P": 1,
+    }
+
+
+def test_a_page_that_is_closed_ends_its_jobs(power, monkeypatch):
+    pages, begun, go = [], threading.Event(), threading.Event()
+    monkeypatch.setattr(server, "ExplorerPage", lambda *args: pages.append(ExplorerPage(*args)) or pages[-1])
+    crew = Crew()
+    document = server.application(Source(power), crew, Warmth()).create_document()
+    (one,) = pages
+    heard = []
+
+    def slow(tell):
+        begun.set()
+        assert go.wait(10)
+        tell(0, 1)
+
+    job = one.jobs.start("slow", slow, heard.append, heard.append)
+    assert begun.wait(10)
+    asyncio.run(DocumentLifecycleHandler().on_session_destroyed(SimpleNamespace(_document=document)))
+    go.set()
+    job.future.result(timeout=10)
+    assert one.jobs.running() == ()
+    assert job.over.is_set()
+    assert heard == []
+    crew.close()
