@@ -20,6 +20,9 @@ from vijax.runtime.ring_solve import Ring
 from vijax.runtime.xla import once
 
 BATCHES = (8, 64, 512)  # lanes of one compiled call
+# Where an orbit has dozens of impacts rounding alone may move a point by more than Newton's last correction is to be.
+# What comes so near, in parts of that, and comes no nearer is as exact as it can be.
+_ROUNDING = 100.0
 
 
 class PathEquations(NamedTuple):
@@ -70,12 +73,16 @@ class Path(Protocol):
 
 
 class _Corrected(NamedTuple):
-    """Newton's way back to the path: the point, the tangent there, the size of the last correction, how many."""
+    """Newton's way back to the path: the point, the tangent there, the size of the last correction, how many.
+
+    And whether the point is on the path.
+    """
 
     y: Float[Array, "unknown"]
     tangent: Float[Array, "unknown"]
     size: Float[Array, ""]
     corrections: Int[Array, ""]
+    arrived: Bool[Array, ""]
 
 
 def _correct(path: Path, guess, former) -> _Corrected:
@@ -89,24 +96,27 @@ def _correct(path: Path, guess, former) -> _Corrected:
         ahead = jnp.zeros_like(miss).at[-1].set(1.0)
         inner, outer = ring_solve.solve(ring.bordered(former[None]), right, jnp.stack([miss, ahead], axis=1))
         step, tangent = jnp.concatenate([inner.reshape(-1, 2), outer]).T
-        return _Corrected(at.y - step, tangent / jnp.linalg.norm(tangent), jnp.abs(step).max(), at.corrections + 1)
+        size, tolerance = jnp.abs(step).max(), path.newton_tolerance
+        arrived = (size <= tolerance) | ((size <= _ROUNDING * tolerance) & (size > 0.5 * at.size))
+        return _Corrected(at.y - step, tangent / jnp.linalg.norm(tangent), size, at.corrections + 1, arrived)
 
     def going(at: _Corrected):
-        return (at.size > path.newton_tolerance) & (at.size < 1.0) & (at.corrections < path.max_corrections)
+        return ~at.arrived & (at.size < 1.0) & (at.corrections < path.max_corrections)
 
-    return lax.while_loop(going, once, _Corrected(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0)))
+    start = _Corrected(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0), jnp.asarray(False))
+    return lax.while_loop(going, once, start)
 
 
 class BranchPlace(NamedTuple):
     """Points of paths, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
 
-    And how Newton came there: the size of its last correction, and how many it took.
+    And how Newton came there: whether it did, and how many corrections it took.
     """
 
     y: np.ndarray
     tangent: np.ndarray
     tests: np.ndarray
-    size: np.ndarray
+    arrived: np.ndarray
     corrections: np.ndarray
 
 
@@ -168,7 +178,7 @@ class Strides(NamedTuple):
 def _try(path: Path, rules: Pace, at: Walker) -> tuple[Walker, Strides]:
     """Try a step; one that does not do is halved."""
     corrected: Any = _correct(path, at.y + at.length * at.tangent, at.tangent)
-    y, tangent, size, corrections = corrected
+    y, tangent, _, corrections, arrived = corrected
     tests: Any = jnp.stack([*path.tests(y, tangent, at.tangent)])
     straight = tangent @ at.tangent
     # Newton may end on another path, or far along this one: neither its direction nor its distance fits then.
@@ -177,7 +187,7 @@ def _try(path: Path, rules: Pace, at: Walker) -> tuple[Walker, Strides]:
     single = (path.happenings(at.tests, tests) <= 1) | (at.length < rules.crowded_step)
     # A path that sets out from a graze does not know yet what is clear: all must be after the first step.
     clear = ~(jnp.isnan(at.tests) & (tests <= 0))[path.first_end :].any()
-    taken = at.going & (size <= path.newton_tolerance) & (straight > rules.min_cosine) & near & single & clear
+    taken = at.going & arrived & (straight > rules.min_cosine) & near & single & clear
     # Past a grazing or a bound there is no orbit. The first such point is kept: between it and the last is the end.
     real = (tests[path.first_end :] > 0).all() | ~taken
     easy = (corrections <= rules.easy_corrections) & (straight > 1 - rules.easy_bend * (1 - rules.min_cosine))
@@ -192,7 +202,7 @@ def _try(path: Path, rules: Pace, at: Walker) -> tuple[Walker, Strides]:
     walker = at._replace(
         y=on[0], tangent=on[1], tests=on[2], length=length, passed=passed, going=going, closed=at.closed | home
     )
-    tried: Any = BranchPlace(y, tangent, tests, size, corrections), at.length, taken
+    tried: Any = BranchPlace(y, tangent, tests, arrived, corrections), at.length, taken
     return walker, Strides(*tried)
 
 

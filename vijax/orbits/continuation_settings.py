@@ -47,8 +47,8 @@ class ContinuationSettings:
             step is halved. A smaller one cuts corners, and may jump between branches that pass each other closely.
         crowded_step: Length below which several things may happen within one step, 1e-7. A larger one leaves out the
             orbits just before an end, and what happens twice; one that rounding cannot divide loses the branch.
-        newton_tolerance: Size of the last Newton correction, 1e-11: the point is then as exact as rounding allows. With
-            1e-4 orbits keep residuals up to 1e-8.
+        newton_tolerance: Size of the last Newton correction, 1e-11: the point is then as exact as rounding allows. A
+            hundred times as much does where rounding lets it come no nearer. With 1e-4 residuals are up to 1e-8.
         max_corrections: Newton corrections of a step before it is halved, 6. With 2, steps stay as short as with few
             `easy_corrections`.
         max_narrowings: How often the interval that holds an event is narrowed, 40: by false position, with every third

@@ -38,7 +38,7 @@ def curve_passage(path: CurvePath, y: np.ndarray, test: str) -> Passage | None:
     orbit = orbits_at(among(path, found.side), start)
     appears = test in ("flight", "contact")
     on, place = _with_impact(path, found, y) if appears else (fewer, _without(fewer, start))
-    if place is None or not place.size[0] <= path.newton_tolerance:
+    if place is None or not place.arrived[0]:
         return None
     return beyond(found, appears, orbit, on, place)
 

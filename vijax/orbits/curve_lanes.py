@@ -60,7 +60,7 @@ def lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: C
         first = _beside(paths, y) if limit else on_curve(paths, y)
         near = np.abs(first.y - y).max(axis=1) < (_BESIDE if limit else settings.max_step)
         real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
-        for index, good in enumerate(real & (first.size <= settings.newton_tolerance)):
+        for index, good in enumerate(real & first.arrived):
             path, place = jax.tree.map(lambda leaf, i=index: leaf[i], (paths, first))
             if good:
                 start = _moved(batch[index], path, place.y) if limit else batch[index]
@@ -92,7 +92,7 @@ def lanes_aside(begun: list[Offshoot], plane: Plane, device: Harvester, settings
             tangent = np.pad(ahead, (0, y.size - ahead.size))[None]
         for sign in (1.0, -1.0):
             there = advance(paths, y, sign * tangent, np.full(1, _ASIDE))
-            near = there.size[0] <= settings.newton_tolerance and np.abs(there.y - y).max() < settings.max_step
+            near = there.arrived[0] and np.abs(there.y - y).max() < settings.max_step
             if near and (there.tests[:, FIRST_CURVE_END:] > 0).all():
                 path, first = jax.tree.map(lambda leaf: leaf[0], (paths, there))
                 moved = _moved(start, path, first.y)
@@ -112,7 +112,7 @@ def _beside(paths: CurvePath, y: np.ndarray) -> BranchPlace:
     """Bring orbits that are near a limit onto its curve: by either parameter alone, whichever has less to move."""
     still = np.eye(y.shape[1])[[-2, -1]]
     tries = [advance(paths, y, np.broadcast_to(one, y.shape), np.zeros(len(y))) for one in still]
-    far = [np.where(one.size <= paths.newton_tolerance, np.abs(one.y - y).max(axis=1), np.inf) for one in tries]
+    far = [np.where(one.arrived, np.abs(one.y - y).max(axis=1), np.inf) for one in tries]
     first = far[0] <= far[1]
 
     def chosen(one: np.ndarray, other: np.ndarray) -> np.ndarray:

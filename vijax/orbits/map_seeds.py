@@ -26,7 +26,7 @@ from vijax.runtime import tiles
 
 _SETTLE = 400  # forcing periods that a cell's ball is flown at most before Newton looks for its orbit, as in a sweep
 _TILE = 64  # cells that are flown together
-_MOST_PERIOD, _MOST_IMPACTS = 8, 24  # of the orbits that seed curves; others are rare, and each width is a program
+_MOST_PERIOD, _MOST_IMPACTS = 24, 24  # of the orbits that seed curves; others are rare, and each width is a program
 _NEAR_LIMIT = 0.3  # parts of a limit within which an orbit of a cell beside it is looked at
 _KINDS = {
     "speed": "grazing impact",

@@ -61,7 +61,7 @@ def from_state(
         lost = ~np.isfinite(last.u + last.v)
         u, v, t = np.where(lost, 0.0, last.u), np.where(lost, 0.0, last.v), np.zeros(shape)
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
-    found = jax.tree.map(np.asarray, trajectory(pair, u, v, periods=2 * period + 1, t0=t).impacts)
+    found = jax.tree.map(np.asarray, trajectory(pair, u, v, periods=tiles.padded(2 * period + 1), t0=t).impacts)
     onset = 2 * found.n + found.t
     around = (onset < onset[:, :1] + 2 * period - SAME) & ~lost[:, None]
     width = tiles.padded(int(around.sum(axis=1).max(initial=1)))

@@ -63,7 +63,7 @@ def switch(
     begin_proofs(doubled.pair, doubled.sequence, doubled.knots)
     away = np.append(ahead, 0.0)[None]
     # Test functions that vanish here would be met again at once.
-    first = BranchPlace(y, away, np.full((1, len(Tests._fields)), np.nan), np.zeros(1), np.zeros(1))
+    first = BranchPlace(y, away, np.full((1, len(Tests._fields)), np.nan), np.full(1, True), np.zeros(1))
     return [follow_arcs(arcs, heading(first, sign), along, points, settings)[0] for sign in (1.0, -1.0)]
 
 
