@@ -415,6 +415,7 @@ def explained(charts: Path | None = None) -> None:
         points = sum(len(curve.values) for curve in found.curves)
         say(f"{name}: curves, points, seconds once compiled", f"{len(found.curves)}, {points}, {seconds:.0f}")
         say(f"{name}: largest piece that no curve explains, in borders; ended", f"{len(found.largest)}; {found.ended}")
+        say(f"{name}: borders of basins among the others", f"{found.basins.sum()} of {len(found.left)}")
         if len(found.largest):
             say(f"{name}: what that piece parts", described(found.largest, dataset))
         if charts is not None:

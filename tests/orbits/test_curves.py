@@ -1,5 +1,7 @@
 """Curves of bifurcations: at their known places, with the multipliers that make them, ended where orbits end."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,17 @@ from vijax.model.device import Harvester
 from vijax.model.energy import rigid_penetration
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
-from vijax.orbits import curve_rows, curves, limits, orbit_search, periodic, shooting, switching
+from vijax.orbits import (
+    curve_rows,
+    curves,
+    limits,
+    map_borders,
+    map_motions,
+    orbit_search,
+    periodic,
+    shooting,
+    switching,
+)
 from vijax.orbits.events import Point
 from vijax.orbits.shooting import Sequence
 
@@ -241,6 +253,18 @@ def test_a_map_is_explained_by_the_curve_on_its_border():
     np.testing.assert_allclose(np.sort(curve.values[[0, -1], 1]), [0.3, 0.6], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("d", "basins"), [((0.2, 0.2001), True), ((0.2001, 0.202), False)])
+def test_a_border_of_basins_is_told_from_one_of_a_bifurcation(d, basins):
+    """Rigid 1:1 and 1:2 attract both until the fold of 1:2 at d = 0.20158 (docs/accuracy.md)."""
+    axes = {"d": np.array(d), "r": np.array([0.5, 0.5001]), "wall": "rigid"}
+    one, other = (map_borders.labelled_plane(vijax.sweep(v0=v0, **axes)) for v0 in (-0.85, -1.0))
+    first = np.array([[True, True], [False, False]])
+    cells = one.cells | {"v0": np.where(first, -0.85, -1.0)}
+    plane = dataclasses.replace(one, names=np.where(first, one.names, other.names), cells=cells)
+    assert plane.names.tolist() == [["1:2", "1:2"], ["1:1", "1:1"]]
+    np.testing.assert_array_equal(map_motions.both_attract(plane, map_borders.borders(plane)), [basins, basins])
+
+
 def test_a_search_without_time_says_what_is_left():
     dataset, told = made_map(), []
     found = vijax.bifurcation_curves(dataset, max_seconds=1e-9, progress=lambda *step: told.append(step))
@@ -264,6 +288,7 @@ def test_ctrl_c_keeps_the_curves_found_until_then():
     assert 0 < found.explained <= found.borders
     table = vijax.curve_dataset(found)
     assert (table.attrs["ended"], table.sizes["border"]) == ("stopped", len(found.left))
+    assert not table["left_basins"].any()
 
 
 def test_rows_have_every_point_and_what_was_met(found, tmp_path):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _MOST_POINTS = 60  # Points of codimension 2 that are listed: all are in the store.
 _ENDED = {
     "explained": "nothing is left",
-    "tried": "the others were looked at in vain: they may be borders of basins",
+    "tried": "the others were looked at in vain",
     "rounds": "all rounds were spent; more are had by --max-rounds",
     "seconds": "all seconds were spent; more are had by --max-seconds",
     "stopped": "the search was stopped",
@@ -48,6 +48,8 @@ def summary(found: "MapCurves", dataset: "xr.Dataset | None" = None) -> Iterator
         f"borders between labels of periodic cells within a cell of a curve: {found.explained:,} of "
         f"{found.borders:,}{share}; {_ENDED[found.ended]}"
     )
+    if found.basins.any():
+        yield f"borders of basins among the others, where both motions attract on either side: {found.basins.sum():,}"
     if len(found.largest):
         low, high = found.largest.min(axis=0), found.largest.max(axis=0)
         names = found.along

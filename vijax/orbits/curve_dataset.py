@@ -37,8 +37,8 @@ def curve_dataset(curves: list[BifurcationCurve] | MapCurves) -> "xr.Dataset":
         `stable`; over curve `kind`, the `label` of its orbits, `end_first`, `end_last`; over (curve, event) what of
         codimension 2 was met: `event`, what grazes besides as `event_test`, how the curve goes on then as
         `event_onward`, both parameters as `event_` and their name, and the `event_residual` there. Of a map, over
-        border, where those are that no curve explains, as `left_` and the parameters' names, and as attributes
-        `borders`, `explained` and `ended`.
+        border, where those are that no curve explains, as `left_` and the parameters' names, and as `left_basins`
+        whether both motions attract on either side; and as attributes `borders`, `explained` and `ended`.
 
     Raises:
         ValueError: No curves, or curves of several planes.
@@ -105,6 +105,8 @@ def _with_borders(dataset: "xr.Dataset", of: MapCurves) -> "xr.Dataset":
     """Add what the curves explain of their map."""
     names = dataset.attrs["along"].split()
     places = {f"left_{name}": ("border", of.left[:, index], AXES[name].attributes) for index, name in enumerate(names)}
+    about = {"units": "1", "long_name": "whether the motions of both sides attract on either side: 1 or 0"}
+    places["left_basins"] = "border", of.basins.astype(np.int8), about
     return dataset.assign(places).assign_attrs(borders=of.borders, explained=of.explained, ended=of.ended)
 
 

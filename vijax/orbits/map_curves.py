@@ -24,6 +24,7 @@ from vijax.orbits.map_borders import (
     limit_borders,
     near,
 )
+from vijax.orbits.map_motions import both_attract
 from vijax.orbits.map_seeds import limit_seeds, seeds
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -51,6 +52,8 @@ class MapCurves(NamedTuple):
         explained: How many of these lie within one cell of a curve.
         left: Both parameters at the others, a row each.
         largest: Those of them that are the longest chain of neighbours.
+        basins: At which of the others basins are parted: the motions of both cells attract in both, so that nothing
+            bifurcates there. Not asked, and False, where the search was stopped or had no more seconds.
         ended: Why the search for more came to its end: all borders are "explained", each of the others was "tried",
             "rounds" or "seconds" were spent, or it was "stopped" by Ctrl-C.
     """
@@ -61,6 +64,7 @@ class MapCurves(NamedTuple):
     explained: int
     left: np.ndarray
     largest: np.ndarray
+    basins: np.ndarray
     ended: Ended
 
 
@@ -96,8 +100,8 @@ def bifurcation_curves(
         progress: Called with (borders explained, borders in all), first before anything is followed.
 
     Returns:
-        The curves, and which borders of the map they explain. Others may be those of basins, not of bifurcations.
-        Where Ctrl-C stops the search, the curves that were found until then.
+        The curves, and which borders of the map they explain, and which of the others are those of basins. Where Ctrl-C
+        stops the search, the curves that were found until then.
 
     Raises:
         ValueError: No map of labels over two parameters that its orbits depend on, or one without periodic cells.
@@ -110,13 +114,16 @@ def bifurcation_curves(
     device = device_of(dataset) if device is None else one_device(device)
     beside = limit_borders(plane) if checks.flag("limits", limits) else borders(plane)[:0]
     search = _CurveSearch(plane, device, max_points, settings, tell)
+    basins = None
     try:
         ended = search.run(max_rounds, round_borders, beside, time.monotonic() + max_seconds)
+        basins = None if ended == "seconds" else both_attract(plane, search.left)
     except KeyboardInterrupt:
         ended = "stopped"
     left = search.left
     where = left.places(plane), largest_piece(left).places(plane)
-    return MapCurves(plane.along, search.found, search.borders, search.borders - len(left), *where, ended)
+    told = np.full(len(left), False) if basins is None else basins
+    return MapCurves(plane.along, search.found, search.borders, search.borders - len(left), *where, told, ended)
 
 
 def check_budget(max_rounds: int = 8, max_seconds: float = math.inf) -> tuple[int, float]:

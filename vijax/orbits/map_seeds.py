@@ -1,12 +1,10 @@
 """What the orbits of some cells of a map meet along one of its axes: where curves over the map begin."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import numpy as np
 
-from vijax.batch import simulate
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
@@ -20,12 +18,11 @@ from vijax.orbits.curve_starts import CurveStart, curve_start
 from vijax.orbits.events import Point, changed, locate
 from vijax.orbits.limits import near_limits
 from vijax.orbits.map_borders import LabelledPlane
+from vijax.orbits.map_motions import pairs, settled
 from vijax.orbits.parameter import tilts
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import tiles
 
-_SETTLE = 400  # forcing periods that a cell's ball is flown at most before Newton looks for its orbit, as in a sweep
-_TILE = 64  # cells that are flown together
 _MOST_PERIOD, _MOST_IMPACTS = 24, 24  # of the orbits that seed curves; others are rare, and each width is a program
 _NEAR_LIMIT = 0.3  # parts of a limit within which an orbit of a cell beside it is looked at
 _KINDS = {
@@ -81,8 +78,7 @@ def limit_seeds(plane: LabelledPlane, cells: np.ndarray, device: Harvester) -> l
 
 def _orbits(plane: LabelledPlane, cells: np.ndarray) -> list[tuple[Orbit, np.ndarray]]:
     """Find the orbits that attract the balls of some cells, by width, with the rows of their cells."""
-    parts = [_settled(plane, cells[first : first + _TILE]) for first in range(0, len(cells), _TILE)]
-    states, impacts = (np.concatenate(part) for part in zip(*parts, strict=True))
+    states, impacts = settled(plane, cells)
     period = plane.period[tuple(cells.T)]
     width = np.array([tiles.padded(max(int(count), 1)) for count in impacts])
     kept = (period <= _MOST_PERIOD) & (impacts > 0) & (impacts <= _MOST_IMPACTS)
@@ -91,7 +87,7 @@ def _orbits(plane: LabelledPlane, cells: np.ndarray) -> list[tuple[Orbit, np.nda
         rows = np.flatnonzero(kept & (period == number) & (width == wide))
         # As often as a power of two, so that few programs are compiled.
         more = np.resize(rows, tiles.padded(rows.size))
-        pair = ImpactPair(**tiles.arrays(_pairs(plane, cells[more])))
+        pair = ImpactPair(**tiles.arrays(pairs(plane, cells[more])))
         orbit = orbit_search.from_state(pair, *states[more].T, period=int(number))[: rows.size]
         for some, good in _by_symmetry(plane, orbit):
             size = tiles.padded(int(np.asarray(some.count).max()))
@@ -100,33 +96,6 @@ def _orbits(plane: LabelledPlane, cells: np.ndarray) -> list[tuple[Orbit, np.nda
         (periodic.concatenate([orbit for orbit, _ in several]), np.concatenate([rows for _, rows in several]))
         for several in found.values()
     ]
-
-
-def _pairs(plane: LabelledPlane, cells: np.ndarray) -> dict[str, Any]:
-    """Give d, kappa, r and gamma of some cells."""
-    index = tuple(cells.T)
-    return {name: None if x is None else x[index] for name, x in plane.cells.items() if name not in ("u0", "v0")}
-
-
-def _settled(plane: LabelledPlane, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fly the balls of a few cells until their attractors are certain: displacement, velocity, phase; impacts a round.
-
-    By the program of chains of cells: a trajectory that is recorded takes a hundred times as long, 0.9 s for 64 cells.
-    """
-    # Rows are repeated, for one number of cells needs one program. No attractor depends on sizes in SI units.
-    more = np.resize(cells, (_TILE, 2))
-    given: dict[str, Any] = {name: None if x is None else x[:, None] for name, x in _pairs(plane, more).items()}
-    pair = ImpactPair(**given)
-    u, v = (plane.cells[name][tuple(more.T)] for name in ("u0", "v0"))
-    start = simulate.Starts(u, v, np.zeros_like(u))
-    one: Any = np.ones((_TILE, 1))
-    told: Any = {"periods": _SETTLE, "recorded_periods": 1, "count": len(cells)}
-    summary = simulate.follow(pair, start, simulate.Growth(one, one), one, one, Harvester(), **told)
-    end: Any = summary.handover
-    states = np.stack([end.u[:, 0], end.v[:, 0], end.t[:, 0]], axis=1)[: len(cells)]
-    impacts = (summary.impacts_left + summary.impacts_right)[: len(cells), 0]
-    known = np.isfinite(states).all(axis=1)
-    return np.where(known[:, None], states, 0.0), np.where(known, impacts, 0)
 
 
 def _by_symmetry(plane: LabelledPlane, orbit: Orbit) -> list[tuple[Orbit, np.ndarray]]:
