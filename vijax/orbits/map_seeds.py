@@ -23,7 +23,7 @@ from vijax.orbits.parameter import tilts
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import tiles
 
-_MOST_PERIOD, _MOST_IMPACTS = 24, 24  # of the orbits that seed curves; others are rare, and each width is a program
+_MOST_PERIOD, _MOST_IMPACTS = 12, 24  # of the orbits that seed curves; others are rare, and each width is a program
 _NEAR_LIMIT = 0.3  # parts of a limit within which an orbit of a cell beside it is looked at
 _KINDS = {
     "speed": "grazing impact",
