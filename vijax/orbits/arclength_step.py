@@ -23,6 +23,7 @@ BATCHES = (8, 64, 512)  # lanes of one compiled call
 # Where an orbit has dozens of impacts rounding alone may move a point by more than Newton's last correction is to be.
 # What comes so near, in parts of that, and comes no nearer is as exact as it can be.
 _ROUNDING = 100.0
+_ASTRAY = 1.0  # A correction of half a period, or of a whole side of the plane, leads nowhere near.
 
 
 class PathEquations(NamedTuple):
@@ -101,7 +102,7 @@ def _correct(path: Path, guess, former) -> _Corrected:
         return _Corrected(at.y - step, tangent / jnp.linalg.norm(tangent), size, at.corrections + 1, arrived)
 
     def going(at: _Corrected):
-        return ~at.arrived & (at.size < 1.0) & (at.corrections < path.max_corrections)
+        return ~at.arrived & (at.size < _ASTRAY) & (at.corrections < path.max_corrections)
 
     start = _Corrected(guess, former, jnp.asarray(0.5, guess.dtype), jnp.int32(0), jnp.asarray(False))
     return lax.while_loop(going, once, start)
@@ -110,7 +111,8 @@ def _correct(path: Path, guess, former) -> _Corrected:
 class BranchPlace(NamedTuple):
     """Points of paths, a row a lane: unknowns (knots, then the parameter over its range), tangents, test functions.
 
-    And how Newton came there: whether it did, and how many corrections it took.
+    And how Newton came there: whether it did, and how many corrections it took. Where it went astray test functions
+    are NaN.
     """
 
     y: np.ndarray
@@ -178,8 +180,11 @@ class Strides(NamedTuple):
 def _try(path: Path, rules: Pace, at: Walker) -> tuple[Walker, Strides]:
     """Try a step; one that does not do is halved."""
     corrected: Any = _correct(path, at.y + at.length * at.tangent, at.tangent)
-    y, tangent, _, corrections, arrived = corrected
-    tests: Any = jnp.stack([*path.tests(y, tangent, at.tangent)])
+    y, tangent, size, corrections, arrived = corrected
+    # Where Newton has gone astray flights may last for thousands of periods, and a search in one for as many seconds.
+    astray = ~(size < _ASTRAY)
+    tests: Any = jnp.stack([*path.tests(jnp.where(astray, at.y, y), tangent, at.tangent)])
+    tests = jnp.where(astray, jnp.nan, tests)
     straight = tangent @ at.tangent
     # Newton may end on another path, or far along this one: neither its direction nor its distance fits then.
     near = jnp.linalg.norm(y - at.y) < 2 * at.length

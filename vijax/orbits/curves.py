@@ -35,7 +35,6 @@ from vijax.orbits.switching import MOST_SWITCHES
 from vijax.runtime import checks, context, tiles
 from vijax.runtime.context import door
 
-_AT_ONCE = 4  # starts of one family that are followed at once, though they may turn out to lie on one curve
 # Two starts on one curve differ from it by less than a step's bend; other curves of the same label are farther apart.
 _ON_CURVE = 5e-4
 
@@ -158,13 +157,10 @@ def _followed_lanes(
     traces = [_trace(curve, plane) for curve in known]
     left = _unmet(begun, traces, plane)
     while left:
-        chosen: dict[tuple, list[Lane]] = {}
-        for lane in left:
-            family = chosen.setdefault(_family(lane.start), [])
-            if len(family) < _AT_ONCE:
-                family.append(lane)
+        # Half of those of one family would turn out to lie on one curve, so that one of each is followed at a time.
+        chosen = {_family(lane.start): lane for lane in reversed(left)}
         batches: dict[tuple, list[Lane]] = {}
-        for lane in (lane for family in chosen.values() for lane in family):
+        for lane in chosen.values():
             batches.setdefault((lane.path.condition, lane.first.y.size), []).append(lane)
         # The widest first, for it may take as long as all others.
         listed = sorted(batches.values(), key=lambda batch: -batch[0].first.y.size)
@@ -174,12 +170,12 @@ def _followed_lanes(
             for batch, paths in zip(listed, pool.map(follow, listed), strict=True):
                 some: list[BifurcationCurve] = []
                 for lane, curve in zip(batch, paths, strict=True):
-                    # Of several starts on one curve, or on one that is known, one is kept.
+                    # A curve that goes on through grazes is in several families, and is kept once.
                     if _unmet([lane], traces[before:], plane):
                         some.append(curve)
                         traces.append(_trace(curve, plane))
                 yield some
-        taken = {id(lane) for batch in batches.values() for lane in batch}
+        taken = {id(lane) for lane in chosen.values()}
         left = _unmet([lane for lane in left if id(lane) not in taken], traces[before:], plane)
 
 

@@ -1,0 +1,29 @@
+"""Steps along paths of orbits, one at a time."""
+
+import numpy as np
+import pytest
+
+import vijax
+from vijax.orbits.arclength_step import advance
+from vijax.orbits.continuation import arcs_from
+
+
+@pytest.fixture(scope="module")
+def begun():
+    """A branch along kappa, of one orbit, and the place on it where it begins."""
+    orbit = vijax.find_orbits(vijax.impact_pair(0.2, 40.0, 0.5), "1:1", guesses=64)[:1]
+    value, none = np.array([40.0]), np.zeros(1)
+    arcs, y = arcs_from(orbit, "kappa", value, none, (value - 37, value + 360), vijax.ContinuationSettings())
+    ahead = np.zeros_like(y)
+    ahead[:, -1] = 1.0
+    return arcs, advance(arcs, y, ahead, none)
+
+
+@pytest.mark.parametrize("length", [0.5, 1.0])
+def test_nothing_is_searched_where_newton_goes_astray(begun, length):
+    # Of the longer step knots are 10^8 half periods apart: a search between these would take minutes.
+    arcs, first = begun
+    there = advance(arcs, first.y, first.tangent, np.full(1, length))
+    assert not there.arrived[0]
+    assert np.abs(there.y).max() > 10
+    assert np.isnan(there.tests).all()
