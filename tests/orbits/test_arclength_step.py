@@ -5,7 +5,7 @@ import pytest
 
 import vijax
 from vijax.orbits.arclength_step import advance
-from vijax.orbits.continuation import arcs_from
+from vijax.orbits.continuation import arcs_from, upwards
 
 
 @pytest.fixture(scope="module")
@@ -14,9 +14,7 @@ def begun():
     orbit = vijax.find_orbits(vijax.impact_pair(0.2, 40.0, 0.5), "1:1", guesses=64)[:1]
     value, none = np.array([40.0]), np.zeros(1)
     arcs, y = arcs_from(orbit, "kappa", value, none, (value - 37, value + 360), vijax.ContinuationSettings())
-    ahead = np.zeros_like(y)
-    ahead[:, -1] = 1.0
-    return arcs, advance(arcs, y, ahead, none)
+    return arcs, upwards(arcs, y)
 
 
 @pytest.mark.parametrize("length", [0.5, 1.0])

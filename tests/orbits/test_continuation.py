@@ -9,7 +9,16 @@ from vijax import plots
 from vijax.model.device import Harvester, with_constants
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
-from vijax.orbits import branch_dataset, continuation, orbit_properties, orbit_search, parameter, periodic, switching
+from vijax.orbits import (
+    branch_dataset,
+    continuation,
+    curves,
+    orbit_properties,
+    orbit_search,
+    parameter,
+    periodic,
+    switching,
+)
 from vijax.orbits.shooting import Sequence
 
 SPAN = (0.1, 0.3)
@@ -174,10 +183,25 @@ def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     assert float(table["P"][0, -1]) == pytest.approx(float(orbit_properties.power(one.orbit[-1:], last)[0]), rel=1e-12)
 
 
-def test_a_family_ends_where_its_orbit_fades():
-    """The branch of the lower 1:1 orbit ends in impacts of speed zero, at a pitchfork that no ball flies."""
+def test_branches_can_be_followed_from_their_folds():
+    """No orbit beside a fold has its parameter. Newton found nearly none of these, on which 1:1 orbits almost fade."""
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
     lower = periodic.solve(impact_pair([0.28], 120.0, 0.6), half, jnp.array([[[0.96, 0.13, 0.03]]]))
-    (faded,) = points(switching.family(lower, "d", (0.2, 0.3)), "pitchfork")
-    assert int(faded.orbit.status[0]) == Status.VIRTUAL
+    folds = points(continuation.follow(lower, "d", (0.2, 0.3)), "fold")
+    (curve,) = curves.follow_curves(folds, "d", {"d": (0.15, 0.3), "kappa": (20.0, 400.0)})
+    begun = curve.orbit[::10]
+    for branch, d in zip(continuation.follow(begun, "d", (0.15, 0.3)), begun.pair.d, strict=True):
+        assert set(branch.ends) == {"grazing impact", "high"}
+        assert np.abs(branch.values - d).min() < 1e-14
+
+
+def test_a_family_ends_where_its_orbit_fades():
+    """The branch of the lower 1:1 orbit ends in impacts of speed zero, where both multipliers are 1: no pitchfork."""
+    half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
+    lower = periodic.solve(impact_pair([0.28], 120.0, 0.6), half, jnp.array([[[0.96, 0.13, 0.03]]]))
+    (branch,) = switching.family(lower, "d", (0.2, 0.3))
+    faded, fold = branch.points
+    assert (faded.kind, fold.kind) == ("grazing impact", "fold")
+    assert float(np.abs(faded.orbit.knots[0, 0, 1])) < 1e-15
+    assert fold.value < faded.value
     assert faded.value == pytest.approx(2 / np.pi**2, rel=1e-12, abs=0)

@@ -241,6 +241,12 @@ def stride(paths: Path, at: Walker, rules: Pace, trials: int = _TRIALS) -> tuple
     return tiles.map_tiles(lambda rows: _stride(rows[0], rows[1], rules, number), (paths, at), BATCHES)
 
 
+def across(y: np.ndarray) -> np.ndarray:
+    """Give a direction for points of paths that is not orthogonal to any path, as none is likely to be."""
+    some = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
+    return np.broadcast_to(some / np.linalg.norm(some), y.shape)
+
+
 def advance(paths: Path, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:
     """Go on from points of paths by an arclength each, whatever comes of it."""
     lanes = len(y)

@@ -12,7 +12,7 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import symmetry
-from vijax.orbits.arclength_step import BranchPlace, advance
+from vijax.orbits.arclength_step import BranchPlace, across, advance
 from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.branch_path import FIRST_END, FOLD, Arc, Tests
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
@@ -91,10 +91,8 @@ def follow(
     checks.choice("direction", direction, _WAYS)
     points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
     arcs, y = set_out(orbit, along, within, device, settings)
-    ahead = np.zeros_like(y)
-    ahead[:, -1] = 1.0
     begin_proofs(orbit.pair, orbit.sequence, orbit.knots)
-    first = advance(arcs, y, ahead, np.zeros(len(orbit)))
+    first = upwards(arcs, y)
     found = [follow_arcs(arcs, heading(first, sign), along, points, settings) for sign in _WAYS[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]
 
@@ -149,11 +147,25 @@ def arcs_from(
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 
-def heading(place: BranchPlace, sign: float) -> BranchPlace:
+def upwards(arcs: Arc, y: np.ndarray) -> BranchPlace:
+    """Find the tangents at starts of branches, such that the parameter rises."""
+    none, ahead = np.zeros(len(y)), np.zeros_like(y)
+    ahead[:, -1] = 1.0
+    first = advance(arcs, y, ahead, none)
+    if first.arrived.all():
+        return first
+    # At a fold no orbit next to it has the parameter of the start, and Newton is to go another way.
+    other = advance(arcs, y, across(y), none)
+    other = heading(other, np.where(other.tangent[:, -1] < 0, -1.0, 1.0))
+    lost = ~first.arrived
+    return jax.tree.map(lambda one, more: tiles.replaced(np.flatnonzero(lost), one, more[lost]), first, other)
+
+
+def heading(place: BranchPlace, sign: float | np.ndarray) -> BranchPlace:
     """Turn the place the other way where the sign is negative; the fold's test function turns with it."""
     tests = place.tests.copy()
     tests[:, FOLD] *= sign
-    return place._replace(tangent=sign * place.tangent, tests=tests)
+    return place._replace(tangent=np.atleast_1d(sign)[:, None] * place.tangent, tests=tests)
 
 
 def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
@@ -212,9 +224,7 @@ def _point(arc: Arc, kind: str, y: np.ndarray, orbit: Orbit, settings: Continuat
         return plain
     half, row = symmetry.halved(orbit, settings.asymmetry), jax.tree.map(np.atleast_1d, arc)
     arcs, known = arcs_from(half, arc.along, np.array([value]), row.steepest, (row.low, row.high), settings)
-    ahead = np.zeros_like(known)
-    ahead[:, -1] = 1.0
-    first, reach = advance(arcs, known, ahead, np.zeros(1)), np.array([_NEAR])
+    first, reach = upwards(arcs, known), np.array([_NEAR])
     before = advance(arcs, first.y, first.tangent, -reach)
     test = np.array([Tests._fields.index("minus")])
     _, there, sure = locate(arcs, before.y, before.tangent, 2 * reach, test, before.tests[0, test], settings)

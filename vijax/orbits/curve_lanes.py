@@ -9,7 +9,7 @@ import numpy as np
 
 from vijax.model.device import Harvester
 from vijax.orbits import orbit_properties, periodic
-from vijax.orbits.arclength_step import BranchPlace, advance
+from vijax.orbits.arclength_step import BranchPlace, across, advance
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_equations import CONDITIONS, FIRST_CURVE_END, Condition, CurvePath, Touch
 from vijax.orbits.curve_plane import Plane, logarithmic, units
@@ -103,9 +103,7 @@ def lanes_aside(begun: list[Offshoot], plane: Plane, device: Harvester, settings
 
 def on_curve(paths: CurvePath, y: np.ndarray) -> BranchPlace:
     """Correct points that lie on their curves already, to find the tangents there."""
-    # Any direction that is not orthogonal to the curve does for the first correction, and none is likely to be.
-    across = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
-    return advance(paths, y, np.broadcast_to(across / np.linalg.norm(across), y.shape), np.zeros(len(y)))
+    return advance(paths, y, across(y), np.zeros(len(y)))
 
 
 def _beside(paths: CurvePath, y: np.ndarray) -> BranchPlace:

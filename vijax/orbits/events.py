@@ -16,6 +16,9 @@ from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.periodic import Orbit
 
 _ROUNDING = 4 * np.finfo(float).eps
+# So little arclength before a branch ends its end alone is met. Where an orbit fades, its multipliers come to 1 or -1
+# at the very place at which its speeds come to 0.
+_AT_THE_END = 1e-12
 _GRAZING = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
 
@@ -83,9 +86,11 @@ def events(arc: Arc, y, tangent, tests, lengths, settings: ContinuationSettings)
         # A multiplier that passes +1 at a fold is no second event.
         if sure and not (t == PLUS and ((index == i) & (test == FOLD)).any())
     ]
-    ends = [event.s for event in found if event.place == len(y) - 2 and event.test in Tests._fields[FIRST_END:]]
-    kept = [event for event in found if event.place < len(y) - 2 or event.s <= min(ends, default=np.inf)]
-    return sorted(kept, key=lambda event: (event.place, event.s))
+    found.sort(key=lambda event: (event.place, event.s))
+    end = next((event for event in found if event.test in Tests._fields[FIRST_END:]), None)
+    if end is None:
+        return found
+    return [event for event in found if event.place < end.place or event.s < end.s - _AT_THE_END] + [end]
 
 
 # `scipy.optimize.elementwise.find_root` locates a fold, a flip or a grazing to the same digit in two thirds of the

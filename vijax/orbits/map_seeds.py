@@ -9,10 +9,9 @@ from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
-from vijax.orbits.arclength_step import advance
 from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.branch_path import Arc, Tests
-from vijax.orbits.continuation import arcs_from, heading
+from vijax.orbits.continuation import arcs_from, heading, upwards
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start
 from vijax.orbits.events import Point, changed, locate
@@ -133,9 +132,7 @@ def _met(
     low, high = (np.interp(place + shift, np.arange(len(values)), values) for shift in (-reach, reach))
     gravity = np.full(size, steepest)
     arcs, y = arcs_from(orbit, plane.along[way], values[place], gravity, (low, high), settings)
-    ahead = np.zeros_like(y)
-    ahead[:, -1] = 1.0
-    first = advance(arcs, y, ahead, np.zeros(size))
+    first = upwards(arcs, y)
     twice = np.tile(np.arange(size), 2)
     both = jax.tree.map(lambda *leaves: np.concatenate(leaves), heading(first, -1.0), heading(first, 1.0))
     paths = jax.tree.map(lambda leaf: leaf[twice], arcs)
