@@ -5,7 +5,8 @@ import pytest
 
 import vijax
 from vijax.orbits.arclength_step import advance
-from vijax.orbits.continuation import arcs_from, upwards
+from vijax.orbits.branch_path import upwards
+from vijax.orbits.continuation import arcs_from
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,15 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing, shooting
-from vijax.orbits.arclength_step import PathEquations
+from vijax.orbits.arclength_step import BranchPlace, PathEquations, across, advance
 from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
+from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray
 
 
@@ -109,3 +111,24 @@ class Arc(eqx.Module):
         passed = Tests(*(jnp.sign(before) * jnp.sign(after) < 0))
         things = [passed.fold | passed.plus, passed.minus, jnp.stack(passed[FIRST_END:]).any()]
         return jnp.stack(things).sum(dtype=jnp.int32)
+
+
+def upwards(arcs: Arc, y: np.ndarray) -> BranchPlace:
+    """Find the tangents at starts of branches, a row each, such that the parameter rises."""
+    none, ahead = np.zeros(len(y)), np.zeros_like(y)
+    ahead[:, -1] = 1.0
+    first = advance(arcs, y, ahead, none)
+    lost = np.flatnonzero(~first.arrived)
+    if not lost.size:
+        return first
+    # At a fold no orbit next to it has the parameter of the start, and Newton is to go another way.
+    other = advance(arcs, y, across(y), none)
+    other = heading(other, np.where(other.tangent[:, -1] < 0, -1.0, 1.0))
+    return jax.tree.map(lambda one, more: tiles.replaced(lost, one, more[lost]), first, other)
+
+
+def heading(place: BranchPlace, sign: float | np.ndarray) -> BranchPlace:
+    """Turn the place the other way where the sign is negative; the fold's test function turns with it."""
+    tests = place.tests.copy()
+    tests[:, FOLD] *= sign
+    return place._replace(tangent=np.atleast_1d(sign)[:, None] * place.tangent, tests=tests)

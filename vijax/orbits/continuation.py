@@ -12,9 +12,9 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import symmetry
-from vijax.orbits.arclength_step import BranchPlace, across, advance
+from vijax.orbits.arclength_step import BranchPlace, advance
 from vijax.orbits.arclength_walk import Walked
-from vijax.orbits.branch_path import FIRST_END, FOLD, Arc, Tests
+from vijax.orbits.branch_path import FIRST_END, FOLD, Arc, Tests, heading, upwards
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import BranchEvent, Point, events, kind_of, locate, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
@@ -145,27 +145,6 @@ def arcs_from(
     arcs = jax.tree.map(np.asarray, arcs)
     knots = np.where(arcs.sequence.real[..., None], orbit.knots, 0.0).reshape(len(orbit), -1)
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
-
-
-def upwards(arcs: Arc, y: np.ndarray) -> BranchPlace:
-    """Find the tangents at starts of branches, such that the parameter rises."""
-    none, ahead = np.zeros(len(y)), np.zeros_like(y)
-    ahead[:, -1] = 1.0
-    first = advance(arcs, y, ahead, none)
-    if first.arrived.all():
-        return first
-    # At a fold no orbit next to it has the parameter of the start, and Newton is to go another way.
-    other = advance(arcs, y, across(y), none)
-    other = heading(other, np.where(other.tangent[:, -1] < 0, -1.0, 1.0))
-    lost = ~first.arrived
-    return jax.tree.map(lambda one, more: tiles.replaced(np.flatnonzero(lost), one, more[lost]), first, other)
-
-
-def heading(place: BranchPlace, sign: float | np.ndarray) -> BranchPlace:
-    """Turn the place the other way where the sign is negative; the fold's test function turns with it."""
-    tests = place.tests.copy()
-    tests[:, FOLD] *= sign
-    return place._replace(tangent=np.atleast_1d(sign)[:, None] * place.tangent, tests=tests)
 
 
 def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:

@@ -13,7 +13,7 @@ from vijax.orbits.map_borders import Borders, LabelledPlane
 
 _SETTLE = 400  # forcing periods that a ball is flown in a cell at most, as in a sweep
 _TILE = 64  # balls that are flown together
-_CELLS = 2  # in which each is flown, one after another
+_CELLS = 2  # Each ball is flown in so many cells, one after another.
 
 
 def settled(plane: LabelledPlane, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,8 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
 from vijax.orbits.arclength_walk import Walked, walk
-from vijax.orbits.branch_path import Arc, Tests
-from vijax.orbits.continuation import arcs_from, heading, upwards
+from vijax.orbits.branch_path import Arc, Tests, heading, upwards
+from vijax.orbits.continuation import arcs_from
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_starts import CurveStart, curve_start
 from vijax.orbits.events import Point, changed, locate

@@ -19,7 +19,7 @@ from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.orbits import grazing
 from vijax.orbits.arclength_step import BranchPlace, Path, advance
-from vijax.orbits.branch_path import FIRST_END, Arc, Tests
+from vijax.orbits.branch_path import FIRST_END, Arc, Tests, heading
 from vijax.orbits.events import orbits_at
 from vijax.orbits.orbit_properties import counts
 from vijax.orbits.periodic import SAME, Orbit
@@ -199,22 +199,22 @@ def branch_passage(arc: Arc, y: np.ndarray, test: str, sign: float) -> Passage |
     pair, knots = arc.pair_and_knots(y)
     if pair.rigid or (found := touching(pair, arc.sequence, np.asarray(knots), test)) is None:
         return None
-    # The orbit with fewer impacts is regular at the graze, and has the multipliers of both.
+    # The orbit with fewer impacts is regular at the graze, and has the multipliers of both. It is to have the parameter
+    # of the graze: at a fold there, where none has, the sign of the parameter says nothing of the way on.
     fewer, start = alone(among(arc, found.side)), unknowns(found.knots, y[-1:])
     ahead = np.zeros_like(start)
     ahead[:, -1] = 1.0
     place = advance(fewer, start, ahead, np.zeros(1))
     if not np.abs(place.y - start).max() < _STAYS:
         return None
-    tests = place.tests.copy()
-    tests[:, Tests._fields.index("fold")] *= sign
+    place = heading(place, sign)
     # Past the graze they are positive; here one of them is zero, or not defined.
-    tests[:, _CLEARANCES] = np.nan
+    place.tests[:, _CLEARANCES] = np.nan
     orbit = orbits_at(jax.tree.map(lambda leaf: leaf[0], fewer), start)
     appears = test in ("flight", "contact")
     if not appears:
-        return beyond(found, appears, orbit, fewer, place._replace(tangent=sign * place.tangent, tests=tests))
+        return beyond(found, appears, orbit, fewer, place)
     begun = with_impact(pair, found)
     start, tangent = unknowns(begun.knots, y[-1:]), unknowns(begun.along, np.zeros(1))
-    place = place._replace(y=start, tangent=tangent, tests=tests)
+    place = place._replace(y=start, tangent=tangent)
     return beyond(found, appears, orbit, alone(among(arc, begun.side)), place)

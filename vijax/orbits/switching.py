@@ -9,8 +9,8 @@ from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import orbit_properties, shooting, symmetry
 from vijax.orbits.arclength_step import BranchPlace
-from vijax.orbits.branch_path import Tests
-from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, heading, set_out
+from vijax.orbits.branch_path import Tests, heading
+from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, set_out
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
 from vijax.orbits.parameter import check_bounds, tilts
