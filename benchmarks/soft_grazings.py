@@ -8,14 +8,14 @@ graze the same orbit is looked for by itself, half way to the next bifurcation, 
 and followed without going through any graze: to the graze from the other side, and to the next bifurcation. One line a
 figure. Typical printout:
 
-    grazings with an orbit found beyond by itself                            56: 3 grazing contact (fewer), ...
+    grazings with an orbit found beyond by itself                            56: 4 grazing contact (fewer), ...
     grazings beyond which random guesses found none                          0
-    largest residual of 5 orbits on either side                              1.7e-15
+    largest residual of 5 orbits on either side                              1.6e-15
     of these not verified by the impact map                                  0
     grazes and bifurcations that the branch of that orbit does not meet      0
-    the graze, met from the other side: largest difference                   2.4e-11
-    the next bifurcation, found from there: number, largest difference       50, 5.1e-13
-    pitchfork of a mirror pair, found from there: number, largest difference 6, 4.8e-08
+    the graze, met from the other side: largest difference                   3.4e-11
+    the next bifurcation, found from there: number, largest difference       50, 3.6e-13
+    pitchfork of a mirror pair, found from there: number, largest difference 6, 1.4e-13
 """
 
 import argparse

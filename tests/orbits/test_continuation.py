@@ -195,6 +195,29 @@ def test_branches_can_be_followed_from_their_folds():
         assert np.abs(branch.values - d).min() < 1e-14
 
 
+@pytest.mark.parametrize("kappa", [None, 40.0])
+def test_a_branch_that_starts_at_a_bound_stays_within(kappa):
+    """It used to set out across the bound, where rounding had the start beyond it already."""
+    start = orbit_search.search(impact_pair(0.2, kappa, 0.5), "RL", guesses=32)[:1]
+    for within, end in (((0.2, 0.25), "low"), ((0.15, 0.2), "high")):
+        (branch,) = continuation.follow(start, "d", within)
+        at_start = [why for why, d in zip(branch.ends, branch.values[[0, -1]], strict=True) if d == pytest.approx(0.2)]
+        assert end in at_start
+        assert within[0] <= branch.values.min() < branch.values.max() <= within[1]
+        assert np.abs(np.diff(branch.values)).min() > 0
+
+
+def test_a_pitchfork_is_told_from_a_fold_however_roughly_it_is_met():
+    """At this gap Newton leaves the mirror pairs 1.07e-4 apart where they meet. The symmetric branch is told, too."""
+    start = orbit_search.search(impact_pair(0.23572947460946414, None, 0.5), "RL", guesses=64)
+    branches = switching.family(start, "r", (0.15, 0.9))
+    assert {"fold"}.isdisjoint(point.kind for one in branches for point in one.points)
+    (pairs,) = (one for one in branches if not bool(one.orbit.sequence.mirrored[0]))
+    (simple,) = (one for one in branches if bool(one.orbit.sequence.mirrored[0]) and one.points)
+    (of_pairs,), (of_simple,) = points([pairs], "pitchfork"), points([simple], "pitchfork")
+    assert of_pairs.value == pytest.approx(of_simple.value, abs=1e-14)
+
+
 def test_a_family_ends_where_its_orbit_fades():
     """The branch of the lower 1:1 orbit ends in impacts of speed zero, where both multipliers are 1: no pitchfork."""
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))

@@ -16,6 +16,7 @@ from vijax.model.energy import rigid_penetration
 from vijax.model.pair import impact_pair
 from vijax.model.records import Status
 from vijax.orbits import (
+    continuation,
     curve_rows,
     curves,
     limits,
@@ -123,6 +124,18 @@ def test_a_fold_and_a_flip_touch_their_graze_at_its_resonance(grown):
         off = np.abs(d - CubicSpline(along[:, 1], along[:, 0])(r))[away > 5e-3]
         power = np.polyfit(np.log(away[away > 5e-3]), np.log(off), 1)[0]
         assert power == pytest.approx(2, abs=0.1)
+
+
+def test_branches_lead_on_from_where_their_orbits_graze(found):
+    """Rounding decides on which side of its graze such an orbit is; each is the end of one way, and not of the other."""
+    graze = found["grazing"].orbit
+    touching = graze[np.flatnonzero(np.asarray(graze.status) == Status.OK)][1:-1]
+    for branch, d in zip(
+        continuation.follow(touching, "d", PLANE["d"], points=10), np.asarray(touching.pair.d), strict=True
+    ):
+        assert "lost" not in branch.ends
+        assert "grazing flight" in branch.ends
+        assert min(abs(branch.values[0] - d), abs(branch.values[-1] - d)) < 1e-12
 
 
 def test_the_stable_side_of_a_graze_is_told_by_the_orbit_that_touches(found):

@@ -23,6 +23,8 @@ BATCHES = (8, 64, 512)  # lanes of one compiled call
 # Where an orbit has dozens of impacts rounding alone may move a point by more than Newton's last correction is to be.
 # What comes so near, in parts of that, and comes no nearer is as exact as it can be.
 _ROUNDING = 100.0
+# Test functions of an orbit that grazes, or is at a bound, are smaller; those of one at a bifurcation.
+_AT_AN_END, _VANISHES = 1e-12, 1e-9
 _ASTRAY = 1.0  # A correction of half a period, or of a whole side of the plane, leads nowhere near.
 
 
@@ -245,6 +247,20 @@ def across(y: np.ndarray) -> np.ndarray:
     """Give a direction for points of paths that is not orthogonal to any path, as none is likely to be."""
     some = np.cos(np.arange(y.shape[1])) * (np.abs(y) > 0).any(axis=0)
     return np.broadcast_to(some / np.linalg.norm(some), y.shape)
+
+
+def settled(place: BranchPlace, first_end: int) -> BranchPlace:
+    """Count starts that rounding alone puts beyond an end of real orbits, at a graze or a bound, as just before it.
+
+    So a path ends where it begins one way, and leads on the other. What else vanishes there is not known: where an
+    orbit fades, its multipliers are 1 but for what Newton leaves.
+    """
+    tests = place.tests.copy()
+    others, ends = tests[:, :first_end], tests[:, first_end:]
+    at_end = np.abs(ends) < _AT_AN_END
+    ends[at_end] = np.finfo(float).tiny
+    others[at_end.any(axis=1)[:, None] & (np.abs(others) < _VANISHES)] = np.nan
+    return place._replace(tests=tests)
 
 
 def advance(paths: Path, y: np.ndarray, tangent: np.ndarray, length: np.ndarray) -> BranchPlace:

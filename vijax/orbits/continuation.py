@@ -12,11 +12,11 @@ import numpy as np
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import symmetry
-from vijax.orbits.arclength_step import BranchPlace, advance
+from vijax.orbits.arclength_step import BranchPlace, advance, settled
 from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.branch_path import FIRST_END, FOLD, Arc, Tests, heading, upwards
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
-from vijax.orbits.events import BranchEvent, Point, events, kind_of, locate, orbits_at
+from vijax.orbits.events import BranchEvent, Point, blur, events, kind_of, locate, orbits_at
 from vijax.orbits.parameter import check_along, check_bounds, tilts
 from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit
 from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
@@ -92,8 +92,8 @@ def follow(
     points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
     arcs, y = set_out(orbit, along, within, device, settings)
     begin_proofs(orbit.pair, orbit.sequence, orbit.knots)
-    first = upwards(arcs, y)
-    found = [follow_arcs(arcs, heading(first, sign), along, points, settings) for sign in _WAYS[direction]]
+    first = settled(upwards(arcs, y), FIRST_END)
+    found = [follow_arcs(orbit, arcs, heading(first, sign), along, points, settings) for sign in _WAYS[direction]]
     return found[0] if len(found) == 1 else [_joined(*both) for both in zip(*found, strict=True)]
 
 
@@ -147,18 +147,25 @@ def arcs_from(
     return arcs, np.concatenate([knots, (x / (high - low))[:, None]], axis=1)
 
 
-def follow_arcs(arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings) -> list[Branch]:
+def follow_arcs(
+    starts: Orbit, arcs: Arc, first: BranchPlace, along: str, points: int, settings: ContinuationSettings
+) -> list[Branch]:
     """Follow one way from every start, at soft walls through grazes, after which orbits have other impacts."""
 
-    def making(_: list[int], arcs: Arc, walked: list[Walked], begun: list[bool]) -> list[Piece]:
-        each = [jax.tree.map(lambda leaf, i=lane: leaf[i], arcs) for lane in range(len(walked))]
-        return [_piece(arc, one, settings, first) for arc, one, first in zip(each, walked, begun, strict=True)]
+    def making(lanes: list[int], arcs: Arc, walked: list[Walked], begun: list[bool]) -> list[Piece]:
+        each = [jax.tree.map(lambda leaf, i=row: leaf[i], arcs) for row in range(len(walked))]
+        # Starts are known to be flown. Of one that grazes rounding might say otherwise, were it verified once more.
+        given = [starts[lane : lane + 1] if yes else None for lane, yes in zip(lanes, begun, strict=True)]
+        return [_piece(arc, one, settings, start) for arc, one, start in zip(each, walked, given, strict=True)]
 
     return [Branch(along, *one) for one in follow_pieces(arcs, first, making, points, settings)]
 
 
-def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool) -> Piece:
-    """Make a piece of a lane's record: what was met between its points, and where it ends; see `pieces.Making`."""
+def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, start: Orbit | None) -> Piece:
+    """Make a piece of a lane's record: what was met between its points, and where it ends; see `pieces.Making`.
+
+    It begins with the start where one is given, else with the first step from it.
+    """
     y, tangent, tests, lengths, end = walked
     unit, last, values = float(arc.high - arc.low), len(y), y[:, -1]
     met: list[Point] = []
@@ -176,12 +183,11 @@ def _piece(arc: Arc, walked: Walked, settings: ContinuationSettings, begun: bool
             end, last, ending = kind, event.place + 1, [orbit]
             values = np.append(y[:last, -1], event.y[-1])
             break
-    rows = slice(0 if begun else 1, last)
-    orbits = ([orbits_at(arc, y[rows])] if last > rows.start else []) + ending
+    orbits = ([] if start is None else [start]) + ([orbits_at(arc, y[1:last])] if last > 1 else []) + ending
     # At a bound the last orbit is there; at a grazing rounding decides whether it is one.
     if orbits and int(np.asarray(orbits[-1].status)[-1]) != Status.OK:
         values, orbits = values[:-1], [*orbits[:-1], orbits[-1][:-1]]
-    return Piece(values[rows.start :] * unit, orbits, met, end, beyond)
+    return Piece(values[start is None :] * unit, orbits, met, end, beyond)
 
 
 def _beyond(arc: Arc, event: BranchEvent, y: np.ndarray, tests: np.ndarray) -> Passage | None:
@@ -201,14 +207,15 @@ def _point(arc: Arc, kind: str, y: np.ndarray, orbit: Orbit, settings: Continuat
     plain = Point(kind, value, orbit)
     if kind != "pitchfork" or bool(arc.sequence.mirrored) or tilts(arc.along):
         return plain
-    half, row = symmetry.halved(orbit, settings.asymmetry), jax.tree.map(np.atleast_1d, arc)
+    half, row = symmetry.halved(orbit, blur(settings)), jax.tree.map(np.atleast_1d, arc)
     arcs, known = arcs_from(half, arc.along, np.array([value]), row.steepest, (row.low, row.high), settings)
     first, reach = upwards(arcs, known), np.array([_NEAR])
     before = advance(arcs, first.y, first.tangent, -reach)
     test = np.array([Tests._fields.index("minus")])
     _, there, sure = locate(arcs, before.y, before.tangent, 2 * reach, test, before.tests[0, test], settings)
     if not sure[0]:
-        return plain
+        exact = bool(symmetry.symmetric(orbit, settings.asymmetry)[0])
+        return plain if exact else plain._replace(kind="fold")
     arc = jax.tree.map(lambda leaf: leaf[0], arcs)
     full = symmetry.unfolded(orbits_at(arc, there))
     return Point(kind, float(there[0, -1] * (arc.high - arc.low)), full)

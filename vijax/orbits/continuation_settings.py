@@ -56,7 +56,8 @@ class ContinuationSettings:
         zero_share: Part of a test function's values at both ends of a step below which it is zero, 1e-3: a pole changes
             sign too, and stays far from zero. Too small a one drops events, ends of the branch among them.
         asymmetry: How far from its mirror image an orbit at a bifurcation is still symmetric, 1e-4 in knots: it decides
-            between pitchfork and fold. Of events of two branches that differ by less, one is not told from the other.
+            between pitchfork and fold. One that is five times as far off counts if a pitchfork is located beside it. Of
+            events of two branches that differ by less, one is not told from the other.
         closing_steps: Steps before a branch can have closed, 20. Too few of them, or too short ones beside `max_step`,
             and it closes before it has left its start.
         max_grazings: Grazes at soft walls that a branch goes through each way, 16. With 0 it ends at the first, as it

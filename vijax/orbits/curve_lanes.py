@@ -9,7 +9,7 @@ import numpy as np
 
 from vijax.model.device import Harvester
 from vijax.orbits import orbit_properties, periodic
-from vijax.orbits.arclength_step import BranchPlace, across, advance
+from vijax.orbits.arclength_step import BranchPlace, across, advance, settled
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.curve_equations import CONDITIONS, FIRST_CURVE_END, Condition, CurvePath, Touch
 from vijax.orbits.curve_plane import Plane, logarithmic, units
@@ -57,7 +57,7 @@ def lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: C
     for batch in batches.values():
         paths, y = _set_out(batch, plane, device, settings)
         limit = paths.device is not None
-        first = _beside(paths, y) if limit else on_curve(paths, y)
+        first = settled(_beside(paths, y) if limit else on_curve(paths, y), FIRST_CURVE_END)
         near = np.abs(first.y - y).max(axis=1) < (_BESIDE if limit else settings.max_step)
         real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
         for index, good in enumerate(real & first.arrived):

@@ -152,11 +152,22 @@ def kind_of(arc: Arc, event: BranchEvent, neighbours: np.ndarray, settings: Cont
         return "pitchfork" if bool(arc.sequence.mirrored) else "flip"
     if test in ("low", "high"):
         return test
+    if bool(arc.sequence.mirrored):
+        return "fold"
     # A branch of mirror pairs turns where the two of a pair meet; a symmetric one passes +1 there without turning.
     around = orbits_at(arc, np.concatenate([event.y[None], neighbours]))
-    meets = np.asarray(symmetry.symmetric(around, settings.asymmetry))
-    turns = test == "fold"
-    return "pitchfork" if meets[0] and turns != meets[1:].all() else "fold"
+    meets = np.asarray(symmetry.symmetric(around[:1], blur(settings)))[0]
+    stays = np.asarray(symmetry.symmetric(around[1:], settings.asymmetry)).all()
+    return "pitchfork" if meets and (test == "fold") != stays else "fold"
+
+
+def blur(settings: ContinuationSettings) -> float:
+    """Say how far from its mirror image an orbit may come out at a pitchfork that a branch of mirror pairs meets.
+
+    Newton's equations are singular there: what they miss grows as the third power of the distance only, so that with a
+    tolerance of 1e-11 it may be a few times 1e-4.
+    """
+    return 5 * settings.asymmetry
 
 
 def orbits_at(path: Path, ys: np.ndarray) -> Orbit:

@@ -18,6 +18,8 @@ from vijax.orbits.orbit_properties import marks
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.soft_graze import Passage
 
+_SAME_PLACE = 1e-12  # So little apart are values of the parameters at which a path begins and ends.
+
 
 class Piece(NamedTuple):
     """A path from graze to graze.
@@ -75,10 +77,17 @@ def follow_pieces(
             left = np.array([points - _size(ways[lane]) for lane in lanes])
             walked = walk(some, places, left, settings)
             for lane, piece in zip(lanes, making(lanes, some, walked, [not ways[i] for i in lanes]), strict=True):
-                ways[lane].append(piece)
+                ways[lane].append(piece if ways[lane] else _once(piece))
         on = [(lane, ways[lane][-1].beyond) for lane, _, _ in going if _goes_on(ways[lane], points, settings)]
         going = [(lane, to.path, to.place) for lane, to in on if to is not None]
     return [_whole(way, settings) for way in ways]
+
+
+def _once(piece: Piece) -> Piece:
+    """Keep the orbit once of a path that ends where it begins: at a graze, or at a bound."""
+    if len(piece.values) != 2 or not np.allclose(*piece.values, rtol=_SAME_PLACE, atol=_SAME_PLACE):
+        return piece
+    return piece._replace(values=piece.values[:1], orbits=[_in_one(piece.orbits)[:1]])
 
 
 def _size(way: list[Piece]) -> int:

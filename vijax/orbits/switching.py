@@ -1,6 +1,6 @@
 """Switching: the branches that begin at flips and pitchforks, and the family of all that begin on these in turn."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -64,7 +64,7 @@ def switch(
     away = np.append(ahead, 0.0)[None]
     # Test functions that vanish here would be met again at once.
     first = BranchPlace(y, away, np.full((1, len(Tests._fields)), np.nan), np.full(1, True), np.zeros(1))
-    return [follow_arcs(arcs, heading(first, sign), along, points, settings)[0] for sign in (1.0, -1.0)]
+    return [follow_arcs(doubled, arcs, heading(first, sign), along, points, settings)[0] for sign in (1.0, -1.0)]
 
 
 def leaving(orbit: Orbit) -> tuple[Orbit, np.ndarray]:
@@ -118,7 +118,9 @@ def family(
         grown += _new(follow(one, along, within, **told), grown, settings)
     youngest = grown
     for _ in range(max_switches):
+        known = [mark for branch in grown for mark in _marks(branch) if not mark.half]
         where = [point for branch in youngest for point in branch.points if _begins(point) and _real(point)]
+        where = [point for point in where if point.kind == "flip" or not _in_full(point, known, settings)]
         youngest = []
         for point in where:
             begun = switch(point, along, within, **told)
@@ -130,17 +132,43 @@ def family(
 
 def _new(found: list[Branch], known: list[Branch], settings: ContinuationSettings) -> list[Branch]:
     """Keep branches that met something which no known one has met: the same points lie on the same branch."""
-    old = [(point.kind, _traits(point)) for branch in known for point in branch.points]
+    old = [mark for branch in known for mark in _marks(branch)]
     new = []
     for branch in found:
-        met = [(point.kind, _traits(point)) for point in branch.points]
-        seen = [any(kind == k and np.allclose(x, y, atol=settings.asymmetry) for k, y in old) for kind, x in met]
-        if not met or not all(seen):
+        met = _marks(branch)
+        if not met or not all(_among(mark, old, settings) for mark in met):
             new.append(branch)
             old += met
     return new
 
 
-def _traits(point: Point) -> np.ndarray:
-    """Give numbers that tell orbits apart, whichever impact they begin with."""
-    return np.append(np.asarray(orbit_properties.marks(symmetry.unfolded(point.orbit)))[0], point.value)
+class _Mark(NamedTuple):
+    """What tells points apart: of what kind they are, whether on a branch of orbits closed half way, numbers.
+
+    A pitchfork is on two branches, and closed half way on one of them.
+    """
+
+    kind: str
+    half: bool
+    traits: np.ndarray
+
+
+def _marks(branch: Branch) -> list[_Mark]:
+    return [_mark(point) for point in branch.points]
+
+
+def _mark(point: Point) -> _Mark:
+    """Give numbers that tell orbits apart, whichever impact they begin with, and the place of the point."""
+    numbers = np.asarray(orbit_properties.marks(symmetry.unfolded(point.orbit)))[0]
+    return _Mark(point.kind, bool(point.orbit.sequence.mirrored[0]), np.append(numbers, point.value))
+
+
+def _in_full(pitchfork: Point, known: list[_Mark], settings: ContinuationSettings) -> bool:
+    """Say whether a known branch of mirror pairs comes by a pitchfork: that is the one which begins there."""
+    return _among(_mark(pitchfork)._replace(half=False), known, settings)
+
+
+def _among(mark: _Mark, known: list[_Mark], settings: ContinuationSettings) -> bool:
+    """Say whether a mark is one of those known."""
+    alike = [other for other in known if (other.kind, other.half) == (mark.kind, mark.half)]
+    return any(np.allclose(mark.traits, other.traits, atol=settings.asymmetry) for other in alike)
