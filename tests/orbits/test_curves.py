@@ -27,6 +27,8 @@ from vijax.orbits import (
     shooting,
     switching,
 )
+from vijax.orbits.curve_equations import Touch
+from vijax.orbits.curve_starts import curve_start, with_touch
 from vijax.orbits.events import Point
 from vijax.orbits.shooting import Sequence
 
@@ -126,8 +128,22 @@ def test_a_fold_and_a_flip_touch_their_graze_at_its_resonance(grown):
         assert power == pytest.approx(2, abs=0.1)
 
 
+def test_a_touch_is_proven_whether_the_ball_meets_the_wall_or_flies_by(found):
+    """Rounding decides which, along the curve of a graze now the one and now the other."""
+    graze = found["grazing"].orbit[1:-1]
+    begun = [curve_start(Point("grazing flight", 0.0, graze[i : i + 1]), (0.0, 0.0), 1e-4) for i in range(len(graze))]
+    starts = [start for start in begun if not isinstance(start, str)]
+    impact, wall, wait = (np.array([getattr(start, name) for start in starts]) for name in ("impact", "wall", "wait"))
+    assert len(np.unique(impact)) == 1
+    hit = with_touch(graze.pair, graze.knots, graze.sequence, Touch(impact[0], wall), wait)
+    assert (np.asarray(hit.status) == Status.OK).all()
+    depth = np.asarray(hit.depth)[:, impact[0] + 1]
+    assert 0 < (depth == 0).sum() < len(depth)
+    assert depth.max() < 1e-6
+
+
 def test_branches_lead_on_from_where_their_orbits_graze(found):
-    """Rounding decides on which side of its graze such an orbit is; each is the end of one way, and not of the other."""
+    """Rounding decides on which side of its graze such an orbit is. One way ends there, the other leads on."""
     graze = found["grazing"].orbit
     touching = graze[np.flatnonzero(np.asarray(graze.status) == Status.OK)][1:-1]
     for branch, d in zip(

@@ -224,17 +224,21 @@ def _judged(pair: ImpactPair, sequence: Sequence, claim: Claim, flown: Next) -> 
     """Judge the claims by what the flights say of them."""
     real, departure = sequence.real, claim.departure
     found = jnp.isfinite(claim.residual) & real.any(axis=1)
-    miss = jnp.abs(flown.t + 2 * claim.periods - departure.next_t)
-    miss = miss + jnp.abs(flown.side * flown.v_in - departure.next_speed)
-    miss = miss + jnp.abs(flown.duration - departure.next_stay)
-    met = flown.real & (flown.side == departure.next_side) & (miss < SAME)
-    verified = found & (met | ~real).all(axis=1)
+
+    def meets(side, t, speed, stay):
+        miss = jnp.abs(flown.t + 2 * claim.periods - t) + jnp.abs(flown.side * flown.v_in - speed)
+        return flown.real & (flown.side == side) & (miss + jnp.abs(flown.duration - stay) < SAME)
+
+    ahead = departure.next_side, departure.next_t, departure.next_speed, departure.next_stay
+    # Rounding decides whether a ball meets the wall that it just touches, or flies by to the impact after it.
+    by = (departure.next_speed == 0) & meets(*(jnp.roll(one, -1, axis=1) for one in ahead))
+    verified = found & (meets(*ahead) | by | ~real).all(axis=1)
     status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
     good = verified[:, None] & real
     # What was flown to is the impact after each.
     place = jnp.arange(real.shape[1], dtype=jnp.int32)
     before = jnp.where(place == 0, real.sum(axis=1, dtype=jnp.int32)[:, None] - 1, place - 1)
-    depth, work = (jnp.take_along_axis(leaf, before, axis=1) for leaf in (flown.depth, flown.work))
+    depth, work = (jnp.take_along_axis(jnp.where(by, 0.0, x), before, axis=1) for x in (flown.depth, flown.work))
     # The first impact is put into the first period.
     knots = claim.knots.at[..., 0].add(-2 * jnp.floor(0.5 * claim.knots[:, :1, 0]))
     return Orbit(

@@ -85,7 +85,8 @@ def follow_pieces(
 
 def _once(piece: Piece) -> Piece:
     """Keep the orbit once of a path that ends where it begins: at a graze, or at a bound."""
-    if len(piece.values) != 2 or not np.allclose(*piece.values, rtol=_SAME_PLACE, atol=_SAME_PLACE):
+    begin, *_, end = piece.values
+    if len(piece.values) != 2 or not np.allclose(begin, end, rtol=_SAME_PLACE, atol=_SAME_PLACE):
         return piece
     return piece._replace(values=piece.values[:1], orbits=[_in_one(piece.orbits)[:1]])
 
