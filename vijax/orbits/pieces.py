@@ -85,8 +85,10 @@ def follow_pieces(
 
 def _once(piece: Piece) -> Piece:
     """Keep the orbit once of a path that ends where it begins: at a graze, or at a bound."""
-    begin, *_, end = piece.values
-    if len(piece.values) != 2 or not np.allclose(begin, end, rtol=_SAME_PLACE, atol=_SAME_PLACE):
+    if len(piece.values) != 2:
+        return piece
+    begin, end = piece.values
+    if not np.allclose(begin, end, rtol=_SAME_PLACE, atol=_SAME_PLACE):
         return piece
     return piece._replace(values=piece.values[:1], orbits=[_in_one(piece.orbits)[:1]])
 
