@@ -13,12 +13,14 @@ from vijax.orbits import (
     branch_dataset,
     continuation,
     curves,
+    events,
     orbit_properties,
     orbit_search,
     parameter,
     periodic,
     switching,
 )
+from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.shooting import Sequence
 
 SPAN = (0.1, 0.3)
@@ -216,6 +218,17 @@ def test_a_pitchfork_is_told_from_a_fold_however_roughly_it_is_met():
     (simple,) = (one for one in branches if bool(one.orbit.sequence.mirrored[0]) and one.points)
     (of_pairs,), (of_simple,) = points([pairs], "pitchfork"), points([simple], "pitchfork")
     assert of_pairs.value == pytest.approx(of_simple.value, abs=1e-14)
+
+
+def test_an_orbit_closed_half_way_folds_where_a_multiplier_passes_one():
+    """In a step from where it fades its turn is not seen, and it was called a pitchfork, at which -1 is passed."""
+    half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
+    lower = periodic.solve(impact_pair([0.28], 120.0, 0.6), half, jnp.array([[[0.96, 0.13, 0.03]]]))
+    arcs, y = continuation.set_out(lower, "d", SPAN, None, ContinuationSettings())
+    arc = jax.tree.map(lambda leaf: leaf[0], arcs)
+    for test, kind in (("plus", "fold"), ("fold", "fold"), ("minus", "pitchfork")):
+        event = events.BranchEvent(0, 0.0, test, y[0])
+        assert events.kind_of(arc, event, np.repeat(y, 2, axis=0), ContinuationSettings()) == kind
 
 
 def test_a_family_ends_where_its_orbit_fades():
