@@ -10,7 +10,8 @@ from vijax.cli.main import vijax as command
 from vijax.cli.page import Page
 from vijax.model.quantities import AXES, QUANTITIES
 from vijax.model.records import Status
-from vijax.planes.outputs import ON_REQUEST, OUTPUTS
+from vijax.planes import outputs
+from vijax.planes.outputs import ON_REQUEST
 
 INTO = Path(__file__).parent / "generated"
 
@@ -18,7 +19,8 @@ INTO = Path(__file__).parent / "generated"
 def write() -> None:
     """Write the pages into `generated`; a page that says the same as before is left, so that it is not built again."""
     INTO.mkdir(exist_ok=True)
-    texts = {"command": _command(), "outputs": _outputs(), "status": _status(), "quantities": _quantities()}
+    texts = {"command": _command(), "status": _status(), "quantities": _quantities()}
+    texts |= {"outputs": _outputs(1), "outputs_expected": _outputs(2)}
     for name, text in (texts | measured.texts()).items():
         path = INTO / f"{name}.md"
         if not path.exists() or path.read_text(encoding="utf-8") != text:
@@ -45,10 +47,10 @@ def _page(name: str, above: click.Context) -> str:
     return "\n".join(parts)
 
 
-def _outputs() -> str:
+def _outputs(starts: int) -> str:
     rows = [
         (f"`{name}`", output.units, escaped(output.description) + (" (on request)" if name in ON_REQUEST else ""))
-        for name, output in OUTPUTS.items()
+        for name, output in outputs.table(starts).items()
     ]
     return table(("variable", "unit", "what it is"), rows)
 

@@ -51,6 +51,11 @@ BAD = [
     (["--workers", "2", "--scheduler", "10.0.0.1:8786"], "workers must be left out with scheduler"),
     (["--workers", "2", "--compare", "rigid"], "workers must be left out with compare"),
     (["--workers", "2", "--out", "map.zarr", "--refine", "2"], "workers must be left out with refine"),
+    (["--starts", "3", "--show", "label"], "show must be among P, power"),
+    (["--starts", "3", "--refine", "2"], "refine must be left out where cells have several starts"),
+    (["--starts", "3", "--outputs", "P", "--plot", "map.png"], "outputs must hold attractors, undecided, admissible"),
+    (["--starts", "3", "--compare", "rigid"], "starts must not be chosen with compare"),
+    (["--show", "best_share"], "show must be label, or among"),
     (["--scheduler", "somewhere"], "scheduler must be an address"),
     (["--kappa", "inf"], 'wall="rigid"'),
     (["--omega=-1"], "omega must be positive"),
@@ -244,6 +249,16 @@ def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert out.startswith("1 cell in")
     assert "cells computed: 1 of 2 shown, 50.0%; the others filled" in out
+
+
+def test_several_starts_from_arguments_to_store_and_picture(folder, capsys):
+    names = ["--out", "expected.zarr", "--plot", "expected.png"]
+    assert script.main([*TINY, "--starts", "5", *names]) == 0
+    assert "cells by attractors found: 1 " in capsys.readouterr().out
+    kept = sweep.load(folder / "expected.zarr")
+    assert kept.attrs["starts"] == 5
+    assert "best_share" in kept
+    assert (folder / "expected.png").stat().st_size > 0
 
 
 @pytest.mark.parametrize(("admissible", "says"), [(True, "admissible\n"), (False, "inadmissible; see docs: model\n")])

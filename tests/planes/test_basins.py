@@ -25,7 +25,7 @@ def planted(kinds, which, dims=("d", "u0", "v0"), noise=NOISE, **further):
     found = {}
     for name, usual in blank.items():
         values = np.array([kind.get(name, usual) for kind in kinds])[which]
-        if name in tables._INVARIANTS:
+        if name in tables.INVARIANTS:
             values = values * (1 + noise * random.uniform(-1, 1, which.shape))
         found[name] = (dims, values)
     return xr.Dataset(found | further)

@@ -97,7 +97,7 @@ def _asked(
     **given: Any,
 ) -> DesignRequest:
     from vijax.design import optimise
-    from vijax.planes.basins import MOST_STARTS
+    from vijax.planes.sweep_settings import MOST_STARTS
     from vijax.runtime import checks
 
     names = tuple(name.strip() for name in tune.split(","))

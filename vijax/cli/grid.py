@@ -37,6 +37,8 @@ def _leave_out(given: dict[str, Any]) -> None:
         raise ValueError(f"outputs must not be chosen with compare; got {outputs!r}; leave them out")
     if (levels := given.pop("refine")) is not None:
         raise ValueError(f"refine must not be chosen with compare, which computes every cell; got {levels}")
+    if (starts := given.pop("starts")) != 1:
+        raise ValueError(f"starts must not be chosen with compare, whose cells have one; got {starts}")
     for name in _METHOD_OPTIONS:
         if (value := given.pop(name)) != getattr(SweepSettings, name, None):
             raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")

@@ -40,12 +40,12 @@ def power_map(
 ) -> None:
     """Map the energy harvested over a plane of parameters."""
     with process.door():
-        _check_show(show, given["until"])
+        _check_show(show, given["until"], given["starts"])
         files = _FILES.get(show, (f"{show}_map.zarr", f"{show}_map.png"))
         picture = given.pop("plot")
         out, plot = targets(given.pop("out"), picture, files, overwrite, goes_on=True)
         axes, made = take_axes(given, PLANE), device(constants)
-        planned = _plan(axes, made, _wanted(outputs, show), given)
+        planned = _plan(axes, made, _wanted(outputs, show, given["starts"]), given)
         plot = drawn(plot, picture, planned.cells.sizes)
         if plot is not None:
             _check_picture(plot, planned, show)
@@ -118,22 +118,24 @@ def _agree(planned: "SweepPlan", yes: bool) -> None:
     process.agree(estimate.of(planned), yes)
 
 
-def _check_show(show: str, until: str) -> None:
-    from vijax.planes.outputs import OUTPUTS
+def _check_show(show: str, until: str, starts: int) -> None:
+    from vijax.planes.outputs import table
 
-    if show != "label" and show not in OUTPUTS:
-        raise ValueError(f"show must be label, or among {', '.join(OUTPUTS)}; got {show!r}")
+    if starts > 1 and show not in table(starts):
+        raise ValueError(f"show must be among {', '.join(table(starts))} with several starts; got {show!r}")
+    if show != "label" and show not in table(starts):
+        raise ValueError(f"show must be label, or among {', '.join(table(starts))}; got {show!r}")
     if show == "label" and until != "attractor":
         raise ValueError(f"show must not be label unless cells are run until their attractor; got until {until}")
 
 
-def _wanted(outputs: str | None, show: str) -> list[str] | None:
+def _wanted(outputs: str | None, show: str, starts: int) -> list[str] | None:
     if outputs is not None:
         return [name.strip() for name in outputs.split(",")]
-    from vijax.planes.outputs import ON_REQUEST, OUTPUTS
+    from vijax.planes.outputs import ON_REQUEST, table
 
     shown = "lyapunov" if show == "label" else show
-    return [name for name in OUTPUTS if name not in ON_REQUEST or name == shown]
+    return [name for name in table(starts) if name not in ON_REQUEST or name == shown]
 
 
 def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: dict[str, Any]) -> "SweepPlan":
@@ -141,8 +143,8 @@ def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: d
     from vijax.planes.sweep_settings import SweepSettings
 
     membrane = _membrane(*(given.pop(name) for name in ("membrane", "chi", "exponent")))
-    refine = given.pop("refine")
-    return plan(axes, outputs, device, SweepSettings(**given, membrane=membrane), refine)
+    refine, starts = given.pop("refine"), given.pop("starts")
+    return plan(axes, outputs, device, SweepSettings(**given, membrane=membrane), refine, starts)
 
 
 def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
@@ -165,7 +167,8 @@ def _check_picture(path: Path, planned: "SweepPlan", show: str) -> None:
     from vijax.plots import style
 
     style.check_format(path)
-    needs = {"label": style.LABEL_NEEDS, "P": style.NEEDS}.get(show, (show,))
+    power = style.NEEDS if planned.starts == 1 else style.EXPECTED_NEEDS
+    needs = {"label": style.LABEL_NEEDS, "P": power}.get(show, (show,))
     missing = [name for name in needs if name not in planned.outputs]
     if missing:
         raise ValueError(f"outputs must hold {', '.join(missing)} for a picture; add them, or give --out alone")
@@ -207,6 +210,9 @@ def _summary(dataset: "xr.Dataset") -> str:
             order=lambda period: period if period > 0 else math.inf,
         )
         lines.append(f"cells by period: {periods}")
+    if "attractors" in dataset:
+        number = tally(dataset["attractors"].values, lambda found: str(found), order=lambda found: found)
+        lines.append(f"cells by attractors found: {number}")
     if "P" in dataset and dataset["P"].size == 1:
         lines.append(f"P: {_only(dataset)}")
     elif {"P", "admissible"} <= set(dataset):
@@ -244,6 +250,11 @@ def run_options() -> list[click.Parameter]:
         options.setting("until", "what cells are run to"),
         options.setting("transient", "periods to drop before a window", Whole(0)),
     ]
+
+
+def _starts_option() -> click.Parameter:
+    many = "starts in every cell; with several P is their mean, and the attractors that share them are told"
+    return click.Option(["--starts"], type=Whole(1), default=1, show_default=True, help=many)
 
 
 class _Membrane(Choice):
@@ -298,10 +309,11 @@ def _output_options() -> list[click.Parameter]:
 
 def complete_outputs(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     """Complete a name of variables, or the last of several. The rooms that know them take a moment to load."""
-    from vijax.planes.outputs import OUTPUTS
+    from vijax.planes.outputs import EXPECTED, OUTPUTS
 
     before, comma, begun = incomplete.rpartition(",")
-    names = OUTPUTS if param.name == "outputs" else [*OUTPUTS, "label"]
+    known = dict.fromkeys([*OUTPUTS, *EXPECTED])
+    names = known if param.name == "outputs" else [*known, "label"]
     return [f"{before}{comma}{name}" for name in names if name.startswith(begun)]
 
 
@@ -309,7 +321,7 @@ def sections() -> Sections:
     """Make the options of the page."""
     return {
         "Plane": plane_options(),
-        "Run": [*run_options(), options.wall_option()],
+        "Run": [*run_options(), _starts_option(), options.wall_option()],
         "Method": [*_method_options(), options.dtype_option()],
         "Variables": _output_options(),
         "Files": options.file_options(),
@@ -332,6 +344,7 @@ EXAMPLES = (
     "--show label --plot labels.png",
     "--show max_penetration --plot depth.png",
     "--show label --curves --plot curves.png",
+    "--starts 64 --plot expected.png",
     "--d 0.05:0.3:1024 --kappa 3:400:1024:log --refine 3 --out fine.zarr --plot fine.png",
     "--d 0.2,0.3 --kappa 40:400:8:log --method ode --membrane hunt-crossley --chi 0.8 --out hertz.zarr",
 )

@@ -17,7 +17,8 @@ from vijax.orbits import continuation, orbit_properties, periodic
 from vijax.orbits.continuation import Direction
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.periodic import Orbit
-from vijax.planes.basins import MOST_STARTS, basin_fractions
+from vijax.planes.basins import basin_fractions
+from vijax.planes.sweep_settings import MOST_STARTS
 from vijax.runtime import checks
 from vijax.runtime.context import door
 

@@ -142,6 +142,10 @@ def explored(dataset: "xr.Dataset") -> ExploredPlane:
             raise ValueError(
                 f"dataset must be made with {name}={needed!r}, as the page runs its cells; got {got!r}; make it anew"
             )
+    if (starts := int(dataset.attrs.get("starts", 1))) != 1:
+        raise ValueError(
+            f"dataset must have one start in every cell, from which the page runs it; got {starts}; make it with one"
+        )
     periods = int(dataset.attrs.get("periods", SweepSettings.periods))
     if not 1 <= periods <= MOST_PERIODS:
         raise ValueError(

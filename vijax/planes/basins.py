@@ -13,13 +13,13 @@ import numpy as np
 
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, one_device
-from vijax.model.label import FAILED, label, ordered
-from vijax.model.records import Status
+from vijax.model.label import label, ordered
 from vijax.model.units import Given
 from vijax.planes import sweep
+from vijax.planes.attractor_marks import ENDED, INVARIANTS, SAME, invariants, kinds
 from vijax.planes.axes import Parameters, cells, check_axis
 from vijax.planes.dataset import DEFAULT, SweepPlan
-from vijax.planes.sweep_settings import SPEED, START_POINTS, STARTS, SweepSettings
+from vijax.planes.sweep_settings import MOST_STARTS, SPEED, START_POINTS, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.lattice import lattice
@@ -29,17 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["basin_fractions", "basins", "label"]
 
-# The most starts of a cell: more are taken for a slip of the finger.
-MOST_STARTS = 10**7
-# Invariants that differ by more are of two attractors. Those of polished orbits agree to 3e-11 from start to start on a
-# dozen planes of 4096 starts, and differ between attractors by 2e-2 and more. In single precision an orbit passes for
-# one of twice its period, and so there is no `dtype`.
-_SAME = 1e-6
-_COUNTS = ("impacts_left", "impacts_right")
-_ENDED = ("period", *_COUNTS, "status")
-_INVARIANTS = ("max_impact_speed", "asymmetry", "contact_fraction", "restitution_left", "restitution_right")
 _MEASURES = ("P", "max_impact_speed", "impacts_per_period", "contact_fraction", "lyapunov")
-_OUTPUTS = tuple(dict.fromkeys((*_ENDED, *_INVARIANTS, *_MEASURES, "admissible", "periods_run")))
+_OUTPUTS = tuple(dict.fromkeys((*ENDED, *INVARIANTS, *_MEASURES, "admissible", "periods_run")))
 _TEXTS = {
     "label": "impacts left:right/forcing periods",
     "periodic": "whether a period was found",
@@ -271,26 +262,14 @@ def _groups(cell: np.ndarray, group: np.ndarray) -> _Groups:
 
 def _group(cell: np.ndarray, measured: dict[str, np.ndarray], merge_mirrors: bool, apart: float) -> np.ndarray:
     """Give every start a number, alike where it is the same attractor of the same cell; in the order of the cells."""
-    period = np.where(np.isin(measured["status"], FAILED), -2, measured["period"]).astype(np.int64)
-    left, right = ordered(measured["impacts_left"], measured["impacts_right"], merge_mirrors)
-    resting = measured["status"] == Status.PERMANENT_CONTACT
-    kind = ((period << 20 | left + 1) << 20 | right + 1) << 1 | resting
-    group = _parted(cell, kind, 0)
-    for values in _invariants(measured, merge_mirrors):
-        # Averages over chaos differ from start to start and tell nothing apart.
-        group = _parted(group, np.where(period > 0, values, 0.0), apart)
-    return group
-
-
-def _invariants(measured: dict[str, np.ndarray], merge_mirrors: bool) -> list[np.ndarray]:
-    """Find what is the same for all starts of a periodic attractor and, to merge mirror images, for both of them."""
-    speed, asymmetry, contact, *restitution = (np.nan_to_num(measured[name], nan=-1.0) for name in _INVARIANTS)
+    speed = measured["max_impact_speed"]
     while speed.ndim > 1:  # the unit of speed may vary where the motion does not
         speed = speed[0]
-    speed = np.log(np.maximum(speed, np.finfo(speed.dtype).tiny))
-    if merge_mirrors:
-        asymmetry, restitution = abs(asymmetry), [np.minimum(*restitution), np.maximum(*restitution)]
-    return [speed, asymmetry, contact, *restitution]
+    kind, period = kinds(measured, merge_mirrors)
+    group = _parted(cell, kind, 0)
+    for values in invariants(measured | {"max_impact_speed": speed}, period, merge_mirrors):
+        group = _parted(group, values, apart)
+    return group
 
 
 def _parted(group: np.ndarray, values: np.ndarray, apart: float) -> np.ndarray:
@@ -320,7 +299,7 @@ def matched(found: "xr.Dataset", merge_mirrors: bool = False) -> "xr.Dataset":
     starts = math.prod(found.sizes[dim] for dim in over)
     measured = {name: _flat(found[name].variable, dims, over) for name in _OUTPUTS}
     cell = np.repeat(np.arange(math.prod(shape)), starts)
-    group = _group(cell, measured, merge_mirrors, _SAME)
+    group = _group(cell, measured, merge_mirrors, SAME)
     groups = _groups(cell, group)
     basin = groups.rank[group].reshape(*shape, *(found.sizes[dim] for dim in over)).astype(np.int32)
     variables = {"basin": xr.Variable((*dims, *over), basin, described("place of the start's attractor in the table"))}
@@ -347,7 +326,7 @@ def _entries(
     measured: dict[str, np.ndarray], groups: _Groups, merge_mirrors: bool, starts: int
 ) -> dict[str, np.ndarray]:
     """Compute the table's columns, each [..., group]."""
-    first = {name: measured[name][..., groups.order[groups.first]] for name in (*_ENDED, "admissible")}
+    first = {name: measured[name][..., groups.order[groups.first]] for name in (*ENDED, "admissible")}
     share = groups.counts / starts
     left, right = ordered(first["impacts_left"], first["impacts_right"], merge_mirrors)
     means = {

@@ -10,8 +10,8 @@ from vijax.model.choices import Walls
 from vijax.model.device import Harvester
 from vijax.planes import sweep
 from vijax.planes.axes import Axes, Parameters
-from vijax.planes.basins import MOST_STARTS, check_starts, described, plan_fractions, spread, started
-from vijax.planes.sweep_settings import SPEED, STARTS, SweepSettings
+from vijax.planes.basins import check_starts, described, plan_fractions, spread, started
+from vijax.planes.sweep_settings import MOST_STARTS, SPEED, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
 

@@ -21,7 +21,8 @@ from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.quantities import AXES
 from vijax.model.records import Status
 from vijax.planes.axes import Cells
-from vijax.planes.outputs import OUTPUTS, VARIED, Found
+from vijax.planes.expected import NEEDS, ManyStarts
+from vijax.planes.outputs import VARIED, Found, Output, table
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import tiles
 from vijax.runtime.pages import see
@@ -44,6 +45,7 @@ class SweepPlan:
         outputs: Variables of the map.
         device: Constants that no axis gives.
         refine: Levels of refinement, 0 where every cell is computed.
+        starts: How many starts every cell has, spread as those of `basin_fractions`; 1 is that of its axes u0 and v0.
     """
 
     cells: Cells
@@ -52,24 +54,30 @@ class SweepPlan:
     outputs: tuple[str, ...]
     device: Harvester
     refine: int = 0
+    starts: int = 1
 
     @property
     def count(self) -> int:
-        """Count the simulations."""
+        """Count the cells that are simulated, from one start or from many."""
         return self.cells.count
+
+    @property
+    def table(self) -> dict[str, Output]:
+        """Give the outputs among which those of the map are."""
+        return table(self.starts)
 
     @property
     def size(self) -> int:
         """Count the bytes of the variables wanted, at eight a number; a store compresses them."""
         of = self.cells
         variants = math.prod(of.sizes[dim] for dim in of.variant)
-        varied = sum(bool(VARIED & set(OUTPUTS[name].needs)) for name in self.outputs)
+        varied = sum(bool(VARIED & set(self.table[name].needs)) for name in self.outputs)
         return 8 * self.count * (varied * variants + len(self.outputs) - varied)
 
     @property
     def needs(self) -> frozenset[str]:
-        """Name the fields of `Summary` that the outputs are made of."""
-        return frozenset(need for name in self.outputs for need in OUTPUTS[name].needs)
+        """Name the fields that the outputs are made of: of `Summary`, or of `expected.ManyStarts`."""
+        return frozenset(need for name in self.outputs for need in self.table[name].needs)
 
     def cut(self, block: Mapping[str, slice]) -> "SweepPlan":
         """Plan a block of the cells alone."""
@@ -101,7 +109,11 @@ def specimen(planned: SweepPlan) -> "xr.Dataset":
     first = planned.cut({dim: slice(1) for dim in planned.cells.dynamic})
     variants = math.prod(planned.cells.sizes[dim] for dim in planned.cells.variant)
     blank = simulate.blank(1, variants, planned.settings.dtype)
-    return label(first, {name: np.asarray(getattr(blank, name)) for name in planned.needs})
+    if planned.starts == 1:
+        return label(first, {name: np.asarray(getattr(blank, name)) for name in planned.needs})
+    one = ManyStarts(np.array([True]))
+    one.add({name: np.asarray(getattr(blank, name)) for name in NEEDS})
+    return label(first, one.fields())
 
 
 def flagged(status: "xr.Variable") -> "xr.Variable":
@@ -137,7 +149,7 @@ def warn_if_held(dataset: "xr.Dataset") -> None:
 
 
 def _variable(name: str, found: Found, planned: SweepPlan) -> "xr.Variable":
-    output = OUTPUTS[name]
+    output = planned.table[name]
     values = output.formula(found, planned.cells, planned.device) if output.formula else found[output.needs[0]]
     values = values.transpose(*(dim for dim in planned.cells.sizes if dim in values.dims))
     # Scales are float64 whatever the cells were computed in.
@@ -188,6 +200,7 @@ def asked(planned: SweepPlan) -> dict[str, Any]:
         **planned.settings.told,
         **record(planned.method),
         "outputs": " ".join(planned.outputs),
+        **({} if planned.starts == 1 else {"starts": planned.starts}),
         **{f"harvester_{name}": float(getattr(planned.device, name)) for name in constants},
         "harvester_penetration_limit": float(planned.device.depth_limit),
         **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings.dtype).items()},

@@ -4,9 +4,10 @@ import itertools
 import logging
 import math
 import queue
+import threading
 import time
 from collections.abc import Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -17,7 +18,10 @@ from vijax.batch import simulate
 from vijax.model.pair import ImpactPair
 from vijax.planes import tile_size
 from vijax.planes.dataset import SweepPlan
+from vijax.planes.expected import NEEDS, ManyStarts
+from vijax.planes.sweep_settings import SPEED
 from vijax.runtime import context
+from vijax.runtime.lattice import lattice
 from vijax.runtime.tiles import padded, places
 
 if TYPE_CHECKING:
@@ -28,7 +32,7 @@ _LOG = logging.getLogger(__name__)
 _WAITING = logging.getLogger("vijax.waiting")
 
 Fields = dict[str, np.ndarray]
-"""Fields of `Summary`, by name."""
+"""Fields of `Summary`, or of `expected.ManyStarts`, by name."""
 
 
 class Call(NamedTuple):
@@ -87,10 +91,11 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
     # Nothing runs on the calling thread: a compiled call or a compilation there would keep Ctrl-C waiting.
     pool = context.pool(len(here))
     running: dict[Future[tuple[Fields, float]], Call] = {}
+    stopped = threading.Event()
 
     def fill() -> None:
         for call in itertools.islice(calls, len(here) + 1 - len(running)):  # one waits, so that nobody does
-            running[pool.submit(_where_free, call, free)] = call
+            running[pool.submit(_where_free, call, free, stopped)] = call
 
     try:
         if first := next(calls, None):
@@ -108,26 +113,27 @@ def in_turn(calls: Iterable[Call]) -> Generator[tuple[Call, Fields, float], None
                 fill()
                 yield call, *future.result()
     finally:
-        # After Ctrl-C the waiting calls are dropped, and those that run end by themselves.
+        # After Ctrl-C the waiting calls are dropped, and those that run end by themselves, or between two starts.
+        stopped.set()
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _where_free(call: Call, free: "queue.SimpleQueue[jax.Device]") -> tuple[Fields, float]:
+def _where_free(call: Call, free: "queue.SimpleQueue[jax.Device]", stopped: threading.Event) -> tuple[Fields, float]:
     """Perform a call on a device that is free."""
     place = free.get()
     try:
-        return perform(call, place)
+        return perform(call, place, stopped)
     finally:
         free.put(place)
 
 
-def perform(call: Call, place: jax.Device) -> tuple[Fields, float]:
-    """Compute the fields for the cells of a call; give them and the seconds it took."""
+def perform(call: Call, place: jax.Device, stopped: threading.Event | None = None) -> tuple[Fields, float]:
+    """Compute the fields for the cells of a call, unless stopped before; give them and the seconds it took."""
     began = time.perf_counter()
     _LOG.info("tile %d begins", call.number)
     found: Fields = {}
     for part in _kinds(call):
-        _put(found, call.cells.size, part, _summarise(call, call.cells[part], part.size, place))
+        _put(found, call.cells.size, part, _summarise(call, call.cells[part], part.size, place, stopped))
     return found, time.perf_counter() - began
 
 
@@ -144,12 +150,38 @@ def _kinds(call: Call) -> list[np.ndarray]:
     return [kind for kind in (np.flatnonzero(level), np.flatnonzero(~level)) if kind.size]
 
 
-def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> Fields:
-    """Compute fields for the first `count` of these cells, padded so that one program serves all."""
+def _summarise(
+    call: Call, index: np.ndarray, count: int, place: jax.Device, stopped: threading.Event | None = None
+) -> Fields:
+    """Compute fields for the first `count` of these cells, from the one start of each or from many."""
+    planned = call.planned
+    of, rows = planned.cells, np.resize(index, call.rows)
+    d = of.flat(of.quantities["d"], rows)
+    if planned.starts == 1:
+        u0, v0 = (of.flat(of.quantities[name], rows) for name in ("u0", "v0"))
+        return _run(call, rows, count, place, (u0, v0), planned.needs)
+    folded = ManyStarts(of.flat(of.quantities["gamma"], rows[:count]) == 0)
+    # Where programs are compiled and no cell is run, one start does.
+    for across, speed in lattice(planned.starts if count else 1, 2).T - 0.5:
+        if stopped is not None and stopped.is_set():
+            raise CancelledError
+        start = across * d, np.full(d.shape, 2 * SPEED * speed)
+        folded.add(_run(call, rows, count, place, start, NEEDS))
+    found = folded.fields()
+    return {name: found[name] for name in planned.needs}
+
+
+def _run(
+    call: Call,
+    rows: np.ndarray,
+    count: int,
+    place: jax.Device,
+    start: tuple[np.ndarray, np.ndarray],
+    needs: frozenset[str],
+) -> Fields:
+    """Compute fields of `Summary` from a start of every cell, padded so that one program serves all."""
     planned = call.planned
     of, settings = planned.cells, planned.settings
-    rows = np.resize(index, call.rows)
-    needs = planned.needs
 
     def column(quantity: "xr.Variable") -> jax.Array:
         return jnp.asarray(of.flat(quantity, rows).astype(settings.dtype))
@@ -158,7 +190,8 @@ def _summarise(call: Call, index: np.ndarray, count: int, place: jax.Device) -> 
         own = of.factors(scale).astype(settings.dtype)
         return jnp.asarray(np.resize(own, padded(own.size)))
 
-    d, kappa, r, gamma, u0, v0 = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0"))
+    d, kappa, r, gamma = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma"))
+    u0, v0 = (jnp.asarray(values.astype(settings.dtype)) for values in start)
     summary = simulate.summarise(
         ImpactPair(d=d, kappa=kappa if settings.wall == "soft" else None, r=r, gamma=gamma),
         u0,

@@ -58,9 +58,9 @@ def of(*plans: SweepPlan) -> Estimate:
     """Estimate what runs of such plans take together."""
     kept = _paces()
     return Estimate(
-        sum(plan.count for plan in plans),
+        sum(plan.count * plan.starts for plan in plans),
         sum(plan.size for plan in plans),
-        sum(plan.count * _periods(plan) * kept.get(_kind(plan), _slow(plan)) for plan in plans),
+        sum(plan.count * plan.starts * _periods(plan) * kept.get(_kind(plan), _slow(plan)) for plan in plans),
     )
 
 
@@ -91,7 +91,7 @@ class Watch:
         (first, began), (last, ended) = self._seen[1], self._seen[-1]
         file = _file()
         if file is not None and ended - began >= _LEAST_TIMED:
-            pace = (ended - began) / ((last - first) * _periods(planned))
+            pace = (ended - began) / ((last - first) * planned.starts * _periods(planned))
             with suppress(OSError):  # a folder may be closed or full; what was run is worth more than how fast it ran
                 file.parent.mkdir(parents=True, exist_ok=True)
                 write_json(_paces() | {_kind(planned): pace}, file)

@@ -41,6 +41,10 @@ def _admissible(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
     return (found["energy_ratio"] <= 1) & within
 
 
+def _risk(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
+    return found["P"] / found["P_greatest"]
+
+
 OUTPUTS = {
     "P": Output(MEASURED["P"].units, MEASURED["P"].text, ("P",)),
     "power": Output("W", "harvested power, P omega / pi", ("P",), _power),
@@ -72,7 +76,34 @@ OUTPUTS = {
     "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
     "status": Output("1", "how the cell ended", ("status",)),
 }
-# Fields of `Summary` in units that vary where the motion does not: a column for every variant.
-VARIED = {"P", "P_stderr", "energy_ratio", "deepest", "fastest"}
+EXPECTED = {
+    "P": Output("J", "harvested energy per half period, mean over the starts", ("P",)),
+    "power": Output("W", "harvested power, P omega / pi", ("P",), _power),
+    "P_stderr": Output("J", "standard error of P over the starts, as if they were drawn at random", ("P_stderr",)),
+    "P_least": Output("J", "P of the attractor that harvests least", ("P_least",)),
+    "P_greatest": Output("J", "P of the attractor that harvests most, the best one", ("P_greatest",)),
+    "expected_over_best": Output("1", "P over P_greatest, NaN where nothing is harvested", ("P", "P_greatest"), _risk),
+    "best_share": Output("1", "part of the starts that end on the best attractor", ("best_share",)),
+    "best_share_stderr": Output("1", "standard error of best_share", ("best_share_stderr",)),
+    "attractors": Output(
+        "1",
+        "attractors found; aperiodic motions are one, level mirror images too, undecided starts none",
+        ("attractors",),
+    ),
+    "undecided": Output("1", "part of the starts without a verdict", ("undecided",)),
+    **{name: OUTPUTS[name] for name in ("max_penetration", "admissible", "energy_ratio")},
+    "status": Output("1", "how most starts ended, or that one failed", ("status",)),
+}
+"""The outputs of a map over many starts in every cell, made of the fields of `expected.ManyStarts`."""
+# Fields in units that vary where the motion does not: a column for every variant.
+VARIED = {
+    *("P", "P_stderr", "energy_ratio", "deepest", "fastest"),
+    *("P_least", "P_greatest", "best_share", "best_share_stderr"),
+}
 # Variables that few ask for, and that cost something: a tangent map along the motion, or another sum.
 ON_REQUEST = ("asymmetry", "lyapunov")
+
+
+def table(starts: int) -> dict[str, Output]:
+    """Give the outputs of a map with so many starts in every cell."""
+    return OUTPUTS if starts == 1 else EXPECTED

@@ -19,9 +19,9 @@ from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, Cells, cells
 from vijax.planes.dataset import DEFAULT, SweepPlan, label, warn_if_held
 from vijax.planes.dispatch import Fields
-from vijax.planes.outputs import ON_REQUEST, OUTPUTS
+from vijax.planes.outputs import ON_REQUEST, table
 from vijax.planes.store import check_store, load, save, view
-from vijax.planes.sweep_settings import SweepSettings
+from vijax.planes.sweep_settings import MOST_STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
@@ -51,6 +51,7 @@ def sweep(
     device: Harvester | None = None,
     dtype: Precision = SweepSettings.dtype,
     refine: int | None = None,
+    starts: int = 1,
     progress: Callable[[int, int], None] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -93,6 +94,10 @@ def sweep(
         refine: Levels of refinement: every 2^refine-th cell along each axis is computed, then only those at borders
             between kinds of motion or where P is not interpolated to 1 %, and the others are filled.
             `computed` says which are which.
+        starts: How many starts every cell has, spread over the gap and over velocities between -0.6 and 0.6 as those of
+            `basin_fractions`. With more than one the map does not hang on u0 and v0, which are left out: P is the mean
+            over the starts, and variables of its own, on the page of outputs, tell the attractors that share them. Of
+            the settings it takes periods and wall.
         progress: Called with (cells done, cells in all) from the calling thread, first before anything is run. While a
             plane is refined, all are those known to be needed, and grow.
         out: Zarr store, named `*.zarr`, to write tile by tile, so that memory is set by a tile. It opens at any time,
@@ -138,7 +143,7 @@ def sweep(
         steps=steps,
         dtype=dtype,
     )
-    return run(plan(axes, outputs, device, settings, refine), progress, out, overwrite, workers)
+    return run(plan(axes, outputs, device, settings, refine, starts), progress, out, overwrite, workers)
 
 
 @door
@@ -148,12 +153,13 @@ def plan(
     device: Harvester | None = None,
     settings: SweepSettings = DEFAULT,
     refine: int | None = None,
+    starts: int = 1,
 ) -> SweepPlan:
     """Check what a sweep is asked for and lay out its cells; runs nothing.
 
     Args:
         axes: Value or values of each axis; None counts as not given.
-        outputs, device, refine: As in `sweep`.
+        outputs, device, refine, starts: As in `sweep`.
         settings: How the cells are run.
 
     Raises:
@@ -161,22 +167,41 @@ def plan(
     """
     tile_size.largest()  # what is wrong with the environment is said before anything runs
     method = settings.integrator()
+    starts = checks.whole("starts", starts, 1, MOST_STARTS)
     if outputs is None:
-        outputs = (name for name in OUTPUTS if name not in ON_REQUEST)
-    wanted = checks.words("outputs", outputs, OUTPUTS)
+        outputs = (name for name in table(starts) if name not in ON_REQUEST)
+    wanted = checks.words("outputs", outputs, table(starts))
     device = one_device(device)
     given = {name: values for name, values in axes.items() if values is not None}
+    if starts > 1:
+        _check_spread(given, settings, refine)
     lossy = method is None or not isinstance(method.law, HuntCrossley)
     laid_out = cells(given, device, settings.wall, restitution=lossy)
+    if starts > 1:
+        named = {name: values for name, values in laid_out.quantities.items() if name not in ("u0", "v0")}
+        laid_out = replace(laid_out, quantities=named)
     return SweepPlan(
         cells=laid_out,
         settings=settings,
         method=method,
         # No map can be read without knowing how its cells ended.
-        outputs=tuple(name for name in OUTPUTS if name in wanted or name == "status"),
+        outputs=tuple(name for name in table(starts) if name in wanted or name == "status"),
         device=device,
         refine=0 if refine is None else _levels(refine, laid_out, settings.until),
+        starts=starts,
     )
+
+
+def _check_spread(given: Mapping[str, Any], settings: SweepSettings, refine: int | None) -> None:
+    """Raise unless cells can be run from many starts each."""
+    for name in ("u0", "v0"):
+        if name in given:
+            raise ValueError(
+                f"{name} must be left out where cells have several starts; got {checks.shown(given[name])}"
+            )
+    if refine is not None:
+        raise ValueError(f"refine must be left out where cells have several starts; got {checks.shown(refine)}")
+    settings.only("a map of several starts", "periods", "wall")
 
 
 def _levels(refine: Any, of: Cells, until: str) -> int:

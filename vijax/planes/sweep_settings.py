@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 # Starts in every cell unless told otherwise: shares of random ones have a standard error of 0.0625 at most.
 STARTS = 64
+# The most starts of a cell: more are taken for a slip of the finger.
+MOST_STARTS = 10**7
 # Starts along either side of a plane of them unless told otherwise.
 START_POINTS = 256
 # Speed up to which starts lie unless told otherwise: the one that basins are drawn to in the field.

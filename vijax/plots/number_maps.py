@@ -19,7 +19,7 @@ from vijax.planes.dataset import best
 from vijax.plots.cells import BARE, VEIL, borders, edges, marked_places, panels, runs, veil
 from vijax.plots.figure import label_logs, styled
 from vijax.plots.kind_maps import coded, of_flags
-from vijax.plots.style import NEEDS, QUANTITIES, axis_label, is_kind, layout, title, units
+from vijax.plots.style import EXPECTED_NEEDS, NEEDS, QUANTITIES, axis_label, is_kind, layout, title, units
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -76,6 +76,10 @@ def power_map(dataset: "xr.Dataset") -> Figure:
     and undecided ones crosses, and a star stands on the largest admissible P. The colours span the admissible cells if
     these are a tenth of those shown, and otherwise all.
 
+    Of a map with several starts in every cell it is the P expected of them; a line then goes around cells of more than
+    one attractor, crosses stand where starts were left undecided, and cells are veiled that any start makes
+    inadmissible.
+
     Args:
         dataset: A map with `P`, `period` and `admissible`. Its dimensions are, in order, x, y, columns and rows of
             panels; of one dimension a curve is drawn.
@@ -83,7 +87,7 @@ def power_map(dataset: "xr.Dataset") -> Figure:
     Raises:
         ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
-    return _picture(dataset, POWER)
+    return _picture(dataset, _EXPECTED if "starts" in dataset.attrs else POWER)
 
 
 @styled
@@ -115,7 +119,13 @@ def kind_of(dataset: "xr.Dataset", name: str) -> MapKind:
     variable = dataset[name]
     written = name.replace("_", " ") + (f" [{units(variable)}]" if units(variable) else "")
     return MapKind(
-        name, written, "sweep", (name,), (*NEEDS,), partial(_number_colours, name), partial(_number_marks, name)
+        name,
+        written,
+        "sweep",
+        (name,),
+        (*NEEDS, *EXPECTED_NEEDS),
+        partial(_number_colours, name),
+        partial(_number_marks, name),
     )
 
 
@@ -258,6 +268,10 @@ def _common_marks(dataset: "xr.Dataset") -> list[Mark]:
             Mark(period == 0, "most", _DOT, "aperiodic"),
             Mark(period < 0, "any", _CROSS, "undecided"),
         ]
+    if "attractors" in dataset:
+        marks.append(Mark(dataset["attractors"].values > 1, "border", _LINE, "border of several attractors"))
+    if "undecided" in dataset:
+        marks.append(Mark(dataset["undecided"].values > 0, "any", _CROSS, "starts undecided"))
     return marks
 
 
@@ -274,7 +288,8 @@ def _number_colours(name: str, dataset: "xr.Dataset") -> Normalize:
 
 
 def _number_marks(name: str, dataset: "xr.Dataset") -> list[Mark]:
-    others = dataset.drop_vars(name) if name == "period" else dataset  # its own colours say it
+    own = ("period", "attractors", "undecided")
+    others = dataset.drop_vars(name) if name in own else dataset  # its own colours say it
     none = ~has_colour(dataset[name].values, _number_colours(name, dataset))
     zero = bool((dataset[name].values[none] == 0).any())
     return [*_common_marks(others), Mark(none, "bare", BARE, "zero, or no value" if zero else "no value")]
@@ -300,6 +315,7 @@ def _difference_marks(dataset: "xr.Dataset") -> list[Mark]:
 
 
 POWER = MapKind("P", QUANTITIES["P"], "sweep", NEEDS, (), _power_colours, _power_marks)
+_EXPECTED = POWER._replace(label=f"{QUANTITIES['P']}, mean over starts", needs=EXPECTED_NEEDS)
 _DIFFERENCE = MapKind(
     "relative_difference",
     r"$|P_\mathrm{rigid} - P_\mathrm{soft}| / P_\mathrm{soft}$",

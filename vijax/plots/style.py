@@ -83,6 +83,7 @@ def units(coordinate: "xr.DataArray") -> str:
 
 
 NEEDS = ("P", "period", "admissible")
+EXPECTED_NEEDS = ("P", "attractors", "undecided", "admissible")
 LABEL_NEEDS = ("period", "impacts_left", "impacts_right", "status")
 MOST_PANELS = 36  # A map has so many at most: more are too small to read.
 
