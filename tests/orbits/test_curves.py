@@ -142,10 +142,19 @@ def test_a_touch_is_proven_whether_the_ball_meets_the_wall_or_flies_by(found):
     assert depth.max() < 1e-6
 
 
+@pytest.mark.parametrize("r", [(0.5, 0.9), (0.2, 0.5)])
+def test_a_curve_begins_at_a_bound_of_its_plane(met, r):
+    """Rounding had the start beyond one of these bounds, and no ball seemed to fly the orbits around."""
+    broken = [point for point in met if point.kind == "pitchfork"]
+    (curve,) = curves.follow_curves(broken, "d", {"d": (0.02, 0.4), "r": r})
+    assert curve.ends == ("r high", "r low")
+    assert len(np.unique(curve.values[:, 1])) == len(curve.values)
+
+
 def test_branches_lead_on_from_where_their_orbits_graze(found):
     """Rounding decides on which side of its graze such an orbit is. One way ends there, the other leads on."""
     graze = found["grazing"].orbit
-    touching = graze[np.flatnonzero(np.asarray(graze.status) == Status.OK)][1:-1]
+    touching = graze[np.flatnonzero(np.asarray(graze.status) == Status.OK)][1:-1:4]
     for branch, d in zip(
         continuation.follow(touching, "d", PLANE["d"], points=10), np.asarray(touching.pair.d), strict=True
     ):

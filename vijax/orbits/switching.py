@@ -9,7 +9,7 @@ from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
 from vijax.orbits import orbit_properties, shooting, symmetry
 from vijax.orbits.arclength_step import BranchPlace
-from vijax.orbits.branch_path import Tests, heading
+from vijax.orbits.branch_path import Tests, heading, upwards
 from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, set_out
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
@@ -17,7 +17,7 @@ from vijax.orbits.parameter import check_bounds, tilts
 from vijax.orbits.periodic import Orbit, begin_proofs
 from vijax.runtime import checks
 from vijax.runtime.context import door
-from vijax.runtime.programs import jitted
+from vijax.runtime.programs import begin, jitted
 
 MOST_SWITCHES = 64  # So many switches in a row at most: each may find several branches from every one before.
 
@@ -111,10 +111,10 @@ def family(
     # What follow and switch are told alike.
     told: Any = {"device": device, "points": points, "settings": settings}
     grown: list[Branch] = []
-    for index in range(len(orbit)):
-        one = orbit[index : index + 1]
-        closed = not tilts(along) and bool(symmetry.symmetric(one)[0])
-        one = symmetry.halved(one) if closed else one
+    starts = [_halved(orbit[index : index + 1], along) for index in range(len(orbit))]
+    for one in starts[1:]:
+        begin(upwards, *set_out(one, along, within, device, settings))
+    for one in starts:
         grown += _new(follow(one, along, within, **told), grown, settings)
     youngest = grown
     for _ in range(max_switches):
@@ -128,6 +128,11 @@ def family(
             youngest += _new([one for one in begun if len(one.values) > 1], grown + youngest, settings)
         grown = grown + youngest
     return grown
+
+
+def _halved(orbit: Orbit, along: str) -> Orbit:
+    """Close an orbit half way where it is symmetric, and stays so along the branch."""
+    return symmetry.halved(orbit) if not tilts(along) and bool(symmetry.symmetric(orbit)[0]) else orbit
 
 
 def _new(found: list[Branch], known: list[Branch], settings: ContinuationSettings) -> list[Branch]:
