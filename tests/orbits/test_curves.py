@@ -144,7 +144,7 @@ def test_a_touch_is_proven_whether_the_ball_meets_the_wall_or_flies_by(found):
 
 @pytest.mark.parametrize("r", [(0.5, 0.9), (0.2, 0.5)])
 def test_a_curve_begins_at_a_bound_of_its_plane(met, r):
-    """Rounding had the start beyond one of these bounds, and no ball seemed to fly the orbits around."""
+    """At whichever it is, it ends there one way and leads on the other."""
     broken = [point for point in met if point.kind == "pitchfork"]
     (curve,) = curves.follow_curves(broken, "d", {"d": (0.02, 0.4), "r": r})
     assert curve.ends == ("r high", "r low")
