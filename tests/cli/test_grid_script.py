@@ -51,7 +51,7 @@ BAD = [
     (["--workers", "2", "--scheduler", "10.0.0.1:8786"], "workers must be left out with scheduler"),
     (["--workers", "2", "--compare", "rigid"], "workers must be left out with compare"),
     (["--workers", "2", "--out", "map.zarr", "--refine", "2"], "workers must be left out with refine"),
-    (["--starts", "3", "--show", "label"], "show must be among P, power"),
+    (["--starts", "3", "--show", "label"], "show must be among P, power.*with several starts"),
     (["--starts", "3", "--refine", "2"], "refine must be left out where cells have several starts"),
     (["--starts", "3", "--outputs", "P", "--plot", "map.png"], "outputs must hold attractors, undecided, admissible"),
     (["--starts", "3", "--compare", "rigid"], "starts must not be chosen with compare"),

@@ -23,7 +23,7 @@ def level():
     return vijax.sweep(**PLANE, starts=24)
 
 
-def agree(expected, table):
+def assert_agrees(expected, table):
     """Compare a map with the table of the same starts, whose undecided and failed ones are no attractors."""
     share = table.fraction.isel(attractor=table.P.fillna(-1.0).argmax("attractor"))
     asked = {
@@ -40,7 +40,7 @@ def agree(expected, table):
 
 def test_level_cells_are_those_of_the_table_with_mirror_images_merged(level):
     table = vijax.basin_fractions(**PLANE, starts=24, merge_mirrors=True)
-    agree(level, table)
+    assert_agrees(level, table)
     assert int(level.attractors.max()) > 1
     assert level.P.attrs["units"] == "J"
     assert "u0" not in level.coords
@@ -49,7 +49,7 @@ def test_level_cells_are_those_of_the_table_with_mirror_images_merged(level):
 
 def test_inclined_cells_and_variants_are_those_of_the_table():
     axes = {**PLANE, "gamma": 0.05, "A": [1.0, 2.0]}
-    agree(vijax.sweep(**axes, starts=12), vijax.basin_fractions(**axes, starts=12))
+    assert_agrees(vijax.sweep(**axes, starts=12), vijax.basin_fractions(**axes, starts=12))
 
 
 def test_where_all_starts_harvest_alike_there_is_no_error(level):

@@ -121,10 +121,11 @@ def _agree(planned: "SweepPlan", yes: bool) -> None:
 def _check_show(show: str, until: str, starts: int) -> None:
     from vijax.planes.outputs import table
 
-    if starts > 1 and show not in table(starts):
-        raise ValueError(f"show must be among {', '.join(table(starts))} with several starts; got {show!r}")
-    if show != "label" and show not in table(starts):
-        raise ValueError(f"show must be label, or among {', '.join(table(starts))}; got {show!r}")
+    known = table(starts)
+    if show not in known and (show != "label" or starts > 1):
+        listed = ", ".join(known)
+        must = f"label, or among {listed}" if starts == 1 else f"among {listed} with several starts"
+        raise ValueError(f"show must be {must}; got {show!r}")
     if show == "label" and until != "attractor":
         raise ValueError(f"show must not be label unless cells are run until their attractor; got until {until}")
 

@@ -145,14 +145,14 @@ def locate(
 
 def kind_of(arc: Arc, event: BranchEvent, neighbours: np.ndarray, settings: ContinuationSettings) -> str:
     """Say what a sign change means for this orbit."""
-    test = event.test
+    test, half = event.test, bool(arc.sequence.mirrored)
     if test in _GRAZING:
         return f"grazing {_GRAZING[test]}"
-    if test == "minus":
-        return "pitchfork" if bool(arc.sequence.mirrored) else "flip"
     if test in ("low", "high"):
         return test
-    if bool(arc.sequence.mirrored):
+    if test == "minus":
+        return "pitchfork" if half else "flip"
+    if half:
         return "fold"
     # A branch of mirror pairs turns where the two of a pair meet; a symmetric one passes +1 there without turning.
     around = orbits_at(arc, np.concatenate([event.y[None], neighbours]))

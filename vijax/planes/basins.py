@@ -19,10 +19,10 @@ from vijax.planes import sweep
 from vijax.planes.attractor_marks import ENDED, INVARIANTS, SAME, invariants, kinds
 from vijax.planes.axes import Parameters, cells, check_axis
 from vijax.planes.dataset import DEFAULT, SweepPlan
+from vijax.planes.start_places import start_places
 from vijax.planes.sweep_settings import MOST_STARTS, SPEED, START_POINTS, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
-from vijax.runtime.lattice import lattice
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -202,11 +202,10 @@ def _middles(count: int) -> np.ndarray:
 
 
 def spread(count: int, seed: int | None) -> "tuple[xr.Variable, xr.Variable]":
-    """Spread points evenly over the unit square around 0, along the dimension `start`; a seed draws them at random."""
+    """Give `start_places` along the dimension `start`."""
     import xarray as xr  # here, as importing vijax must not load it
 
-    points = lattice(count, 2) if seed is None else np.random.default_rng(seed).random((2, count))
-    first, second = points - 0.5
+    first, second = start_places(count, seed)
     return xr.Variable("start", first), xr.Variable("start", second)
 
 

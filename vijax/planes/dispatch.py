@@ -19,9 +19,9 @@ from vijax.model.pair import ImpactPair
 from vijax.planes import tile_size
 from vijax.planes.dataset import SweepPlan
 from vijax.planes.expected import NEEDS, ManyStarts
+from vijax.planes.start_places import start_places
 from vijax.planes.sweep_settings import SPEED
 from vijax.runtime import context
-from vijax.runtime.lattice import lattice
 from vijax.runtime.tiles import padded, places
 
 if TYPE_CHECKING:
@@ -156,13 +156,13 @@ def _summarise(
     """Compute fields for the first `count` of these cells, from the one start of each or from many."""
     planned = call.planned
     of, rows = planned.cells, np.resize(index, call.rows)
-    d = of.flat(of.quantities["d"], rows)
     if planned.starts == 1:
         u0, v0 = (of.flat(of.quantities[name], rows) for name in ("u0", "v0"))
         return _run(call, rows, count, place, (u0, v0), planned.needs)
+    d = of.flat(of.quantities["d"], rows)
     folded = ManyStarts(of.flat(of.quantities["gamma"], rows[:count]) == 0)
     # Where programs are compiled and no cell is run, one start does.
-    for across, speed in lattice(planned.starts if count else 1, 2).T - 0.5:
+    for across, speed in start_places(planned.starts if count else 1).T:
         if stopped is not None and stopped.is_set():
             raise CancelledError
         start = across * d, np.full(d.shape, 2 * SPEED * speed)

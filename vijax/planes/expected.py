@@ -31,8 +31,10 @@ class _Attractor:
         """Say in which cells a start with these marks ended there."""
         return (self.count > 0) & (self.kind == kind) & (np.abs(self.marks - marks) <= SAME).all(axis=0)
 
-    def found(self, where: np.ndarray, kind: np.ndarray, marks: np.ndarray, period: np.ndarray, status: np.ndarray):
-        """Begin with the marks of a start, in some cells."""
+    def begin(
+        self, where: np.ndarray, kind: np.ndarray, marks: np.ndarray, period: np.ndarray, status: np.ndarray
+    ) -> None:
+        """Take over what marks a start, in some cells."""
         self.kind[where], self.period[where], self.status[where] = kind[where], period[where], status[where]
         self.marks[:, where] = marks[:, where]
 
@@ -80,16 +82,14 @@ class ManyStarts:
             one.take(here, found["P"])
             left &= ~here
         # What is left ended on an attractor that is new to its cell.
-        for one in self._attractors:
+        blank = _Attractor(*found["P"].shape)
+        for one in (*self._attractors, blank):
             here = left & (one.count == 0)
-            one.found(here, kind, marks, period, found["status"])
+            one.begin(here, kind, marks, period, found["status"])
             one.take(here, found["P"])
             left &= ~here
-        if left.any():
-            new = _Attractor(*found["P"].shape)
-            new.found(left, kind, marks, period, found["status"])
-            new.take(left, found["P"])
-            self._attractors.append(new)
+        if blank.count.any():
+            self._attractors.append(blank)
 
     def fields(self) -> dict[str, np.ndarray]:
         """Give the fields of a map of expected power, [cell] or [cell, variant]; see `outputs.EXPECTED`."""
