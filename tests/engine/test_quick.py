@@ -97,6 +97,28 @@ def test_no_crossing_is_missed_beside_a_graze():
     np.testing.assert_allclose(hit.flight[told], out.flight[told], rtol=1e-6, atol=1e-6)
 
 
+def test_a_ball_at_rest_is_flown_where_the_forcing_pulls_it_up():
+    """The start of every cell of a plane, at rest at phase 0, is one; the other half is left to the careful step."""
+    rng = np.random.default_rng(4)
+    d, t = 10.0 ** rng.uniform(-2, 0.3, 4096), rng.uniform(0, 2, 4096)
+    u = rng.uniform(-0.5, 0.5, 4096) * d
+    t[:512], t[512:1024], u[:2048] = 0.0, rng.choice([0.5, 1.5], 512), 0.0
+    pair, rest = jax.tree.map(jnp.asarray, pairs(d, None, 0.5, 0.0)), np.zeros_like(t)
+    lane = Ball(*map(jnp.asarray, (u, rest, t, rest)))
+    step = jax.jit(lambda pair, lane: quick.quick_step(quick_wall.prepare(pair), jnp.zeros_like(lane.u), lane))
+    careful = jax.jit(jax.vmap(exact.step, in_axes=(0, 0, None)))
+    hit, _, sure, never = jax.tree.map(np.asarray, step(pair, lane))
+    out = careful(pair, jax.tree.map(jnp.asarray, start(u, rest, t)), HORIZON)
+    assert not never.any()
+    assert not sure[np.cos(np.pi * t) < -EPS].any()
+    small = d < 1 / np.pi**2  # the swing is twice that
+    assert sure[:512][small[:512]].mean() > 0.95
+    told = sure & (hit.flight < HORIZON)
+    assert told.mean() > 0.3
+    np.testing.assert_array_equal(hit.side[told], out.impact.side[told])
+    np.testing.assert_allclose(hit.flight[told], out.flight[told], rtol=1e-12)
+
+
 def test_patience_decides_or_says_that_it_did_not():
     """A limited patience gives the unlimited answer or NaN (it once gave the depth found so far)."""
     rng = np.random.default_rng(5)

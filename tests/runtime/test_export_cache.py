@@ -102,6 +102,14 @@ def test_a_program_without_kernels_is_another_one(folder, monkeypatch):
     assert len(list(folder.iterdir())) == 2
 
 
+def test_a_program_for_a_gpu_is_kept_by_the_name_of_its_platform(monkeypatch):
+    """JAX calls the device of an array a GPU, and exports for CUDA."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(export_cache.export, "default_export_platform", lambda: "cuda")
+    assert export_cache._platform([np.zeros(3)]) == "cuda"
+    assert export_cache._platform([X]) == "cpu"
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
     monkeypatch.setattr(cache_folder, "kept", lambda: tmp_path if kept else None)

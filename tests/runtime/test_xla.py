@@ -12,7 +12,7 @@ from jax import export, lax
 
 import vijax
 from vijax.runtime import xla
-from vijax.runtime.xla import in_blocks, kernel, put, share, whole_blocks
+from vijax.runtime.xla import first, in_blocks, kernel, put, repeat, search, share, whole_blocks
 
 X = jnp.linspace(0.1, 2.0, 192)
 MARK = "xla_cpu_small_call"
@@ -95,8 +95,15 @@ def test_lanes_come_in_whole_blocks(lanes, whole):
     assert whole_blocks(lanes) == whole
 
 
+@pytest.fixture(params=["cpu", "gpu"])
+def either(request, monkeypatch):
+    """What is traced for a CPU and what for an accelerator: both run here."""
+    monkeypatch.setattr(jax, "default_backend", lambda: request.param)
+    return request.param
+
+
 @pytest.mark.parametrize("count", [0, 2, 3])
-def test_rows_are_replaced_and_no_other(count):
+def test_rows_are_replaced_and_no_other(either, count):
     lanes = {"x": jnp.arange(5.0), "yes": jnp.zeros((5, 2), bool)}
     part = {"x": jnp.asarray([10.0, 20.0, 30.0]), "yes": jnp.ones((3, 2), bool)}
     rows = np.asarray([4, 0, 2])
@@ -105,6 +112,31 @@ def test_rows_are_replaced_and_no_other(count):
     for i, row in enumerate(rows[:count]):
         expected["x"][row], expected["yes"][row] = part["x"][i], True
     jax.tree.map(np.testing.assert_array_equal, after, expected)
+
+
+@pytest.mark.parametrize("width", [1, 4, 40])
+def test_the_first_lanes_of_a_mask_are_found_in_order(either, width):
+    mask = np.random.default_rng(3).random(40) < 0.3
+    members, chosen = first(jnp.asarray(mask), width)
+    there = np.flatnonzero(mask)[:width]
+    np.testing.assert_array_equal(members[: there.size], there)
+    np.testing.assert_array_equal(np.flatnonzero(chosen), there)
+    assert members.shape == (width,)
+    assert ((np.asarray(members) >= 0) & (np.asarray(members) < 40)).all()
+
+
+def test_a_search_ends_where_its_loop_does(either):
+    """Each of several searches by itself, also where they are of different lengths."""
+    ends = jnp.asarray([0, 1, 4, 5, 11])
+    halved = jax.vmap(lambda end: search(lambda s: s[0] < end, lambda s: (s[0] + 1, s[1] / 2), (0 * end, 1.0)))(ends)
+    np.testing.assert_array_equal(halved[0], ends)
+    np.testing.assert_array_equal(halved[1], 0.5 ** np.asarray(ends))
+
+
+def test_work_is_repeated_while_it_moves_anything(either):
+    """On an accelerator as often as it is asked for: what is done then must leave alone what has ended."""
+    trips = repeat(lambda n: n + 1, 8, lambda n: n < 3, jnp.asarray(0))
+    assert trips == (3 if either == "cpu" else 8)
 
 
 @ON_CPU

@@ -15,7 +15,7 @@ from vijax.engine.roots import bracketed_root
 from vijax.model import flow
 from vijax.model.flow import PI, Force, Membrane
 from vijax.runtime.arrays import Flag, Scalar
-from vijax.runtime.xla import once, share
+from vijax.runtime.xla import once, search, share
 
 _ARRIVED = 2.0**-30  # relative step of the approach after which Newton's last one is exact
 PATIENCE = 20_000  # stages (about free half cycles) of one contact; only r = 1 comes near
@@ -127,7 +127,7 @@ def first_return(
     zero, no = jnp.zeros_like(w0), jnp.zeros_like(wanted)
     start = _Search(zero, w0, z0, zero, spell_after(force, zero), wanted, no, jnp.int32(0))
     goes_on = lambda search: search.running & (search.stage < patience)  # noqa: E731
-    found = lax.while_loop(goes_on, partial(_advance, oscillator, limit), start)
+    found = search(goes_on, partial(_advance, oscillator, limit), start)
     # From rest on the wall against a negative push the contact is a parabola of length 2 z0/|push|.
     push = jnp.minimum(force.at(zero) - m.mu * z0, -jnp.finfo(w0.dtype).tiny)
     guess = jnp.where(found.s == 0, -2 * z0 / push, zero)

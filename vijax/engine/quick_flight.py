@@ -105,6 +105,8 @@ def fly(half: Lane, lane: Ball) -> Flight:
     u = flip * lane.u
     p = flip * PI * lane.v - sine
     u, t, p, cosine = share((u, t, p, cosine))
+    # A ball at rest begins a stretch, as one that has just turned, if the forcing pulls it downwards in this frame.
+    falls = cosine < 0
     centre = jnp.where(t < 0.5, -0.5, 1.5).astype(t.dtype)
     stretch = _stretch(*single((half, u, p, centre - t, cosine)))
     wall = jnp.where(stretch.up, 1.0, -1.0).astype(half.dtype)
@@ -125,5 +127,8 @@ def fly(half: Lane, lane: Ball) -> Flight:
     # The iteration is of fourth order: what is left after the last step is (stiffness step)^3 step.
     converged = stiffness * jnp.abs(step) < converged_step(eps)
     # A short hop loses its leading digits in the phases.
-    sure = converged & ~doubt & (speed > 0) & (elapsed > 1 / 256) & (lane.v != 0) & (jnp.abs(y) < 3.4)
-    return Flight(elapsed, speed, flip, wall, sine, cosine, sure, never & (lane.v != 0))
+    moves = lane.v != 0
+    # One at rest that meets no wall may stay where it is for ever.
+    known = moves | (falls & ~never)
+    sure = converged & ~doubt & (speed > 0) & (elapsed > 1 / 256) & known & (jnp.abs(y) < 3.4)
+    return Flight(elapsed, speed, flip, wall, sine, cosine, sure, never & moves)

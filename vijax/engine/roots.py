@@ -6,10 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from vijax.runtime.arrays import Flag, Scalar, Values
-from vijax.runtime.xla import share, shared
+from vijax.runtime.xla import search, share, shared
 
 _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
 
@@ -61,7 +60,7 @@ def bracketed_root(function: Callable, low: Scalar, high: Scalar, guess: Scalar,
 
     guess = jnp.where((guess > low) & (guess < high), guess, 0.5 * (low + high))
     start = (jnp.int32(0), low, high, guess, high - low, high - low)
-    return lax.while_loop(unfinished, shrink, start)[3]
+    return search(unfinished, shrink, start)[3]
 
 
 def converged_step(eps: Any) -> float:

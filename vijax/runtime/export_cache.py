@@ -93,9 +93,13 @@ class TracedProgram:
 
 
 def _platform(leaves: list[Any]) -> str:
-    """Say where the arguments of a program are; NumPy's arrays are wherever JAX computes by default."""
+    """Say where the arguments of a program are; NumPy's arrays are wherever JAX computes by default.
+
+    A device calls itself a GPU, where a program that is exported asks for the maker's platform.
+    """
     devices = (device for x in leaves if isinstance(x, jax.Array) for device in x.devices())
-    return next((device.platform for device in devices), jax.default_backend())
+    platform = next((device.platform for device in devices), jax.default_backend())
+    return export.default_export_platform() if platform == jax.default_backend() else platform
 
 
 def _trace(flat: Callable[..., Any], platform: str, leaves: list[Any]) -> _Traced:

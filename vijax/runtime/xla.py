@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
+from vijax.runtime.arrays import choose
 from vijax.runtime.pages import see
 
 P = ParamSpec("P")
@@ -37,11 +38,18 @@ _CPU_OPTIONS = {
     # Tiles already keep every core at work.
     "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
 }
+_GPU_OPTIONS = {
+    # A run is one graph of kernels, its loops in it: else the host is asked before every trip whether it goes on, and
+    # a plane of 1024 x 1024 cells takes two and a half times as long.
+    "xla_gpu_enable_command_buffer": "FUSION,WHILE,CONDITIONAL,CUSTOM_CALL,DYNAMIC_SLICE_FUSION",
+    "xla_gpu_graph_min_graph_size": 1,
+}
 # A program that runs for milliseconds costs what it takes to compile: LLVM leaves it as it is, which takes half the
 # time, and it runs up to five times as long.
 _BRIEF = {"xla_backend_optimization_level": 0}
 _STAYS = {"inlineable": "false"}  # a call that XLA does not see through
 _ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
+_TRIPS = 4  # of a short loop, between two looks whether it goes on, on an accelerator
 _BLOCK = 64  # lanes: what a step stores of them stays in the first cache; with 32 LLVM runs out of registers
 
 once = jax.jit
@@ -65,12 +73,13 @@ def _asked_for() -> bool:
 KERNELS = _asked_for()
 
 
-def _on_cpu() -> bool:
+def on_cpu() -> bool:
+    """Say whether programs are made for a CPU, not for an accelerator."""
     return jax.default_backend() == "cpu"
 
 
 def _in_kernels() -> bool:
-    return KERNELS and _on_cpu()
+    return KERNELS and on_cpu()
 
 
 def compiler_options(*, brief: bool = False) -> dict[str, Any]:
@@ -80,8 +89,12 @@ def compiler_options(*, brief: bool = False) -> dict[str, Any]:
         brief: Whether the program runs so briefly that its compilation is what it costs.
     """
     said = os.environ.get("XLA_FLAGS", "")
-    options = _CPU_OPTIONS | (_BRIEF if brief else {})
-    return {name: value for name, value in options.items() if name not in said} if _on_cpu() else {}
+    options = _options() | (_BRIEF if brief and on_cpu() else {})
+    return {name: value for name, value in options.items() if name not in said}
+
+
+def _options() -> dict[str, Any]:
+    return {"cpu": _CPU_OPTIONS, "gpu": _GPU_OPTIONS}.get(jax.default_backend(), {})
 
 
 @jax.jit
@@ -98,9 +111,12 @@ def share(value: Any) -> Any:
     """Keep a value that several results need: XLA on CPU fuses one result at a time, and would compute it for each.
 
     A call that does nothing and stays a call. (A barrier is taken away before fusion, and no kernel may contain one;
-    without kernels, and on accelerators, it is what JAX offers.)
+    without kernels it is what JAX offers.) An accelerator's fusion has many results and computes each value of a lane
+    once: stored ones would cut a step that is 3 kernels into 81.
     """
-    return _kept(value) if _in_kernels() else lax.optimization_barrier(value)
+    if _in_kernels():
+        return _kept(value)
+    return lax.optimization_barrier(value) if on_cpu() else value
 
 
 def shared(work: Callable[P, T]) -> Callable[P, T]:
@@ -131,6 +147,63 @@ def kernel(work: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
+def repeat(work: Callable[[T], T], most: int, goes_on: Callable[[T], Bool[Array, ""]], state: T) -> T:
+    """Do `work` up to so many times: on the CPU while `goes_on`, elsewhere always.
+
+    An accelerator runs what the host sends: it would stop to be asked after every trip, for longer than one takes.
+    """
+    if not on_cpu():
+        return lax.fori_loop(0, most, lambda _, state: work(state), state)
+
+    def again(carry: tuple[Any, T]) -> tuple[Any, T]:
+        return carry[0] + 1, work(carry[1])
+
+    start = jnp.zeros((), jnp.int32), state
+    return lax.while_loop(lambda carry: (carry[0] < most) & goes_on(carry[1]), again, start)[1]
+
+
+def search(goes_on: Callable[[T], Bool[Array, ""]], work: Callable[[T], T], state: T) -> T:
+    """Do `work` while `goes_on`: `lax.while_loop` for short work on a few numbers.
+
+    To end a trip takes an accelerator longer than such a trip does: it makes four at a time, and leaves alone what
+    ended before.
+    """
+    if on_cpu():
+        return lax.while_loop(goes_on, work, state)
+
+    def some(state: T) -> T:
+        for _ in range(_TRIPS):
+            state = choose(goes_on(state), work(state), state)
+        return state
+
+    return lax.while_loop(goes_on, some, state)
+
+
+def first(mask: Bool[Array, "lane"], width: int) -> tuple[Int[Array, "width"], Bool[Array, "lane"]]:
+    """Find the first `width` lanes of a mask, any others where there are fewer; and for every lane whether it is one.
+
+    By rank. On the CPU that is summed by doubling, ten times faster than XLA's, and looked up by binary search, as no
+    kernel may hold a scatter.
+    """
+    if on_cpu():
+        rank = _summed(mask.astype(jnp.int32))
+        members = jnp.searchsorted(rank, jnp.arange(1, width + 1, dtype=jnp.int32))
+        return jnp.minimum(members, mask.size - 1), mask & (rank <= width)
+    rank = jnp.cumsum(mask, dtype=jnp.int32)
+    chosen = mask & (rank <= width)
+    lane = jnp.arange(mask.size, dtype=jnp.int32)
+    place = jnp.where(chosen, rank - 1, width + lane)
+    return jnp.zeros(width, jnp.int32).at[place].set(lane, mode="drop", unique_indices=True), chosen
+
+
+def _summed(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
+    reach = 1
+    while reach < count.size:
+        count = count + jnp.pad(count[:-reach], (reach, 0))
+        reach *= 2
+    return count
+
+
 def whole_blocks(count: int) -> int:
     """Round lanes up to what `in_blocks` parts evenly."""
     return -(-count // _BLOCK) * _BLOCK if _in_kernels() else count
@@ -149,10 +222,15 @@ def put(lanes: T, part: T, rows: Int[Array, "row"], count: Int[Array, ""]) -> T:
     """Replace the first `count` of these rows of `lanes` by those of `part`.
 
     On the CPU one after another: a scatter cannot be in a kernel, and what is merged otherwise is read in every lane.
+    Elsewhere every lane looks up what replaces it: one scatter for all leaves, the rest of it fuses.
     """
     if not _in_kernels():
-        at = jnp.where(jnp.arange(rows.size, dtype=count.dtype) < count, rows, jax.tree.leaves(lanes)[0].shape[0])
-        return jax.tree.map(lambda leaf, new: leaf.at[at].set(new, mode="drop"), lanes, part)
+        size = jax.tree.leaves(lanes)[0].shape[0]
+        order = jnp.arange(rows.size, dtype=jnp.int32)
+        at = jnp.where(order < count, rows, size + order)
+        source = jnp.full(size, -1, jnp.int32).at[at].set(order, mode="drop", unique_indices=True)
+        new = jax.tree.map(lambda leaf: leaf[jnp.maximum(source, 0)], part)
+        return choose(source >= 0, new, lanes)
 
     def one(i, lanes):
         def replaced(leaf, new):

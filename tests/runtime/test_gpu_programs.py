@@ -1,0 +1,90 @@
+"""Programs for a GPU, without one: all that public functions compile is lowered for CUDA, as an accelerator has it."""
+
+import jax
+import numpy as np
+import pytest
+from jax import export
+
+import vijax
+from tests.helpers import cases
+from tests.runtime.test_programs import CALLS, known  # noqa: F401  a fixture
+from vijax.batch import simulate
+from vijax.runtime import export_cache, xla
+from vijax.runtime.export_cache import TracedProgram
+
+# What compiles no program of ours; what CI lowers, the others taking minutes: a plane, a motion, an orbit, its search.
+WITHOUT = ("impact_pair", "harvested_energy")
+FEW = ("sweep", "trajectory, periods", "steady", "orbit_search.search")
+
+
+@pytest.fixture
+def called(monkeypatch):
+    """The traced programs that are called, with the shapes of their arguments, each once."""
+    found = {}
+    call = TracedProgram.__call__
+
+    def noted(self, *args, **kwargs):
+        shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype), args)
+        found[self._name, str(shapes)] = self, shapes
+        return call(self, *args, **kwargs)
+
+    monkeypatch.setattr(TracedProgram, "__call__", noted)
+    return found
+
+
+@pytest.fixture
+def on_gpu(monkeypatch):
+    """Trace as for a GPU; what was traced for this CPU is forgotten before and after."""
+
+    def begin():
+        jax.clear_caches()
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+
+    yield begin
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize("name", cases(CALLS, long=tuple(set(CALLS) - set(FEW))))
+def test_every_program_is_lowered_for_a_gpu(name, known, called, on_gpu):  # noqa: F811
+    CALLS[name](0, known)
+    on_gpu()
+    assert called or name in WITHOUT
+    for program, shapes in called.values():
+        leaves, tree = jax.tree.flatten(shapes)
+
+        def flat(*leaves, work=program._work, tree=tree):
+            return jax.tree.leaves(work(*jax.tree.unflatten(tree, leaves)))
+
+        made = export.export(jax.jit(flat), platforms=["cuda"])(*leaves)
+        text = made.mlir_module()
+        assert "callback" not in text  # the host is never called
+        assert "lapack" not in text
+        assert "xla_cpu" not in text
+        assert any(value.dtype == np.float64 for value in made.out_avals)
+        assert not any(value.dtype == np.float32 for value in made.out_avals)
+
+
+def test_a_gpu_is_given_what_it_is_asked_for_in_xla_flags(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    name = "xla_gpu_enable_command_buffer"
+    assert "WHILE" in xla.compiler_options()[name]
+    assert xla.compiler_options(brief=True) == xla.compiler_options()
+    monkeypatch.setenv("XLA_FLAGS", f"--{name}=")
+    assert name not in xla.compiler_options()
+
+
+@pytest.mark.parametrize("gamma", [0.0, pytest.param(0.3, marks=pytest.mark.long)], ids=["level", "inclined"])
+def test_a_plane_as_a_gpu_has_it_comes_out_the_same(gamma, on_gpu, monkeypatch):
+    """Run here: other loops, other lookups, other services of what the quick step declines."""
+    asked = {"d": np.linspace(0.12, 0.3, 8), "kappa": np.geomspace(10, 400, 6), "r": 0.5, "gamma": gamma}
+    plain = vijax.sweep(**asked)
+    on_gpu()
+    monkeypatch.setattr(export_cache.export, "default_export_platform", lambda: "cpu")
+    simulate.compiled.cache_clear()
+    found = vijax.sweep(**asked)
+    simulate.compiled.cache_clear()
+    settled = plain.period.values > 0
+    assert settled.mean() > 0.4
+    np.testing.assert_array_equal(found.period.values[settled], plain.period.values[settled])
+    np.testing.assert_allclose(found.P.values[settled], plain.P.values[settled], rtol=1e-9)
