@@ -22,6 +22,7 @@ from vijax.model import energy, restitution
 from vijax.model import pair as pairs
 from vijax.model.pair import membrane_pair
 from vijax.orbits import motion, orbit_properties, orbit_search, parameter, periodic
+from vijax.runtime import context, tiles, xla
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = {
@@ -151,6 +152,18 @@ def test_forked_after_jax_has_started_a_process_says_so_and_before_it_works():
     np.testing.assert_allclose(
         [float(line) for line in done.stdout.split()], [vijax.harvested_energy(device, 1e-3 * i) for i in (1, 2)]
     )
+
+
+def test_a_device_that_is_preferred_decides_what_programs_are_made_for(monkeypatch):
+    """A CPU, on a machine whose GPU would be taken: here, and in the threads that run tiles."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert xla.platform() == "gpu"
+    with jax.default_device(jax.devices()[0]):
+        workers = context.pool(1)
+        assert xla.platform() == workers.submit(xla.platform).result() == "cpu"
+        assert tiles.workers() == os.cpu_count()
+    with jax.default_device("cpu"):
+        assert xla.on_cpu()
 
 
 @pytest.mark.skipif(jax.default_backend() == "gpu", reason="asks for a GPU that is not there")

@@ -56,8 +56,14 @@ def door(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """Make threads that work under these settings: JAX's are those of one thread."""
-    return ThreadPoolExecutor(threads, initializer=lambda: _held().__enter__())
+    """Make threads that work under these settings, and on the device that is preferred here: JAX has both by thread."""
+    device = jax.default_device.value
+
+    def begin() -> None:
+        _held().__enter__()
+        jax.default_device(device).__enter__()
+
+    return ThreadPoolExecutor(threads, initializer=begin)
 
 
 def beside(work: Callable[..., Any], *args: Any, **named: Any) -> None:

@@ -98,7 +98,7 @@ def _platform(leaves: list[Any]) -> str:
     A device calls itself a GPU, where a program that is exported asks for the maker's platform.
     """
     devices = (device for x in leaves if isinstance(x, jax.Array) for device in x.devices())
-    platform = next((device.platform for device in devices), jax.default_backend())
+    platform = next((device.platform for device in devices), xla.platform())
     return export.default_export_platform() if platform == jax.default_backend() else platform
 
 

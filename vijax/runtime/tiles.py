@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vijax.runtime import xla
+
 
 def workers() -> int:
     """Count the threads that call programs on different tiles: one a core of a CPU, one for an accelerator."""
-    return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
+    return (os.cpu_count() or 1) if xla.on_cpu() else 1
 
 
 def places() -> list[jax.Device]:

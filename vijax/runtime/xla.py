@@ -1,4 +1,6 @@
-"""What vijax asks of XLA: values that are stored, kernels of many operations, options of its compiler.
+"""What vijax asks of XLA, other things of a CPU than of an accelerator.
+
+Values that are stored, kernels of many operations, loops, lookups among lanes, options of its compiler.
 
 On the CPU, XLA makes one kernel of each value that is stored and calls them one after another: with a few hundred lanes
 calls and memory cost as much as the arithmetic. It can emit a computation of many such values as one kernel, and does
@@ -73,9 +75,15 @@ def _asked_for() -> bool:
 KERNELS = _asked_for()
 
 
+def platform() -> str:
+    """Name the platform that programs are made for: that of the device which JAX was told to prefer, if it was."""
+    chosen: Any = jax.default_device.value
+    return getattr(chosen, "platform", chosen) or jax.default_backend()
+
+
 def on_cpu() -> bool:
     """Say whether programs are made for a CPU, not for an accelerator."""
-    return jax.default_backend() == "cpu"
+    return platform() == "cpu"
 
 
 def _in_kernels() -> bool:
@@ -94,7 +102,7 @@ def compiler_options(*, brief: bool = False) -> dict[str, Any]:
 
 
 def _options() -> dict[str, Any]:
-    return {"cpu": _CPU_OPTIONS, "gpu": _GPU_OPTIONS}.get(jax.default_backend(), {})
+    return {"cpu": _CPU_OPTIONS, "gpu": _GPU_OPTIONS}.get(platform(), {})
 
 
 @jax.jit
