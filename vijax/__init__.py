@@ -4,8 +4,8 @@ Importing vijax switches JAX to 64 bits, before any array is made: impact times 
 user needs stands here; what each function takes and returns its docstring says.
 
 Devices and pairs: `Harvester` (SI units) gives an `ImpactPair` (nondimensional), as `impact_pair` does from numbers;
-`HuntCrossley` is another membrane, `harvested_energy` the energy of one impact. `State`, `Impact` and `Status` are what
-records are made of.
+`HuntCrossley` is another membrane, `MembraneLaw` makes one of your own, `harvested_energy` is the energy of one impact.
+`State`, `Impact` and `Status` are what records are made of.
 
 Planes of parameters, as `xarray.Dataset`: `sweep` maps power, kind of motion and all that tells whether to believe it;
 `compare` maps what a rigid wall gets wrong, of which `cheapest_model` and `rigid_from` make a verdict; `basins` and

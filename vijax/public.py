@@ -19,7 +19,7 @@ from vijax.design.tolerance_plane import tolerance_plane as design_plane
 from vijax.explorer.door import explore
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
-from vijax.model.membrane import HuntCrossley
+from vijax.model.membrane import HuntCrossley, MembraneLaw
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Impact, State, Status
 from vijax.orbits.branch_dataset import dataset as branch_dataset
@@ -64,6 +64,7 @@ __all__ = [
     "Impact",
     "ImpactPair",
     "MapCurves",
+    "MembraneLaw",
     "Optimum",
     "Orbit",
     "Smoothness",

@@ -1,12 +1,15 @@
 """Methods by name: the door, maps by every method, membranes without a closed form."""
 
 from dataclasses import replace
+from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
+from scipy.integrate import solve_ivp
 
 import vijax
 from vijax import Harvester, HuntCrossley, sweep
@@ -294,6 +297,117 @@ def test_hunt_crossley_maps():
     assert float(restitution.max()) < 1
     assert float(restitution.max() - restitution.min()) > 0.01  # it is a result: slower impacts lose less
     assert "hunt-crossley" in found.attrs["membrane"]
+
+
+# --- a law of one's own -----------------------------------------------------------------------------------------------
+
+
+class Plain(vijax.MembraneLaw):
+    """The linear membrane, by hand."""
+
+    def acceleration(self, pair, w, z):
+        """Spring and damper."""
+        return -(pair.kappa**2 * w + pair.mu * z)
+
+
+class Cubic(vijax.MembraneLaw):
+    """One that stiffens."""
+
+    beta: float
+
+    def acceleration(self, pair, w, z):
+        """A cubic spring."""
+        return -(pair.kappa**2 * (w + self.beta * w**3) + pair.mu * z)
+
+
+class Elastic(vijax.MembraneLaw):
+    """One that loses nothing, whatever r is."""
+
+    restitution: ClassVar[bool] = False
+
+    def acceleration(self, pair, w, z):
+        """A spring."""
+        return -(pair.kappa**2) * w
+
+
+@pytest.mark.parametrize("options", [{"method": "ode"}, {"method": "rk4", "steps": 100}], ids=["ode", "rk4"])
+def test_the_linear_law_by_hand_is_the_linear_membrane(options):
+    pair = impact_pair([0.2, 0.25], [40.0, 100.0], 0.5, [0.0, 0.1])
+    plain, own = (vijax.trajectory(pair, 0.02, 0.3, 4, membrane=law, **options) for law in (None, Plain()))
+    for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(own), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-10, atol=1e-12)
+
+
+def test_a_map_is_made_with_a_law_of_ones_own_and_names_it():
+    axes = {"d": [0.2, 0.25], "kappa": [40.0, 100.0], "r": 0.5, "periods": 60, "method": "ode"}
+    plain, own = sweep(**axes), sweep(**axes, membrane=Plain())
+    assert (plain.period > 0).all()
+    np.testing.assert_array_equal(own.period, plain.period)
+    np.testing.assert_allclose(own.P, plain.P, rtol=1e-12)
+    assert (plain.attrs["membrane"], own.attrs["membrane"]) == ("linear", "Plain")
+    assert record(choose("ode", {"membrane": Cubic(500.0)}))["membrane"] == "Cubic with beta 500"
+
+
+def test_a_contact_of_ones_own_law_is_that_of_another_solver():
+    pair, law = impact_pair(0.2, 40.0, 0.5), Cubic(500.0)
+    ran = vijax.trajectory(pair, 0.02, 0.3, 4, method="ode", membrane=law, rtol=1e-11, atol=1e-13)
+    hit = {name: float(getattr(ran.impacts, name)[0]) for name in ("t", "side", "v_in", "v_out", "depth", "duration")}
+
+    def slope(t, y):
+        push = hit["side"] * np.cos(np.pi * t) - 1600 * (y[0] + 500 * y[0] ** 3) - float(pair.mu) * y[1]
+        return y[1], push
+
+    def out(t, y):
+        return y[0] if t > hit["t"] else 1.0
+
+    def crest(t, y):
+        return y[1]
+
+    out.terminal, out.direction = True, -1
+    start = (0.0, hit["side"] * hit["v_in"])
+    true = solve_ivp(slope, (hit["t"], hit["t"] + 1), start, "DOP853", events=(out, crest), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(true.t[-1] - hit["t"], hit["duration"], rtol=1e-8)
+    np.testing.assert_allclose(hit["side"] * true.y[1, -1], hit["v_out"], rtol=1e-8)
+    np.testing.assert_allclose(true.y_events[1][0][0], hit["depth"], rtol=1e-8)
+
+
+def test_a_motion_has_derivatives_in_the_numbers_of_a_law():
+    def end(beta):
+        law = Cubic(beta)
+        ran = vijax.trajectory(impact_pair(0.2, 40.0, 0.5), 0.02, 0.3, 3, method="ode", membrane=law, rtol=1e-11)
+        return ran.states.u[-1]
+
+    slope = jax.grad(end)(500.0)
+    np.testing.assert_allclose(slope, (end(505.0) - end(495.0)) / 10, rtol=1e-5)
+
+
+def test_a_law_without_restitution_is_given_none():
+    pair = ImpactPair(0.2, 40.0, None, 0.0)
+    ran = vijax.trajectory(pair, 0.02, 0.3, 4, method="ode", membrane=Elastic(), rtol=1e-11, atol=1e-13)
+    hits = int(ran.filled)
+    assert hits > 4
+    np.testing.assert_allclose(ran.impacts.work[:hits], 0, atol=1e-9)
+    found = sweep(d=0.2, kappa=40.0, method="ode", membrane=Elastic(), until="window", periods=5)
+    assert np.isnan(found.r)
+    with pytest.raises(ValueError, match="r must be left out with a membrane"):
+        sweep(d=0.2, kappa=40.0, r=0.5, method="ode", membrane=Elastic())
+
+
+def test_a_law_that_does_not_push_a_ball_out_is_refused():
+    for force, says in (
+        (lambda w: 1.0 * w, r"below 0, which pushes the ball out, at w = 1e-06, w' = 0; got 1e-06 of Wrong"),
+        (lambda w: jnp.nan * w, "acceleration must be 0 at w = 0, w' = 0; got nan"),
+        (lambda w: jnp.where(w < 0.01, -w, 0.0), "below 0, which pushes the ball out, at w = 0.01"),
+        (lambda w: -1.0 - w, "acceleration must be 0 at w = 0, w' = 0; got -1"),
+        (lambda w: -jnp.stack([w, w]), r"acceleration must be 0 at w = 0, w' = 0; got \[-?0.0"),
+    ):
+
+        class Wrong(vijax.MembraneLaw):
+            def acceleration(self, pair, w, z, force=force):
+                return force(w)
+
+        with pytest.raises(ValueError, match=says):
+            sweep(d=0.2, kappa=40.0, r=0.5, method="ode", membrane=Wrong())
 
 
 @pytest.mark.long

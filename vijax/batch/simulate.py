@@ -20,7 +20,6 @@ from vijax.engine.ground import ground_of
 from vijax.engine.impact import Arrival, Ball
 from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device, electrical
-from vijax.model.membrane import HuntCrossley
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.runtime import checks, export_cache, xla
 from vijax.runtime.arrays import AnyArray, present
@@ -154,8 +153,8 @@ def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, 
     """Raise ValueError unless a tile of cells can be run: one-dimensional arrays of one length."""
     if not isinstance(method, Method | None):
         raise ValueError(f"method must be a vijax.engine.method.Method, or None; got {checks.shown(method)}")
-    # Whoever carries cells of a Hunt-Crossley membrane has NaN for r.
-    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    # Whoever carries cells of a membrane that takes no restitution has NaN for r.
+    lossy = method is None or method.law.restitution
     nothing: Any = None
     checks.known("pair", check_pair(pair if lossy else dataclasses.replace(pair, r=nothing)))
     check_device(device)

@@ -16,7 +16,7 @@ from vijax.batch.stepped_run import stepped_run
 from vijax.engine.method import Method
 from vijax.engine.method_choice import choose
 from vijax.model.choices import MethodName, SolverName
-from vijax.model.membrane import HuntCrossley, Law
+from vijax.model.membrane import MembraneLaw
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
@@ -38,10 +38,11 @@ def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any]) -> Method |
     """Take the method as it is, or as `choose` makes it of a name, if the pair suits its membrane."""
     if not isinstance(method, Method):
         method = choose(method, options, wall=_wall(pair), dtype=_precision(pair))
-    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    lossy = method is None or method.law.restitution
     if (pair.r is None) == lossy:
         raise ValueError(
-            f"r must be None with a Hunt-Crossley membrane, and a number with others; got {checks.shown(pair.r)}"
+            "r must be None with a membrane that takes none, as HuntCrossley, and a number with others; "
+            f"got {checks.shown(pair.r)}"
         )
     return method
 
@@ -72,7 +73,7 @@ def trajectory(
     solver: SolverName | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    membrane: Law | None = None,
+    membrane: MembraneLaw | None = None,
     steps: int | None = None,
 ) -> Trajectory:
     """Follow one start, or an array of starts, for a number of forcing periods.
@@ -84,7 +85,8 @@ def trajectory(
         t0: Time of the start, in [0, 2 periods).
         max_impacts: Room for impacts; 16 a period and 16 more unless given.
         method: "exact", "ode" or "rk4", as in `sweep`; or a `vijax.engine.method.Method`.
-        solver, rtol, atol, membrane, steps: As in `sweep`. With a `HuntCrossley` membrane the pair's r is None.
+        solver, rtol, atol, membrane, steps: As in `sweep`. The pair's r is None with a membrane
+            that takes none, as `HuntCrossley`.
 
     Returns:
         The `Trajectory`. Differentiable in pair and start, forward and reverse, by a scan of bounded length. The exact

@@ -13,7 +13,7 @@ import jax
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vijax.model.membrane import Law, Linear, Wall
+from vijax.model.membrane import Linear, MembraneLaw, Wall
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
 from vijax.runtime.arrays import Flag, Scalar
@@ -97,7 +97,7 @@ class Method(eqx.Module, Generic[C]):
         law: The membrane; the linear one unless given.
     """
 
-    law: Law = eqx.field(default_factory=Linear, kw_only=True)
+    law: MembraneLaw = eqx.field(default_factory=Linear, kw_only=True)
 
     @abstractmethod
     def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> C:

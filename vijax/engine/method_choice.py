@@ -9,7 +9,7 @@ import numpy as np
 
 from vijax.engine.method import Method
 from vijax.model.choices import MethodName, SolverName
-from vijax.model.membrane import HuntCrossley, Law, Linear
+from vijax.model.membrane import Linear, check_law
 from vijax.runtime import checks
 from vijax.runtime.pages import see
 
@@ -40,18 +40,9 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
     """
     checks.choice("method", method, OPTIONS)
     given = {name: value for name, value in options.items() if value is not None}
-    law = given.get("membrane", Linear())
-    if not isinstance(law, Linear | HuntCrossley):
-        raise ValueError(
-            see(
-                "methods",
-                f"membrane must be a vijax.HuntCrossley, or left out for the linear one; got {checks.shown(law)}",
-            )
-        )
+    law = check_law(given.get("membrane", Linear()))
     if method == "exact" and not isinstance(law, Linear):
-        raise ValueError(
-            see("methods", f'membrane must be linear for method="exact"; got {describe(law)}; use method="ode"')
-        )
+        raise ValueError(see("methods", f'membrane must be linear for method="exact"; got {law}; use method="ode"'))
     for name in given:
         takers = [taker for taker, taken in OPTIONS.items() if name in taken]
         if method not in takers and name != "membrane":
@@ -79,20 +70,13 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
     return Ode(solver, rtol, atol, law=law)
 
 
-def describe(law: Law) -> str:
-    """Put a membrane law in words: its name, as `--membrane` takes it, and its numbers."""
-    if isinstance(law, Linear):
-        return "linear"
-    return f"hunt-crossley with chi {float(law.chi):g}, exponent {float(law.exponent):g}"
-
-
 def record(method: Method | None) -> dict[str, Any]:
     """Name what a method was told, for the attributes of a map."""
     if method is None:
         return {}
     told = {field.name: getattr(method, field.name) for field in dataclasses.fields(method) if field.name != "law"}
     numbers = {name: np.asarray(value).item() for name, value in told.items() if value is not None}
-    return {"membrane": describe(method.law)} | numbers
+    return {"membrane": str(method.law)} | numbers
 
 
 def _quoted(name: str) -> str:

@@ -62,8 +62,8 @@ class Rk4(Method[Rk4Carry]):
 
     @property
     def arithmetic(self) -> bool:
-        """Say whether a step calls no library: it does not."""
-        return True
+        """Say whether a step calls no library: it does not, if its membrane does not."""
+        return self.law.arithmetic
 
     def most_steps(self, periods: int, max_impacts: int) -> int:
         """Say how many steps a recorded run takes."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
 from vijax.model.device import Harvester, one_device
-from vijax.model.membrane import HuntCrossley, Law
+from vijax.model.membrane import MembraneLaw
 from vijax.planes import cluster, dispatch, estimate, store_filling, tile_size, tiled_store
 from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, Cells, cells
@@ -45,7 +45,7 @@ def sweep(
     solver: SolverName | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    membrane: Law | None = None,
+    membrane: MembraneLaw | None = None,
     steps: int | None = None,
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
@@ -84,8 +84,8 @@ def sweep(
             paper's fixed steps without event location.
         solver: Of "ode": Tsit5 unless given; Bosh3, Dopri5, Dopri8, Kvaerno3, Kvaerno4 or Kvaerno5.
         rtol, atol: Of "ode": tolerances of position and velocity step by step, 1e-8 and 1e-10 unless given.
-        membrane: Of "ode" and "rk4": `HuntCrossley(chi)` for the linear membrane. It takes no r: the map's
-            `restitution` is what came out.
+        membrane: Of "ode" and "rk4": `HuntCrossley(chi)`, or a `MembraneLaw` of your own, for the linear membrane.
+            `HuntCrossley` takes no r: the map's `restitution` is what came out.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
         outputs: The variables wanted, of those on the page of outputs; all but `asymmetry` and `lyapunov`
             unless given. What is not wanted is not computed. `status` always comes.
@@ -175,7 +175,7 @@ def plan(
     given = {name: values for name, values in axes.items() if values is not None}
     if starts > 1:
         _check_spread(given, settings, refine)
-    lossy = method is None or not isinstance(method.law, HuntCrossley)
+    lossy = method is None or method.law.restitution
     laid_out = cells(given, device, settings.wall, restitution=lossy)
     if starts > 1:
         named = {name: values for name, values in laid_out.quantities.items() if name not in ("u0", "v0")}
