@@ -330,6 +330,25 @@ class Elastic(vijax.MembraneLaw):
         return -(pair.kappa**2) * w
 
 
+class Series(vijax.MembraneLaw):
+    """One with a name, and as many coefficients as are given."""
+
+    name: str = eqx.field(static=True)
+    odd: Array
+
+    def acceleration(self, pair, w, z):
+        """A sum of odd powers."""
+        powers = w ** jnp.arange(1.0, 2 * self.odd.size, 2)
+        return -(pair.kappa**2 * (self.odd * powers).sum() + pair.mu * z)
+
+
+def test_a_law_holds_arrays_and_names():
+    pair, series = impact_pair([0.2, 0.25], 40.0, 0.5), Series("measured", jnp.asarray([1.0, 500.0]))
+    flown = [vijax.trajectory(pair, 0.02, 0.3, 3, method="ode", membrane=law) for law in (Cubic(500.0), series)]
+    np.testing.assert_allclose(flown[1].states.u, flown[0].states.u, rtol=1e-9)
+    assert str(series) == "Series with name measured, odd [1.0, 500.0]"
+
+
 @pytest.mark.parametrize("options", [{"method": "ode"}, {"method": "rk4", "steps": 100}], ids=["ode", "rk4"])
 def test_the_linear_law_by_hand_is_the_linear_membrane(options):
     pair = impact_pair([0.2, 0.25], [40.0, 100.0], 0.5, [0.0, 0.1])

@@ -66,7 +66,8 @@ class MembraneLaw(eqx.Module):
 
 
 def _shown(value: Any) -> str:
-    return str(np.asarray(value).tolist()) if np.ndim(value) else f"{float(value):g}"
+    array = np.asarray(value)
+    return f"{array.item():g}" if array.shape == () and array.dtype.kind in "iuf" else str(array.tolist())
 
 
 class _Bound(eqx.Module):

@@ -37,7 +37,7 @@ def jitted(
     part = jax.jit(work, static_argnames=static)
 
     @cache  # JAX must not look for its backend before a program is called
-    def program(brief: bool) -> Callable[P, T]:
+    def program(brief: bool, platform: str) -> Callable[P, T]:
         return jax.jit(work, compiler_options=xla.compiler_options(brief=brief), static_argnames=static)
 
     @lru_cache(maxsize=32)
@@ -54,7 +54,7 @@ def jitted(
         arrays = all(map(_is_array, jax.tree.leaves(args))) and set(kwargs) <= set(static)
         if known and arrays and cache_folder.kept():
             return traced(tuple(kwargs.items()))(*args, brief=brief)
-        return program(brief)(*args, **kwargs)
+        return program(brief, xla.platform())(*args, **kwargs)
 
     return call
 
