@@ -357,6 +357,12 @@ def test_the_linear_law_by_hand_is_the_linear_membrane(options):
         np.testing.assert_allclose(other, one, rtol=1e-10, atol=1e-12)
 
 
+def test_rk4_puts_no_law_into_a_kernel_that_may_call_a_library():
+    assert choose("rk4", {}).arithmetic
+    assert choose("rk4", {"membrane": HuntCrossley(0.5)}).arithmetic
+    assert not choose("rk4", {"membrane": Plain()}).arithmetic
+
+
 def test_a_map_is_made_with_a_law_of_ones_own_and_names_it():
     axes = {"d": [0.2, 0.25], "kappa": [40.0, 100.0], "r": 0.5, "periods": 60, "method": "ode"}
     plain, own = sweep(**axes), sweep(**axes, membrane=Plain())
