@@ -185,6 +185,7 @@ def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     assert float(table["P"][0, -1]) == pytest.approx(float(orbit_properties.power(one.orbit[-1:], last)[0]), rel=1e-12)
 
 
+@pytest.mark.long
 def test_branches_can_be_followed_from_their_folds():
     """No orbit beside a fold has its parameter. Newton found nearly none of these, on which 1:1 orbits almost fade."""
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
