@@ -123,10 +123,6 @@ def plane(periods: int) -> None:
     say("aperiodic cells: largest relative standard error of P", max(spread), 0.03)
 
 
-# What rounding leaves of w below zero at an exit that was found: 66 of its scale at most, in all contacts drawn.
-_EXIT_ROUNDINGS = 128
-
-
 def audit(share: float) -> None:
     """Audit drawn flights and contacts by a dense scan in long double, and constructed extrema."""
     flights, contacts, bad_flight, bad_contact, determinant, undecided = 0, 0, 0, 0, 0.0, 0
@@ -140,7 +136,7 @@ def audit(share: float) -> None:
         if soft:
             below = yardstick.audit_contacts(pair, ran)
             contacts += len(below)
-            bad_contact += int(np.sum(~(below < _EXIT_ROUNDINGS * yardstick.EPS)))
+            bad_contact += int(np.sum(~(below < 64 * yardstick.EPS)))
         with np.errstate(invalid="ignore", over="ignore"):
             determinant = max(determinant, float(np.nanmax(yardstick.determinants(pair, ran, 4))))
     say("missed wall crossings", bad_flight, 0, f"{flights:,} flights over random parameters")
