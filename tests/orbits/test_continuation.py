@@ -198,7 +198,7 @@ def test_branches_can_be_followed_from_their_folds():
         assert np.abs(branch.values - d).min() < 1e-14
 
 
-@pytest.mark.parametrize("kappa", [None, 40.0])
+@pytest.mark.parametrize("kappa", [None, pytest.param(40.0, marks=pytest.mark.long)])
 def test_a_branch_that_starts_at_a_bound_stays_within(kappa):
     """It used to set out across the bound, where rounding had the start beyond it already."""
     start = orbit_search.search(impact_pair(0.2, kappa, 0.5), "RL", guesses=32)[:1]
