@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 import vijax
+from benchmarks.accelerator import plane
 from benchmarks.orbits import say
 from vijax.planes.sweep_settings import STARTS
 
@@ -27,11 +28,6 @@ _HERE = Path(__file__).parents[1]
 _CELLS = 128
 _COMPARED = 200
 _PAIRS = 3
-
-
-def plane(cells: int) -> dict[str, Any]:
-    """Give the axes of the default plane with so many cells along each."""
-    return {"d": np.linspace(0.05, 0.3, cells), "kappa": np.geomspace(3, 400, cells), "r": 0.5}
 
 
 def costs(cells: int, starts: int) -> None:

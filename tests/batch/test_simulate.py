@@ -345,7 +345,6 @@ def test_single_precision_finds_the_same_periods():
     assert (single != double)[periodic].mean() < 0.01
 
 
-@pytest.mark.long
 def test_a_long_period_is_kept_by_a_flight_of_thousands():
     # Orbits that attract from so near that chaos passes them: Newton alone would find them from there.
     for d, kappa, r in (

@@ -185,7 +185,6 @@ def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     assert float(table["P"][0, -1]) == pytest.approx(float(orbit_properties.power(one.orbit[-1:], last)[0]), rel=1e-12)
 
 
-@pytest.mark.long
 def test_branches_can_be_followed_from_their_folds():
     """No orbit beside a fold has its parameter. Newton found nearly none of these, on which 1:1 orbits almost fade."""
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
@@ -198,7 +197,7 @@ def test_branches_can_be_followed_from_their_folds():
         assert np.abs(branch.values - d).min() < 1e-14
 
 
-@pytest.mark.parametrize("kappa", [None, pytest.param(40.0, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kappa", [None, 40.0])
 def test_a_branch_that_starts_at_a_bound_stays_within(kappa):
     """It used to set out across the bound, where rounding had the start beyond it already."""
     start = orbit_search.search(impact_pair(0.2, kappa, 0.5), "RL", guesses=32)[:1]

@@ -110,6 +110,14 @@ def test_a_program_for_a_gpu_is_kept_by_the_name_of_its_platform(monkeypatch):
     assert export_cache._platform([X]) == "cpu"
 
 
+def test_a_program_made_for_another_platform_is_another_one(folder, monkeypatch):
+    """On the CPU of a machine with a GPU, too."""
+    called()
+    monkeypatch.setattr(xla, "platform", lambda: "gpu")
+    assert called()[1] == 1
+    assert len(list(folder.iterdir())) == 2
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_threads_that_call_at_once_compile_it_once(tmp_path, monkeypatch, kept):
     monkeypatch.setattr(cache_folder, "kept", lambda: tmp_path if kept else None)

@@ -80,6 +80,20 @@ class _Bound(eqx.Module):
         return self.law.acceleration(self.pair, w, z)
 
 
+class _Shipped(MembraneLaw):
+    """A law that vijax has: its `wall` computes once for a pair what need not be computed at every step."""
+
+    arithmetic: ClassVar[bool] = True
+
+    def acceleration(self, pair: ImpactPair, w: Values, z: Values) -> Values:
+        """Compute the acceleration at penetration w and rate z."""
+        return self.wall(pair)(w, z)
+
+    @abstractmethod
+    def wall(self, pair: ImpactPair) -> Wall:
+        """Give the law the numbers of a pair."""
+
+
 class Spring(eqx.Module):
     """-(kappa^2 w + mu w'): a linear spring and damper."""
 
@@ -91,14 +105,8 @@ class Spring(eqx.Module):
         return -(self.square * w + self.mu * z)
 
 
-class Linear(MembraneLaw):
+class Linear(_Shipped):
     """The paper's membrane, Eq. (38): its damping is calibrated so that a free contact has restitution r, Eq. (19)."""
-
-    arithmetic: ClassVar[bool] = True
-
-    def acceleration(self, pair: ImpactPair, w: Values, z: Values) -> Values:
-        """Compute the acceleration at penetration w and rate z."""
-        return self.wall(pair)(w, z)
 
     def wall(self, pair: ImpactPair) -> Spring:
         """Give the law the numbers of a pair."""
@@ -124,7 +132,7 @@ class Hertz(eqx.Module):
         return -self.square * spring * (1 + self.chi * z)
 
 
-class HuntCrossley(MembraneLaw):
+class HuntCrossley(_Shipped):
     """Hunt and Crossley's membrane, w'' = -kappa^2 w^n (1 + chi w') + forcing: no restitution r is given to it.
 
     The loss grows with the speed, so that the restitution is a result: -v_out/v_in is near 1 - 2 chi v_in/3 for slow
@@ -141,7 +149,6 @@ class HuntCrossley(MembraneLaw):
     chi: Real
     exponent: Real = 1.5
     restitution: ClassVar[bool] = False
-    arithmetic: ClassVar[bool] = True
 
     def __check_init__(self):
         for name, least in (("chi", 0), ("exponent", 1)):
@@ -149,10 +156,6 @@ class HuntCrossley(MembraneLaw):
             if checks.is_concrete(value):
                 must = f"one finite number of at least {least}"
                 checks.real(name, value, must, lambda x, least=least: least <= x < math.inf)
-
-    def acceleration(self, pair: ImpactPair, w: Values, z: Values) -> Values:
-        """Compute the acceleration at penetration w and rate z."""
-        return self.wall(pair)(w, z)
 
     def wall(self, pair: ImpactPair) -> Hertz:
         """Give the law the numbers of a pair."""
@@ -181,7 +184,7 @@ def check_law(law: Any) -> MembraneLaw:
                 f"one; got {checks.shown(law)}",
             )
         )
-    if isinstance(law, Linear | HuntCrossley):
+    if isinstance(law, _Shipped):
         return law
     d, kappa, r, gamma = map(jnp.asarray, _NOMINAL)
     nothing: Any = None

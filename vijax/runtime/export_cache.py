@@ -2,7 +2,8 @@
 
 Tracing and lowering the program of a plane takes two seconds of every process, more than running a small plane, and the
 small programs that find an orbit take one together. What comes of it depends on the program, on the shapes of its
-arguments, on these sources, on JAX, and on whether kernels are wanted (`xla.KERNELS`), alone.
+arguments, on these sources, on JAX, on the platform that programs are made for (`xla.platform`), and on whether kernels
+are wanted (`xla.KERNELS`), alone.
 """
 
 import hashlib
@@ -82,7 +83,7 @@ class TracedProgram:
         if folder is None or not _ours(tree):
             return jax.jit(flat, compiler_options=options)
         shapes = tuple((x.shape, str(x.dtype)) for x in leaves)
-        name = f"{self._name} {(platform, tree, shapes)} {xla.KERNELS} {source_digest()}"
+        name = f"{self._name} {(platform, tree, shapes)} {xla.platform()} {xla.KERNELS} {source_digest()}"
         path = folder / f"traced-{_DIGEST(name.encode()).hexdigest()}"
         known = _read(path)
         if known is None:
