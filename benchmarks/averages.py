@@ -143,7 +143,8 @@ def cells(count: int) -> Iterator[Row]:
     def one(numbered: tuple[int, Harvester]) -> list[Row]:
         index, of = numbered
         found, fit = vijax.average(of), vijax.average(of, balls=TIMES * 4096, seed=SEED)
-        where = f"{index}: d {float(of.pair().d):.4g}, kappa {float(present(of.pair().kappa)):.4g}, r {float(of.r):.3g}"
+        pair = of.pair()
+        where = f"{index}: d {float(pair.d):.4g}, kappa {float(present(pair.kappa)):.4g}, r {float(pair.r):.3g}"
         return [
             Row(
                 "cells",

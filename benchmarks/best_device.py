@@ -210,7 +210,7 @@ def _again(part: str, devices: list[Harvester], designs: list[Design]) -> None:
     # Where the long flight left them: they go on from there.
     starts, (balls, periods) = [one.starts for one in best], FLOWN
     flown = fly(task, np.array(owner), z, np.zeros(len(owner)), starts, periods, balls)
-    kept = [bool(one.found.margins(one.device).min() >= 0) for one in flown]
+    kept = [bool(one.found.margins().min() >= 0) for one in flown]
     off = []
     for one, again in zip(best, flown, strict=True):
         P = again.found.P

@@ -310,7 +310,7 @@ def scanned(device: Harvester, points: int) -> Best | None:
         return None
     best = found.isel(P.argmax(...))
     left, right, period = (int(best[name]) for name in ("impacts_left", "impacts_right", "period"))
-    used = max(float(best["max_penetration"]) / float(device.depth_limit), float(best["energy_ratio"]))
+    used = max(float(best["max_penetration"]) / float(np.asarray(device.depth_limit)), float(best["energy_ratio"]))
     return Best(float(best["P"]), float(best["kappa"]), period, f"{left}:{right}/{period}T", used < FREE)
 
 
@@ -362,7 +362,7 @@ def excess(optimum: Optimum) -> float:
     deep: Any = np.asarray(orbit.depth) * float(device.length_unit)
     given = np.asarray(orbit.work) * float(device.m_b * device.speed_unit**2)
     gained = np.asarray(harvested_energy(device, deep))
-    return float(max(np.nanmax(deep) / float(device.depth_limit), np.nanmax(gained / given)) - 1)
+    return float(max(np.nanmax(deep) / float(np.asarray(device.depth_limit)), np.nanmax(gained / given)) - 1)
 
 
 def scan(devices: int, points: int) -> None:

@@ -361,7 +361,7 @@ def mp_oscillate(kappa, r, force, w0, z0, s):
     response = mp.mpc(c, q) / mp.mpc(kappa**2 - mp.pi**2, 2 * zeta * mp.pi)
     free = w0 - response.real + g / kappa**2
     rate = (z0 + mp.pi * response.imag + zeta * free) / omega1
-    steady = response * mp.expjpi(s)
+    steady = response * mp.mpc(mp.cospi(s), mp.sinpi(s))  # findroot lets no function of a real number be complex
     decay, cos, sin = mp.exp(-zeta * s), mp.cos(omega1 * s), mp.sin(omega1 * s)
     w = steady.real - g / kappa**2 + decay * (free * cos + rate * sin)
     return w, -mp.pi * steady.imag + decay * ((omega1 * rate - zeta * free) * cos - (omega1 * free + zeta * rate) * sin)
@@ -397,14 +397,14 @@ class Row(NamedTuple):
 def mp_march(parameters, count: int, guesses: list | None = None) -> tuple[list[Row], list]:
     """Find the first impacts of a start (d, kappa or None, r, gamma, u0, v0) at t = 0, each event from a dense scan.
 
-    `guesses` of a run nearby replace the scans.
+    kappa and r may be two, of the left wall and of the right one. `guesses` of a run nearby replace the scans.
     """
-    numbers: Any = (x if x is None else mp.mpf(x) for x in parameters)
-    d, kappa, r, gamma, u, v = numbers
+    d, stiffness, restitution, gamma, u, v = (_mp_number(x) for x in parameters)
     t, rows, found = mp.mpf(0), [], []
     for k in range(count):
         flight, duration, deepest = guesses[k] if guesses else (_scan_flight(d, gamma, t, u, v), None, None)
         side = 1 if u + mp_flight(gamma, t, v, flight)[0] > 0 else -1
+        kappa, r = (x[side > 0] if isinstance(x, tuple) else x for x in (stiffness, restitution))
 
         def gap(s, side=side, t=t, u=u, v=v):
             rise, speed = mp_flight(gamma, t, v, s)
@@ -418,7 +418,7 @@ def mp_march(parameters, count: int, guesses: list | None = None) -> tuple[list[
             if not guesses:
                 duration, deepest = _scan_contact(kappa, r, gamma, side, onset, side * v_in)
 
-            def course(s, side=side, onset=onset, v_in=v_in):
+            def course(s, side=side, onset=onset, v_in=v_in, kappa=kappa, r=r):
                 return mp_contact(kappa, r, gamma, side, onset, side * v_in, s)
 
             stay = newton(lambda s, course=course: course(s)[:2], mp.mpf(duration))
@@ -428,6 +428,12 @@ def mp_march(parameters, count: int, guesses: list | None = None) -> tuple[list[
         found.append((flight, duration, deepest))
         t, u, v = onset + stay, side * d / 2, v_out
     return rows, found
+
+
+def _mp_number(x: Any) -> Any:
+    if isinstance(x, tuple):
+        return tuple(map(_mp_number, x))
+    return x if x is None else mp.mpf(x)
 
 
 def _scan_flight(d, gamma, t, u, v) -> float:

@@ -4,6 +4,7 @@ Importing vijax switches JAX to 64 bits, before any array is made: impact times 
 user needs stands here; what each function takes and returns its docstring says.
 
 Devices and pairs: `Harvester` (SI units) gives an `ImpactPair` (nondimensional), as `impact_pair` does from numbers;
+`Sides` holds what two walls that differ have;
 `HuntCrossley` is another membrane, `MembraneLaw` makes one of your own, `harvested_energy` is the energy of one impact.
 `State`, `Impact` and `Status` are what records are made of.
 

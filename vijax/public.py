@@ -22,6 +22,7 @@ from vijax.model.energy import harvested_energy
 from vijax.model.membrane import HuntCrossley, MembraneLaw
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Impact, State, Status
+from vijax.model.sides import Sides
 from vijax.orbits.branch_dataset import dataset as branch_dataset
 from vijax.orbits.continuation import Branch
 from vijax.orbits.continuation import follow as follow_orbits
@@ -67,6 +68,7 @@ __all__ = [
     "MembraneLaw",
     "Optimum",
     "Orbit",
+    "Sides",
     "Smoothness",
     "State",
     "Status",

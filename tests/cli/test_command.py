@@ -109,7 +109,8 @@ def test_python_m_is_the_command():
     said = subprocess.run(
         [sys.executable, "-m", "vijax", "sweep", "--wall", "x"], capture_output=True, text=True, cwd=ROOT
     )
-    assert (said.returncode, said.stderr) == (2, 'error: wall must be "soft" or "rigid"; got \'x\'\n')
+    told = "error: wall must be among soft, rigid, rigid_left, rigid_right; got 'x'\n"
+    assert (said.returncode, said.stderr) == (2, told)
 
 
 # --- words -----------------------------------------------------------------------------------------------------------
@@ -268,7 +269,7 @@ def completed(monkeypatch, capsys):
         ("vijax ", ["sweep", "compare", "orbit-diagram", "basins", "branch", "curves", "design", "explore", "docs"]),
         ("vijax b", ["basins", "branch"]),
         ("vijax sweep --me", ["--method", "--membrane"]),
-        ("vijax sweep --wall ", ["soft", "rigid"]),
+        ("vijax sweep --wall ", ["soft", "rigid", "rigid_left", "rigid_right"]),
         ("vijax sweep --method ode --solver Dop", ["Dopri5", "Dopri8"]),
         ("vijax compare --compar", []),
         ("vijax orbit-diagram --direction d", ["down"]),
@@ -286,8 +287,8 @@ def test_a_shell_completes_subcommands_options_and_choices(completed, line, word
 @pytest.mark.parametrize(
     ("shell", "words", "told"),
     [
-        ("zsh", {"COMP_WORDS": "vijax sweep --wall=ri", "COMP_CWORD": "2"}, "plain\n--wall=rigid\n_\n"),
-        ("fish", {"COMP_WORDS": "vijax sweep --wall=ri", "COMP_CWORD": "--wall=ri"}, "plain,--wall=rigid\n"),
+        ("zsh", {"COMP_WORDS": "vijax sweep --wall=so", "COMP_CWORD": "2"}, "plain\n--wall=soft\n_\n"),
+        ("fish", {"COMP_WORDS": "vijax sweep --wall=so", "COMP_CWORD": "--wall=so"}, "plain,--wall=soft\n"),
         ("fish", {"COMP_WORDS": "vijax sweep --show", "COMP_CWORD": "lab"}, "plain,label\n"),
     ],
 )
@@ -321,7 +322,7 @@ def test_bash_completes_after_the_line_of_the_pages(tmp_path):
     stub.write_text(f"#!{sys.executable}\nfrom vijax.cli.main import command\ncommand()\n")
     stub.chmod(0o755)
     environment = os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-    asked = 'COMP_WORDS=(vijax sweep --wall r) COMP_CWORD=3; _vijax_completion vijax; echo "${COMPREPLY[@]}"'
+    asked = 'COMP_WORDS=(vijax sweep --wall s) COMP_CWORD=3; _vijax_completion vijax; echo "${COMPREPLY[@]}"'
     done = subprocess.run(["bash", "-c", f"{line}; {asked}"], capture_output=True, text=True, env=environment)
-    assert done.stdout == "rigid\n", done.stderr
+    assert done.stdout == "soft\n", done.stderr
     assert line in " ".join(command.vijax.get_help(click.Context(command.vijax)).split())

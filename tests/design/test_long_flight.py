@@ -71,7 +71,8 @@ def proved(monkeypatch, motion, known=-math.inf):
         designs.append(float(z[0, 0]))
         end = on_motion(starts[0], balls)
         depth = device.depth_limit * math.exp(-room) * one
-        found = Averages(P * one, one, depth, 0.1 * one, one, zero, zero, zero, zero, one, end)
+        left = device.depth_limit / depth
+        found = Averages(P * one, one, depth, left, 0.1 * one, one, zero, zero, zero, zero, one, end)
         return [Ensemble(np.zeros((balls, 1)), found, device)]
 
     monkeypatch.setattr(long_flight, "fly", flown)

@@ -18,7 +18,7 @@ class Given(NamedTuple):
         """Give the objective."""
         return self.objective
 
-    def margins(self, device: Any) -> np.ndarray:
+    def margins(self) -> np.ndarray:
         """Give the margins, [motion, limit]."""
         return self.lacks[:, None]
 

@@ -199,7 +199,7 @@ REFUSED = [
         "d, kappa, r and gamma must broadcast to one shape; got d (2,), kappa (3,), r (), gamma ()",
     ),
     (lambda: impact_pair(0.2, None, 0.5).mu, "kappa must be a number for a membrane's damping"),
-    (lambda: Harvester().pair("hard"), 'wall must be "soft" or "rigid"; got \'hard\''),
+    (lambda: Harvester().pair("hard"), "wall must be among soft, rigid, rigid_left, rigid_right; got 'hard'"),
     (lambda: Harvester(omega=0.0), "omega must be positive and finite; got 0.0; it is the forcing frequency in rad/s"),
     (lambda: Harvester(A=-1.0), "A must be positive and finite; got -1.0; "),
     (lambda: Harvester(C_T=-1.0), "C_T must be finite and not negative; got -1.0; "),

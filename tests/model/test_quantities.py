@@ -28,6 +28,8 @@ def test_every_axis_and_every_constant_of_the_device_is_in_the_table():
     assert list(Parameters.__annotations__) == list(PARAMETERS)
     assert set(Axes.__annotations__) == set(AXES)
     assert {field.name for field in dataclasses.fields(ImpactPair)} < set(PARAMETERS)
+    of_walls = {f"{name}_{side}" for name in ("omega0", "r") for side in quantities.SIDES}
+    assert of_walls < set(AXES)
     assert set(QUANTITIES) == set(AXES) | set(CONSTANTS)
     assert set(variables.NAMES) == set(QUANTITIES) - set(quantities.STARTS) - {"penetration_limit"}
     assert set(MOVED) == set(PARAMETERS)
@@ -61,8 +63,9 @@ def test_what_has_a_unit_is_given_by_the_device():
     """An option whose name is physical makes the plane the device's."""
     from vijax.cli.options import DEVICE, PHYSICAL
 
-    assert {"omega", "A", "beta", "s", "omega0", "k"} == DEVICE
-    assert {"s", "omega0", "k"} == PHYSICAL
+    of_walls = {f"{name}_{side}" for name in ("omega0", "k") for side in quantities.SIDES}
+    assert {"omega", "A", "beta", "s", "omega0", "k"} | of_walls == DEVICE
+    assert {"s", "omega0", "k"} | of_walls == PHYSICAL
 
 
 @pytest.mark.parametrize("name", [name for name, axis in PARAMETERS.items() if axis.default])
@@ -86,8 +89,11 @@ def test_another_name_of_a_constant_decides_it(name):
     """The device of a map is the same by whatever name it is given, and two of them are refused."""
     device = Harvester(beta=0.02)
     value, constant = float(variables.value_of(device, name)), AXES[name].constant
-    usual, asked = (cells(given, device, "soft").quantities for given in ({}, {name: value}))
-    for one in ("d", "kappa", "gamma"):
+    whole = quantities.of_both_walls(name)
+    usual, asked = (
+        cells(given, device, "soft").quantities for given in ({f"{whole}_left": value} if whole else {}, {name: value})
+    )
+    for one in ("d", "gamma", *(("kappa_left", "kappa_right") if whole else ("kappa",))):
         assert float(asked[one]) == pytest.approx(float(usual[one]), rel=1e-12)
     assert constant in quantities.synonyms(name)
     made = variables.tuned(device, (name,), variables.variables((name,), [1.1 * value]))
@@ -98,8 +104,9 @@ def test_another_name_of_a_constant_decides_it(name):
 
 @pytest.mark.parametrize("name", [name for name, one in QUANTITIES.items() if one.unit])
 def test_docstrings_name_the_units_of_the_table(name):
-    said = re.search(rf"^ +{name}: .*\[(.+?)\]", inspect.getdoc(Harvester), re.MULTILINE)
-    if name == "k":
+    whole = quantities.of_both_walls(name) or name
+    said = re.search(rf"^ +{whole}: .*\[(.+?)\]", inspect.getdoc(Harvester), re.MULTILINE)
+    if whole == "k":
         assert name not in CONSTANTS
         said = re.search(r"\[(.+?)\]", inspect.getdoc(Harvester.k.fget))
     assert said[1] == QUANTITIES[name].unit

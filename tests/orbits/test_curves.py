@@ -22,9 +22,9 @@ from vijax.orbits import (
     limits,
     map_borders,
     map_motions,
+    multipliers,
     orbit_search,
     periodic,
-    shooting,
     switching,
 )
 from vijax.orbits.curve_equations import Touch
@@ -203,8 +203,8 @@ def test_conditions_are_those_of_the_monodromy_matrix(met):
         pair, sequence, knots = (
             jax.tree.map(lambda x: x[0], leaf) for leaf in (orbit.pair, orbit.sequence, orbit.knots)
         )
-        around = np.asarray(shooting.monodromy(pair, sequence, knots))
-        both = shooting.multiplier_conditions(pair, sequence, knots)
+        around = np.asarray(multipliers.monodromy(pair, sequence, knots))
+        both = multipliers.multiplier_conditions(pair, sequence, knots)
         speed = np.asarray(knots)[:, 1]
         weight = np.prod(speed / (speed + 0.1))
         for sign, found in zip((-1, 1), both, strict=True):

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.yardstick import reference_orbits
 from vijax.model.pair import impact_pair
-from vijax.orbits import shooting
+from vijax.orbits import multipliers, shooting
 from vijax.orbits.shooting import Sequence
 
 
@@ -61,7 +61,7 @@ def test_the_monodromy_contracts_as_contact_and_impacts_do():
         expected = 0.5 ** (2 * count) if case == "rigid" else math.exp(-float(pair.mu) * stay)
         if case == "rigid":
             knots = knots.at[:, 2].set(0.0)
-        around = jax.jit(shooting.monodromy)(pair, walls, knots)
+        around = jax.jit(multipliers.monodromy)(pair, walls, knots)
         np.testing.assert_allclose(np.linalg.det(around), expected, rtol=1e-12)
 
 

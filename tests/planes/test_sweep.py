@@ -173,7 +173,7 @@ BAD = [
     ({"omega0": 100.0, "k": 500.0}, "omega0 and k"),
     ({"gamma": 0.1, "beta": 0.1}, "gamma and beta"),
     ({"wall": "rigid", "d": [0.2, 0.1], "u0": 0.08}, "u0 must lie in the gap .* got 0.08 where d = 0.1"),
-    ({"wall": "hard"}, 'wall must be "soft" or "rigid"'),
+    ({"wall": "hard"}, "wall must be among soft, rigid, rigid_left, rigid_right"),
     ({"until": "chaos"}, "until must be"),
     ({"method": "euler"}, 'method must be "exact" or "ode" or "rk4"; got \'euler\''),
     ({"solver": "Tsit5"}, "solver must be left out unless method is \"ode\"; got 'Tsit5'"),

@@ -17,9 +17,10 @@ from jaxtyping import Array, Float, Int
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Arrival, Ball, LaneImpact
 from vijax.engine.method import ImpactOutcome, Method
-from vijax.engine.quick_wall import Wall
+from vijax.engine.quick_wall import TwoWalls
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
+from vijax.model.sides import Sides
 from vijax.runtime.arrays import AnyArray, Lane, Mask, Values
 
 # Share of its periods that a cell without an orbit leaves out of its averages. Less keeps more of the way to the
@@ -39,6 +40,8 @@ class Plan(eqx.Module):
     Attributes:
         until: "attractor" or "window".
         rigid: Whether the walls are.
+        unequal: Whether the two walls may differ.
+        hard_wall: Which wall is rigid beside a soft one; 0 where both are of one kind.
         ground: What gamma is over all cells.
         deep: Whether greatest depths and works are wanted.
         energies: Whether what is harvested is wanted; needs `deep`.
@@ -51,6 +54,8 @@ class Plan(eqx.Module):
 
     until: str = eqx.field(static=True, default="attractor")
     rigid: bool = eqx.field(static=True, default=False)
+    unequal: bool = eqx.field(static=True, default=False)
+    hard_wall: int = eqx.field(static=True, default=0)
     ground: Ground = eqx.field(static=True, default=Ground.LEVEL)
     deep: bool = eqx.field(static=True, default=False)
     energies: bool = eqx.field(static=True, default=False)
@@ -66,6 +71,11 @@ class Plan(eqx.Module):
         Equinox leaves out what is a default, but tells that by identity: "attractor" of another process is none.
         """
         return str(dataclasses.asdict(self))
+
+
+def walls_of(pair: ImpactPair) -> dict[str, Any]:
+    """Name what a `Plan` says of the walls of a pair."""
+    return {"rigid": pair.rigid, "unequal": pair.unequal, "hard_wall": pair.hard_wall}
 
 
 class Settings(eqx.Module):
@@ -121,6 +131,7 @@ class Tally(eqx.Module):
     fastest: Lane
     momentum: Lane | None  # sum of v_in, signed
     deepest: Lane | None
+    deepest_sides: Sides | None  # of each wall, where these may differ
     harvest: Harvest | None
     stuck: Mask | None
 
@@ -173,7 +184,7 @@ class Cell(eqx.Module):
     """A lane's cell: parameters, where the ball is, and what has been seen."""
 
     pair: ImpactPair
-    wall: Wall | None
+    wall: TwoWalls | None
     course: Course | None
     length: Lane
     speed: Lane
@@ -212,10 +223,11 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
     zero = jnp.zeros_like(like)
     wide = jnp.zeros((*like.shape, plan.variants), like.dtype)
     harvest = Harvest(wide, wide, wide, wide) if plan.energies else None
-    stuck = jnp.zeros(like.shape, bool) if plan.rigid else None
+    stuck = jnp.zeros(like.shape, bool) if plan.rigid or plan.hard_wall else None
     deepest = zero if plan.deep else None
+    sides = Sides(zero, zero) if plan.deep and plan.unequal else None
     momentum = zero if plan.asymmetry else None
-    return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, harvest, stuck)
+    return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, sides, harvest, stuck)
 
 
 def batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:

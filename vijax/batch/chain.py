@@ -98,17 +98,22 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
 def resting(pair: ImpactPair, end: Lane) -> Ball:
     """Make a ball that stays for ever on the wall on which it lies, at phase 0, once only its steady motion is left."""
     side, zero = -jnp.sign(pair.gamma), jnp.zeros_like(end)
-    if pair.rigid:
-        return Ball(0.5 * side * pair.d, zero, zero, end)
 
-    def steady(pair, side):
-        response = flow.steady_response(flow.membrane(pair), flow.contact_force(pair.gamma, side, jnp.zeros_like(side)))
-        return response.at(jnp.zeros_like(side)), response.slope().at(jnp.zeros_like(side))
+    def rigid(_: ImpactPair) -> tuple:
+        return zero, zero
 
-    w, z = jax.vmap(steady)(pair, side)
+    def soft(wall: ImpactPair) -> tuple:
+        def steady(wall, side):
+            force = flow.contact_force(wall.gamma, side, jnp.zeros_like(side))
+            response = flow.steady_response(flow.membrane(wall), force)
+            return response.at(jnp.zeros_like(side)), response.slope().at(jnp.zeros_like(side))
+
+        return jax.vmap(steady)(wall, side)
+
+    w, z = pair.met(side, rigid, soft)
     return Ball(side * (0.5 * pair.d + w), side * z, zero, end)
 
 
 def within(pair: ImpactPair, u: Lane) -> Lane:
     """Put a start that the gap of a rigid wall does not hold back into it; give the displacement."""
-    return jnp.clip(u, -START_REACH * pair.d, START_REACH * pair.d) if pair.rigid else u
+    return jnp.where(pair.hard(u), jnp.clip(u, -START_REACH * pair.d, START_REACH * pair.d), u)

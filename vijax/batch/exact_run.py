@@ -38,13 +38,17 @@ def ball_at(pair: ImpactPair, start: State, out: exact.Outcome, when: Float[AnyA
     held = start.mode != 0
     side = jnp.where(held, start.mode, out.impact.side).astype(rise.dtype)
     inside = jnp.where(aloft, 0.0, when - out.flight)
-    if pair.rigid:
+
+    def rigid(_: ImpactPair) -> tuple:
         # Only sticking lasts: at rest on the wall.
-        w, z = jnp.zeros_like(rise), jnp.zeros_like(rise)
-    else:
+        return jnp.zeros_like(rise), jnp.zeros_like(rise)
+
+    def soft(wall: ImpactPair) -> tuple:
         force = flow.contact_force(pair.gamma, side, out.impact.t)
         w0 = jnp.where(held, side * start.u - 0.5 * pair.d, 0.0)
-        w, z = flow.oscillate(flow.membrane(pair, rolled=True), force, w0, side * out.impact.v_in, inside)
+        return flow.oscillate(flow.membrane(wall, rolled=True), force, w0, side * out.impact.v_in, inside)
+
+    w, z = pair.met(side, rigid, soft)
     u = jnp.where(aloft, start.u + rise, side * (0.5 * pair.d + w))
     return u, jnp.where(aloft, v, side * z), jnp.where(aloft, 0, side.astype(jnp.int32))
 

@@ -105,16 +105,16 @@ def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int
         steps: How many.
         ground: For the quick step on such ground; by the careful one where it is None.
     """
-    wall = None if ground is None else quick_wall.prepare(pair, ground=ground)
+    walls = None if ground is None else quick_wall.prepare(pair, ground=ground)
 
     def one(reached: _Underway, _):
         state, over, waits = reached
         left = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(state.t.dtype) - state.t)
         wanted = ~over & (left > 0)
-        if wall is None:
+        if walls is None:
             out, sure = jax.vmap(exact.step)(pair, state, left), jnp.ones_like(over)
         else:
-            out, sure = _quick_outcome(wall, pair, state)
+            out, sure = _quick_outcome(walls, pair, state)
         waits = waits | (wanted & ~sure)
         ends = ~waits & (~wanted | out.quiet | out.permanent | (out.impact.n >= periods))
         stays = over | ends | waits
@@ -124,10 +124,10 @@ def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int
     return lax.scan(one, _Underway(states, over, jnp.zeros_like(over)), None, length=steps)
 
 
-def _quick_outcome(wall: quick_wall.Wall, pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
+def _quick_outcome(walls: quick_wall.TwoWalls, pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
     """Take balls one impact on by the quick step; say of which it is sure."""
     ball = Ball(state.u, state.v, state.t, state.n.astype(state.t.dtype))
-    impact, _, sure, _ = quick.quick_step(wall, pair.gamma, ball, deep=True)
+    impact, _, sure, _ = quick.quick_step(walls, pair.gamma, ball, deep=True)
     after, whole, no = impact.after, state.n.dtype, jnp.zeros_like(sure)
     told = Impact(
         n=impact.onset_n.astype(whole),

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vijax.batch import advance
-from vijax.batch.cell import Event, Plan
+from vijax.batch.cell import Event, Plan, walls_of
 from vijax.engine import quick, quick_wall
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Ball
@@ -95,7 +95,7 @@ def next_impacts(
         t: Phase, in [0, 2).
         ground: That of all cells with which one program is shared.
     """
-    plan = Plan(until="window", rigid=pair.rigid, ground=ground, deep=True, tangent=False)
+    plan = Plan(until="window", **walls_of(pair), ground=ground, deep=True, tangent=False)
     pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
     zero: Any = np.zeros_like(t)
     ball = Ball(0.5 * side * pair.d, -side * speed, t, zero)

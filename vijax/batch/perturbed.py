@@ -16,7 +16,7 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float, Int
 
 from vijax.batch import lanes, rows
-from vijax.batch.cell import TRANSIENT_SHARE, Entry, Plan, Settings
+from vijax.batch.cell import TRANSIENT_SHARE, Entry, Plan, Settings, walls_of
 from vijax.batch.simulate import compiled, program, width_of
 from vijax.batch.summary import Summary, shapes
 from vijax.engine.ground import Ground, ground_of
@@ -57,9 +57,9 @@ def averages(
         speed_variant=jnp.ones_like(length),
     )
     given = table, count, settings
-    plans = [_plan(ground, length.size) for ground in (Ground.LEVEL, Ground.GENTLE)]
+    plans = [_plan(pair, ground, length.size) for ground in (Ground.LEVEL, Ground.GENTLE)]
     if checks.is_concrete(given):
-        plan = _plan(ground_of(pair.gamma), length.size)
+        plan = _plan(pair, ground_of(pair.gamma), length.size)
         found = compiled(plan, width_of(table.shape[0]))(*given)
     else:
         # Rows of padding may hold anything.
@@ -91,5 +91,5 @@ def _traced(plan: Plan, given: Any) -> Float[Array, "ball out"]:
     return run(*given)
 
 
-def _plan(ground: Ground, variants: int) -> Plan:
-    return Plan(ground=ground, deep=True, energies=True, variants=variants)
+def _plan(pair: ImpactPair, ground: Ground, variants: int) -> Plan:
+    return Plan(**walls_of(pair), ground=ground, deep=True, energies=True, variants=variants)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from vijax.batch import advance, chain, lanes, rows, solver_steps
 from vijax.batch.attractor_search import blank_candidate, review
-from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally
+from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally, walls_of
 from vijax.batch.recurrence import MAX_PERIOD, recurrence, settled
 from vijax.batch.summary import Summary, shapes, unload
 from vijax.engine import exact, quick_wall
@@ -21,13 +21,14 @@ from vijax.engine.impact import Arrival, Ball
 from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device, electrical
 from vijax.model.pair import ImpactPair, check_pair
+from vijax.model.sides import Sides
 from vijax.runtime import checks, export_cache, xla
 from vijax.runtime.arrays import AnyArray, present
 from vijax.runtime.context import door
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(Summary))
 ENERGY = frozenset({"P", "P_stderr", "energy_ratio"})
-DEEP = ENERGY | {"deepest"}
+DEEP = ENERGY | {"deepest", "deepest_left", "deepest_right"}
 
 
 class Scale(eqx.Module):
@@ -82,8 +83,13 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
 def entry_shapes(plan: Plan, dtype: Any) -> Entry:
     """Give what a run is told of a cell, as shapes."""
     one: Any = jax.ShapeDtypeStruct((1,), dtype)
-    pair = ImpactPair(one, None if plan.rigid else one, one, one)
-    device = jax.tree.map(lambda _: one, electrical(Harvester())) if plan.devices else None
+    each: Any = Sides(one, one) if plan.unequal else one
+    kappa: Any = None if plan.rigid else each
+    if plan.hard_wall:
+        kappa = Sides(*(None if side == plan.hard_wall else one for side in (-1, 1)))
+    pair = ImpactPair(one, kappa, each, one)
+    device = electrical(Harvester(), unequal=plan.unequal) if plan.devices else None
+    device = jax.tree.map(lambda _: one, device)
     return Entry(pair, length=one, speed=one, u=one, v=one, t=one if plan.chained else None, device=device)
 
 
@@ -214,7 +220,7 @@ def summarise(
     dtype = pair.d.dtype
     plan = Plan(
         until=until,
-        rigid=pair.rigid,
+        **walls_of(pair),
         ground=ground_of(pair.gamma),
         deep=bool(outputs & DEEP),
         energies=bool(outputs & ENERGY),
@@ -245,7 +251,7 @@ def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""]
 
 def blank(count: int, variants: int, dtype: str) -> Summary:
     """Make an empty summary of so many cells: which shape and kind of number each field has."""
-    plan = Plan(deep=True, energies=True, asymmetry=True, variants=variants)
+    plan = Plan(deep=True, energies=True, asymmetry=True, unequal=True, variants=variants)
     like = shapes(plan, np.dtype(dtype))
     return rows.unpack(np.zeros((count, rows.width(like)), dtype), like)
 
@@ -275,7 +281,8 @@ def attractors(
     """
     length: Any = device.length_unit
     speed: Any = device.speed_unit
-    cells = rows.pack(Entry(pair, length, speed, starts.u, starts.v, starts.t, electrical(device)))
+    own = electrical(device, unequal=pair.unequal)
+    cells = rows.pack(Entry(pair, length, speed, starts.u, starts.v, starts.t, own))
     plan = dataclasses.replace(_chained(pair), devices=True)
     number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
     settings = _chained_settings(pair, Harvester(), periods, recorded_periods)
@@ -284,7 +291,7 @@ def attractors(
 
 def _chained(pair: ImpactPair) -> Plan:
     """Make the plan of cells whose ends are wanted."""
-    return Plan(rigid=pair.rigid, ground=ground_of(pair.gamma), deep=True, energies=True, chained=True)
+    return Plan(**walls_of(pair), ground=ground_of(pair.gamma), deep=True, energies=True, chained=True)
 
 
 def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, recorded_periods: int) -> Settings:

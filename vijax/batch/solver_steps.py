@@ -24,7 +24,7 @@ def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane
     whole = ball.n.astype(jnp.int32)
     state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
     carry = jax.vmap(partial(method.start, deep=plan.deep, tangent=plan.tangent))(pair, state)
-    wall = jax.vmap(method.law.wall)(pair)
+    wall = jax.vmap(method.law.walls)(pair)
     _, outcome, _ = jax.eval_shape(jax.vmap(method.step), pair, wall, carry)
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outcome)
     return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)

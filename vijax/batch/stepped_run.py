@@ -57,7 +57,7 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, r
     """Step all lanes together, each until its last period is over and its last contact has ended."""
     periods, max_impacts, chunks = asked
     begun = jax.vmap(begin)(pair, u0, v0, t0)
-    wall = jax.vmap(method.law.wall)(pair)
+    wall = jax.vmap(method.law.walls)(pair)
     carry = jax.vmap(partial(method.start, deep=True, tangent=False))(pair, begun)
     start = _recording(room, carry, u0)
 

@@ -12,6 +12,7 @@ from vijax.batch.cell_end import chaotic, failed, growth, last_period
 from vijax.batch.chain import Handover, hand_over
 from vijax.engine.impact import Ball
 from vijax.model.records import Status
+from vijax.model.sides import Sides, named
 from vijax.runtime.arrays import AnyArray, Values, present
 
 
@@ -22,6 +23,8 @@ class Summary(eqx.Module):
     P_stderr: Float[AnyArray, "cell variant"] | None
     energy_ratio: Float[AnyArray, "cell variant"] | None  # largest E_j/W_j
     deepest: Float[AnyArray, "cell"] | None
+    deepest_left: Float[AnyArray, "cell"] | None  # of the left wall; where the walls may differ
+    deepest_right: Float[AnyArray, "cell"] | None
     fastest: Float[AnyArray, "cell"]
     asymmetry: Float[AnyArray, "cell"] | None  # mean of v_in over the greatest speed
     period: Int[AnyArray, "cell"]
@@ -48,7 +51,8 @@ def shapes(plan: Plan, dtype: Any) -> Any:
     kinds |= dict.fromkeys(("period", "impacts_left", "impacts_right", "status"), whole)
     kinds |= {"handover": Handover(number, number, number, Ball(*[number] * 4), number)}
     asked = dict.fromkeys(energies, plan.energies)
-    asked |= {"deepest": plan.deep, "asymmetry": plan.asymmetry, "lyapunov": plan.tangent, "handover": plan.chained}
+    asked |= {"deepest": plan.deep} | dict.fromkeys(("deepest_left", "deepest_right"), plan.deep and plan.unequal)
+    asked |= {"asymmetry": plan.asymmetry, "lyapunov": plan.tangent, "handover": plan.chained}
     names = Summary.__dataclass_fields__
     fields: dict[str, Any] = {name: kinds.get(name, number) if asked.get(name, True) else None for name in names}
     return Summary(**fields)
@@ -115,19 +119,21 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
         each = jnp.where(still, 0.0, jnp.round(impacts * e.prime / e.span))
         return jnp.where(labelled, each, -1.0).astype(jnp.int32)
 
-    power = error = ratio = deepest = None
+    def depth(greatest):
+        return jnp.where(failed, jnp.nan, jnp.where(e.silent, 0.0, greatest))
+
+    power = error = ratio = None
     if t.harvest is not None:
         power, error = _power(plan, settings, cell, t.harvest, e)
         power, error = jnp.where(failed[:, None], jnp.nan, power), jnp.where(failed[:, None], jnp.nan, error)
         ratio = jnp.where(failed[:, None], jnp.nan, jnp.where(still[:, None], 0.0, t.harvest.ratio))
-    if t.deepest is not None:
-        deepest = jnp.where(failed, jnp.nan, jnp.where(e.silent, 0.0, t.deepest))
+    depths = {"deepest": t.deepest} | named("deepest", t.deepest_sides or Sides(None, None))
     ran = cell.ball.n + 0.5 * cell.ball.t
     return Summary(
         P=power,
         P_stderr=error,
         energy_ratio=ratio,
-        deepest=deepest,
+        **{name: None if x is None else depth(x) for name, x in depths.items()},
         fastest=measured(t.fastest),
         asymmetry=None if t.momentum is None else per(t.momentum, hits * t.fastest),
         period=period.astype(jnp.int32),

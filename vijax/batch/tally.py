@@ -22,6 +22,7 @@ from vijax.batch.cell_end import ended, last_period
 from vijax.batch.chain import note
 from vijax.engine.impact import LaneImpact
 from vijax.model import energy
+from vijax.model.sides import Sides
 from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share
 
@@ -46,8 +47,7 @@ def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     tally = _add(settings, cell, impact, counted, turned, event.stuck)
     if tally.deepest is not None:
         # A contact for ever has a depth although no impact ends it.
-        depth = present(impact.depth)
-        tally = replace(tally, deepest=jnp.where(event.permanent & (depth > tally.deepest), depth, tally.deepest))
+        tally = _deeper(tally, impact, event.permanent & ~jnp.isnan(present(impact.depth)))
     candidate, found = recur(settings, cell, impact, kept, count)
     return replace(
         cell,
@@ -93,11 +93,11 @@ def _add(settings: Settings, cell: Cell, impact: LaneImpact, counted: Mask, turn
     rebound = share(-impact.v_out / jnp.where(impact.v_in == 0, 1.0, impact.v_in))
     speed = jnp.where(counted, jnp.abs(impact.v_in), 0.0)
     harvest = None if old.harvest is None else _harvested(settings, cell, old.harvest, impact, counted, turned)
-    momentum = deepest = None
+    momentum = None
     if old.momentum is not None:
         momentum = old.momentum + jnp.where(counted, impact.v_in, 0.0)
     if old.deepest is not None:
-        deepest = jnp.where(counted, jnp.maximum(old.deepest, present(impact.depth)), old.deepest)
+        old = _deeper(old, impact, counted)
     return Tally(
         left=old.left + left.astype(speed.dtype),
         right=old.right + right.astype(speed.dtype),
@@ -106,10 +106,25 @@ def _add(settings: Settings, cell: Cell, impact: LaneImpact, counted: Mask, turn
         contact=old.contact + jnp.where(counted, impact.duration, 0.0),
         fastest=jnp.maximum(old.fastest, speed),
         momentum=momentum,
-        deepest=deepest,
+        deepest=old.deepest,
+        deepest_sides=old.deepest_sides,
         harvest=harvest,
         stuck=None if old.stuck is None else old.stuck | (counted & stuck),
     )
+
+
+def _deeper(old: Tally, impact: LaneImpact, counted: Mask) -> Tally:
+    """Take the depth of one impact into the greatest so far: of all, and of its wall where the walls may differ."""
+    depth = present(impact.depth)
+
+    def greatest(so_far: Lane, here: Mask) -> Lane:
+        return jnp.where(here, jnp.maximum(so_far, depth), so_far)
+
+    sides = old.deepest_sides
+    if sides is not None:
+        left, right = counted & (impact.side < 0), counted & (impact.side > 0)
+        sides = Sides(greatest(sides.left, left), greatest(sides.right, right))
+    return replace(old, deepest=greatest(present(old.deepest), counted), deepest_sides=sides)
 
 
 def _harvested(
@@ -119,6 +134,7 @@ def _harvested(
     metres = (present(impact.depth) * cell.length)[:, None] * settings.length_variant
     speeds = cell.speed[:, None] * settings.speed_variant
     device = settings.device if cell.device is None else jax.tree.map(lambda x: x[:, None], cell.device)
+    device = device.at(impact.side[:, None])
     got = share(energy.harvested_energy(device, metres))
     given = device.m_b * speeds * speeds * present(impact.work)[:, None]
     wide, ended = counted[:, None], turned[:, None]

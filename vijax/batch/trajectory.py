@@ -26,10 +26,6 @@ _IMPACT, _STATE = 56, 32  # bytes of a record: what a run asks of memory is told
 _TILES = (1, 8, 64, 512, 4096)
 
 
-def _wall(pair: ImpactPair) -> str:
-    return "rigid" if pair.rigid else "soft"
-
-
 def _precision(pair: ImpactPair) -> str:
     return str(jnp.result_type(float, pair.d))
 
@@ -37,7 +33,7 @@ def _precision(pair: ImpactPair) -> str:
 def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any]) -> Method | None:
     """Take the method as it is, or as `choose` makes it of a name, if the pair suits its membrane."""
     if not isinstance(method, Method):
-        method = choose(method, options, wall=_wall(pair), dtype=_precision(pair))
+        method = choose(method, options, wall=pair.walls, dtype=_precision(pair))
     lossy = method is None or method.law.restitution
     if (pair.r is None) == lossy:
         raise ValueError(

@@ -1,6 +1,5 @@
 """What options say: axes and device of the texts they were given, one point of them, parts of a whole."""
 
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -9,6 +8,7 @@ from vijax.cli.options import PHYSICAL
 from vijax.model.quantities import AXES
 
 if TYPE_CHECKING:
+    from vijax.model.choices import Walls
     from vijax.model.device import Harvester
     from vijax.model.pair import ImpactPair
 
@@ -76,10 +76,12 @@ def part(option: str, text: str) -> float:
     return value
 
 
-def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft") -> "tuple[ImpactPair, Harvester]":
+def at_one_point(
+    axes: Mapping[str, Any], device: "Harvester", wall: "Walls" = "soft"
+) -> "tuple[ImpactPair, Harvester]":
     """Find the pair that the axes give, each by one number, and the device that has it."""
-    from vijax.model.device import with_constants, with_pair
-    from vijax.model.pair import WALLS, impact_pair
+    from vijax.model.device import realised
+    from vijax.model.pair import WALLS
     from vijax.planes.axes import cells
     from vijax.runtime import checks
 
@@ -88,7 +90,4 @@ def at_one_point(axes: Mapping[str, Any], device: "Harvester", wall: str = "soft
             raise ValueError(f"{name} must be one number here; got {values.size} of them")
     checks.choice("wall", wall, WALLS)
     given = cells({name: float(values.flat[0]) for name, values in axes.items()}, device, wall).quantities
-    d, kappa, r, gamma, A, omega = (float(given[name]) for name in ("d", "kappa", "r", "gamma", "A", "omega"))
-    device = with_constants(device, A=A, omega=omega, omega0=kappa * omega / math.pi)
-    pair = impact_pair(d, kappa if wall == "soft" else None, r, gamma)
-    return pair, with_pair(device, pair)
+    return realised(device, {name: float(value) for name, value in given.items()}, wall)

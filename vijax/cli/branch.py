@@ -20,6 +20,7 @@ from vijax.model.quantities import AXES, BRANCH_QUANTITIES, PARAMETERS
 from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
+    from vijax.model.choices import Walls
     from vijax.model.device import Harvester
     from vijax.model.pair import ImpactPair
     from vijax.orbits.continuation import Branch
@@ -91,7 +92,7 @@ def branches(
 
 
 def _asked(
-    constants: tuple[str, ...], along: str, impacts: str, guesses: int, max_switches: int, wall: str, **given: Any
+    constants: tuple[str, ...], along: str, impacts: str, guesses: int, max_switches: int, wall: "Walls", **given: Any
 ) -> BranchRequest:
     from vijax.orbits import orbit_search, parameter, switching
     from vijax.runtime import checks

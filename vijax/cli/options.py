@@ -13,7 +13,7 @@ import click
 
 from vijax.cli.kinds import Choice, NewFile
 from vijax.model.choices import Motion, Objective
-from vijax.model.quantities import AXES, Quantity, synonyms
+from vijax.model.quantities import AXES, Quantity, of_both_walls, synonyms
 from vijax.planes.sweep_settings import SweepSettings, choices
 
 VALUES = (
@@ -24,6 +24,7 @@ VALUES = (
 DEVICE = {name for name, axis in AXES.items() if axis.unit}
 # One of these besides d and kappa, and the plane is the device's: what is not given is taken from Tables I and II.
 PHYSICAL = {name for of in ("d", "kappa") for name in synonyms(of) if name in DEVICE}
+PHYSICAL |= {name for name in DEVICE if of_both_walls(name) in PHYSICAL}
 
 MEMBRANES = ("linear", "hunt-crossley")
 OBJECTIVES, MOTIONS = get_args(Objective), get_args(Motion)

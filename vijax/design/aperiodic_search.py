@@ -159,7 +159,7 @@ def _judge(task: Task, place: Place, ensemble: Ensemble) -> None:
     value = some.found.value(task.objective, some.device)
     enough = good.sum() >= max(_FEWEST, 0.5 * good.size) and value.any()
     if enough:
-        surface = fit(some.offsets, value, some.found.margins(some.device), share=task.reliability)
+        surface = fit(some.offsets, value, some.found.margins(), share=task.reliability)
         noise = _SURE * float(surface.value_error + place.surface.value_error) + settings.min_gain
         here = np.zeros_like(place.z)
         enough = surface.worth(here, settings.limit_price) > place.surface.worth(here, settings.limit_price) - noise
@@ -191,7 +191,7 @@ def _windows(
     settings = task.settings
     new: dict[int, Place] = {}
     for place, at, wide, (offsets, found, device) in zip(going, centre, radius, flown, strict=True):
-        good = (found.period > 0) & np.isin(found.status, AVERAGED) & (found.margins(device).min(axis=1) >= 0)
+        good = (found.period > 0) & np.isin(found.status, AVERAGED) & (found.margins().min(axis=1) >= 0)
         if wide <= settings.last_radius or not good.any() or not place.known:
             continue
         value = np.where(good, found.value(task.objective, device), 0.0)

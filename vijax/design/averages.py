@@ -1,5 +1,6 @@
 """Averages of motions that are no orbit to climb from: what each ball gave over all that was flown, and where it is."""
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 from vijax.batch.simulate import Starts
 from vijax.model.device import Harvester
 from vijax.model.label import label
+from vijax.model.sides import named
 
 LIMITS = "penetration limit", "energy given to the membrane"
 _MOST = 20.0  # logarithms of margins end here: no contact, no voltage
@@ -20,6 +22,7 @@ class Averages(NamedTuple):
         P: Energy harvested per half forcing period [J].
         speed: Largest speed into a wall [m/s].
         depth: Largest penetration [m].
+        room: The penetration limit over that; of walls with limits of their own the less of both.
         ratio: Largest ratio of harvested energy to energy given to the membrane.
         lyapunov: Largest Lyapunov exponent per forcing period.
         period, left, right, status: Of the label; see `Summary`.
@@ -30,6 +33,7 @@ class Averages(NamedTuple):
     P: np.ndarray
     speed: np.ndarray
     depth: np.ndarray
+    room: np.ndarray
     ratio: np.ndarray
     lyapunov: np.ndarray
     period: np.ndarray
@@ -54,11 +58,11 @@ class Averages(NamedTuple):
             return self.speed
         return self.P * np.asarray(device.omega) / np.pi if objective == "power" else self.P
 
-    def margins(self, device: Harvester) -> np.ndarray:
+    def margins(self) -> np.ndarray:
         """Compute logarithms [ball, 2] of the room left below the penetration limit and the energy given."""
         with np.errstate(divide="ignore"):
-            room = np.stack([np.log(np.asarray(device.depth_limit) / self.depth), -np.log(self.ratio)], axis=-1)
-        return np.minimum(room, _MOST)
+            left = np.stack([np.log(self.room), -np.log(self.ratio)], axis=-1)
+        return np.minimum(left, _MOST)
 
 
 def averages(device: Harvester, ended: Any) -> Averages:
@@ -69,10 +73,14 @@ def averages(device: Harvester, ended: Any) -> Averages:
         ended: Their `Summary`, of a program whose cells have devices of their own.
     """
     length, speed = np.asarray(device.length_unit), np.asarray(device.speed_unit)
+    limits = named("deepest", device.depth_limit)
+    with np.errstate(divide="ignore"):
+        rooms = [np.asarray(limit) / (getattr(ended, name) * length) for name, limit in limits.items()]
     return Averages(
         P=ended.P[:, 0],
         speed=ended.fastest * speed,
         depth=ended.deepest * length,
+        room=reduce(np.minimum, rooms),
         ratio=ended.energy_ratio[:, 0],
         lyapunov=ended.lyapunov,
         period=ended.period,

@@ -5,7 +5,6 @@ What is fitted to them, and what is made of it, is elsewhere (`response_surface`
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -14,7 +13,7 @@ from vijax.design.averages import Averages, averages
 from vijax.design.design_settings import DesignSettings
 from vijax.design.survey import survey
 from vijax.design.tolerance import Tolerance, drawn
-from vijax.design.variables import LINEAR, cells
+from vijax.design.variables import LINEAR, cells, scattered
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import SETTLED, Status
@@ -115,9 +114,9 @@ def fly(
     device, pair = _cells(given, z.reshape(-1, len(task.tune)), task.tune)
     if task.tolerances:
         names, factors = drawn(task.tolerances, balls)
-        off = {name: getattr(device, name) * np.tile(x, len(owner)) for name, x in zip(names, factors.T, strict=True)}
         # Tuned already: what is left to do is the nondimensional form of what is off.
-        device, pair = _cells(_changed(device, off), np.zeros((each.size, 0)), ())
+        device = scattered(device, names, [np.tile(x, len(owner)) for x in factors.T])
+        device, pair = _cells(device, np.zeros((each.size, 0)), ())
     begun = _anywhere(pair.d, len(owner), balls) if task.expected else _joined([on_motion(x, balls) for x in starts])
     found = averages(device, survey(pair, device, begun, longest=1, periods=periods).ended)
     whole = Ensemble((z - centre[:, None]).reshape(-1, len(task.tune)), found, device)
@@ -128,11 +127,6 @@ def _cells(device: Harvester, z: np.ndarray, names: tuple[str, ...]) -> tuple[Ha
     """Make devices with tuned quantities, and their pairs, as NumPy's arrays."""
     found = tiles.map_tiles(lambda rows: cells(rows[0], rows[1], names), (device, z), _TILES)
     return jax.tree.map(np.asarray, found)
-
-
-def _changed(device: Harvester, constants: dict[str, np.ndarray]) -> Harvester:
-    """Put arrays in the place of some constants; not by `replace`, which would check every one of them."""
-    return eqx.tree_at(lambda one: [getattr(one, name) for name in constants], device, list(constants.values()))
 
 
 def pairs(balls: int, size: int) -> np.ndarray:

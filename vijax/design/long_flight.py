@@ -177,7 +177,7 @@ def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble, proves: b
     shares = Counter(found.labels().tolist())
     if not task.expected and (len(shares) > 1 or not np.isin(found.status, AVERAGED).all()):
         return None
-    room = room_left(found.margins(device), task.reliability, proves=proves)
+    room = room_left(found.margins(), task.reliability, proves=proves)
     given = found.value(task.objective, device)
     own = jax.tree.map(float, tuned(task.devices[place.owner], task.tune, z))
     low, high = task.box[place.owner]
@@ -194,7 +194,7 @@ def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble, proves: b
         max_penetration=float(found.depth.max()),
         energy_ratio=float(found.ratio.max()),
         lyapunov=float(np.nanmean(found.lyapunov)) if np.isfinite(found.lyapunov).any() else float("nan"),
-        admissible=float((found.margins(device).min(axis=1) >= 0).mean()),
+        admissible=float((found.margins().min(axis=1) >= 0).mean()),
         shares={name: count / found.P.size for name, count in shares.most_common()},
         gradient=dict(zip(task.tune, place.surface.gradient.tolist(), strict=True)),
         gradient_stderr=dict(zip(task.tune, place.surface.gradient_error.tolist(), strict=True)),

@@ -174,7 +174,7 @@ def _looked(scene: "_Scene", met: Met, unrest: Met, seen: "_Seen") -> list[Looke
     """Sum up what was met of every device, by the closer survey too."""
     power = np.where(unrest.hope.lacks < 0, 0.0, np.nan_to_num(unrest.found.P))
     owner = np.concatenate([met.owner, unrest.owner])
-    every_room = np.concatenate([one.found.margins(one.device) for one in (met, unrest)])
+    every_room = np.concatenate([one.found.margins() for one in (met, unrest)])
     every_status = seen.found.ended.status
 
     def told(one: int) -> Looked:
@@ -355,7 +355,7 @@ def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) 
 def _impacts(met: Met) -> tuple[np.ndarray, np.ndarray]:
     """Count left and right impacts of orbits; in a level tube the more and the fewer."""
     left, right = met.ended.impacts_left, met.ended.impacts_right
-    swap = (met.pair.gamma == 0) & (right > left)
+    swap = met.pair.symmetric & (right > left)
     return np.where(swap, right, left), np.where(swap, left, right)
 
 

@@ -14,6 +14,7 @@ from vijax.design.ascent import Look
 from vijax.model.choices import Objective
 from vijax.model.device import Harvester
 from vijax.model.records import Status
+from vijax.model.sides import at
 from vijax.orbits import shooting, steady
 from vijax.orbits.shooting import Sequence
 from vijax.runtime.programs import jitted
@@ -54,9 +55,7 @@ class Scene(eqx.Module):
 
     def device(self, device: Harvester, z, factors) -> Harvester:
         """Make the device with tuned quantities and scattered constants."""
-        tuned = variables.tuned(device, self.names, z)
-        off = {name: getattr(tuned, name) * x for name, x in zip(self.scattered, factors, strict=True)}
-        return eqx.tree_at(lambda d: [getattr(d, n) for n in off], tuned, list(off.values())) if off else tuned
+        return variables.scattered(variables.tuned(device, self.names, z), self.scattered, factors)
 
 
 class _SeenOrbit(NamedTuple):
@@ -73,7 +72,7 @@ def _measure(scene: Scene, device: Harvester, sequence: Sequence, factors, knots
     there = steady.response(own, own.pair(), sequence, knots, residual)
     value = {"power": there.power, "speed": there.speed}.get(scene.objective, there.P)
     real, one = sequence.real, jnp.ones_like(there.depth)
-    deep = jnp.log(own.depth_limit / jnp.where(real, there.depth, one))
+    deep = jnp.log(at(own.depth_limit, sequence.side) / jnp.where(real, there.depth, one))
     rich = jnp.log(jnp.where(real, there.work, one) / jnp.where(real, there.energy, one))
     margins = jnp.concatenate([jnp.where(real, x, _MOST) for x in (deep, rich)])
     seen = _SeenOrbit(jnp.log(value), jnp.minimum(margins, _MOST), there.knots)

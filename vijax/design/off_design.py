@@ -128,7 +128,7 @@ def _go_on(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...], going: l
     none = np.zeros(len(going))
     flown = fly(_task(optimum, "P"), none.astype(int), z, none, [way.starts for way in going], _PERIODS, 1)
     for way, off, one in zip(going, ahead, flown, strict=True):
-        P, kept = float(one.found.P[0]), bool(one.found.margins(one.device).min() >= 0)
+        P, kept = float(one.found.P[0]), bool(one.found.margins().min() >= 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             # Beyond a fold another orbit may have the label; its P is another one.
             smooth = abs(np.log(P / way.P)) < _STEEPEST * (off - way.off) + _LEAST_JUMP
@@ -198,7 +198,7 @@ def scattered(
 def _spread(one: Ensemble) -> Spread:
     """Sum up what the devices of an ensemble give."""
     alive = np.isin(one.found.status, AVERAGED) & (one.found.P > 0)
-    kept = alive & (one.found.margins(one.device).min(axis=1) >= 0)
+    kept = alive & (one.found.margins().min(axis=1) >= 0)
     P = np.where(alive, np.nan_to_num(one.found.P), 0.0)
     return Spread(
         mean=float(np.where(kept, P, 0.0).mean()),

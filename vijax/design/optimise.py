@@ -26,6 +26,7 @@ from vijax.design.tolerance import Nodes, Spread, Tolerance, check_samples, chec
 from vijax.design.variables import NAMES, check_names, limits, values, variables
 from vijax.model.choices import Motion, Objective
 from vijax.model.device import Harvester, one_device
+from vijax.model.sides import named
 from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
 from vijax.runtime import checks
@@ -305,7 +306,7 @@ def check(
         raise ValueError("devices must hold at least one; got none")
     checks.choice("objective", objective, OBJECTIVES)
     for device in devices:
-        if not float(one_device(device).V):
+        if not any(map(float, named("V", one_device(device).V).values())):
             raise ValueError("V must not be zero for a design to harvest; got 0")
     over = objective in OVER_TOLERANCES
     if over != bool(tolerances) and objective != "expected":

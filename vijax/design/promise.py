@@ -27,7 +27,7 @@ def promise(found: Averages, device: Harvester, objective: str) -> Promise:
     """Judge motions in devices of their own: what they gave, and what they lacked."""
     with np.errstate(divide="ignore"):
         value = np.log(np.nan_to_num(found.value(objective, device)))
-    return Promise(value, np.nanmin(found.margins(device), axis=1, initial=0.0))
+    return Promise(value, np.nanmin(found.margins(), axis=1, initial=0.0))
 
 
 class Met(NamedTuple):

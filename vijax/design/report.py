@@ -12,9 +12,11 @@ from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.robustness import Surroundings
 from vijax.design.tolerance import Spread, Tolerance
 from vijax.design.tolerance_plane import TolerancePlane
-from vijax.design.variables import LINEAR, constant, value_of
+from vijax.design.variables import LINEAR, constant
 from vijax.model.device import CONSTANTS
 from vijax.model.energy import energy_ratio
+from vijax.model.pair import quantities
+from vijax.model.sides import named
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -87,18 +89,16 @@ def optimum(one: Optimum | AperiodicOptimum) -> dict[str, Any]:
     """
     checks.instance("one", one, AnyOptimum, "vijax.optimise(...).best")
     device = one.device
-    kappa = float(value_of(device, "kappa"))
     common = {
         "values": one.values,
         "label": one.label,
         "height": one.height,
         "P": one.P,
         "P_stderr": one.P_stderr,
-        "omega0": float(device.omega0),
-        "pair": {"d": float(value_of(device, "d")), "kappa": kappa, "r": float(device.r)}
-        | {"gamma": float(value_of(device, "gamma"))},
-        "device": {name: float(getattr(device, name)) for name in CONSTANTS},
-        "penetration_limit": float(device.depth_limit),
+        **_numbers("omega0", device.omega0),
+        "pair": {name: float(value) for name, value in quantities(device.pair()).items()},
+        "device": {key: x for name in CONSTANTS for key, x in _numbers(name, getattr(device, name)).items()},
+        **_numbers("penetration_limit", device.depth_limit),
         "gradient": one.gradient,
         "active": list(one.active),
         "stopped": one.stopped,
@@ -106,6 +106,11 @@ def optimum(one: Optimum | AperiodicOptimum) -> dict[str, Any]:
         "heights": one.heights,
     }
     return common | (_averaged(one) if isinstance(one, AperiodicOptimum) else _orbit(one))
+
+
+def _numbers(name: str, value: Any) -> dict[str, float]:
+    """Put a constant under its name, or what each wall has of it under names of their own."""
+    return {argument: float(one) for argument, one in named(name, value).items()}
 
 
 def _averaged(one: AperiodicOptimum) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from vijax.design.optimise import Design
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum, states
 from vijax.design.variables import tuned, values, variables
 from vijax.model.device import Harvester
+from vijax.model.pair import quantities
 from vijax.model.records import Status
 from vijax.orbits import continuation, orbit_properties, periodic
 from vijax.orbits.continuation import Direction
@@ -57,8 +58,9 @@ class Surroundings(NamedTuple):
     Attributes:
         share: Part of all starts that its motion (and the mirror image) attracts.
         attractors: All that were met there, its own among them, the largest share first.
-        below, above: Along omega0, all else of the device as it is; None of a motion that is no orbit, which has no
-            bifurcations of its own (`off_design.extents` says how far it lasts).
+        below, above: Along omega0, all else of the device as it is; None where the walls differ, whose frequencies are
+            two (`design_plane` shows their plane), and of a motion that is no orbit, which has no bifurcations of its
+            own (`off_design.extents` says how far it lasts).
     """
 
     share: float
@@ -91,6 +93,8 @@ def surroundings(
     # Several attractors may have the design's label; by its P its own is known among them.
     own = float(orbit_properties.power(optimum.orbit, optimum.device)[0])
     share = sum(one.share for one in attractors if math.isclose(one.P, own, rel_tol=_SAME))
+    if optimum.device.unequal:
+        return Surroundings(share, attractors, None, None)
     return Surroundings(share, attractors, _edge(optimum, "down", reach), _edge(optimum, "up", reach))
 
 
@@ -100,19 +104,19 @@ def _checked(reach: Any) -> float:
 
 def _attractors(device: Harvester, starts: int, seed: int | None) -> tuple[Neighbour, ...]:
     """Find what attracts the balls of a device, mirror images as one, the largest share first."""
-    d, kappa, r, gamma = (float(x) for x in jax.tree.leaves(device.pair()))
-    found = basin_fractions(
-        d=d, kappa=kappa, r=r, gamma=gamma, starts=starts, seed=seed, device=device, merge_mirrors=gamma == 0
-    )
+    pair = device.pair()
+    named: Any = {name: float(value) for name, value in quantities(pair).items()}
+    mirrors = bool(pair.symmetric)
+    found = basin_fractions(**named, starts=starts, seed=seed, device=device, merge_mirrors=mirrors)
     columns = [found[name].values.ravel() for name in ("label", "P", "fraction", "admissible")]
     rows = [Neighbour(str(a), float(b), float(c), bool(e)) for a, b, c, e in zip(*columns, strict=True) if c > 0]
     return tuple(sorted(rows, key=lambda one: -one.share))
 
 
 def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
-    device = optimum.device
+    omega0: Any = optimum.device.omega0  # of both walls
     # Of all that the motion depends on, omega0 changes kappa alone.
-    kappa = float(device.omega0) * math.pi / float(device.omega)
+    kappa = float(omega0) * math.pi / float(optimum.device.omega)
     within = ((1 - reach) * kappa, (1 + reach) * kappa)
     # What comes first is all that is asked, a graze too.
     settings = ContinuationSettings(max_grazings=0)
@@ -123,7 +127,7 @@ def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
         kind, at = "none", within[way == "up"]
     else:
         kind, at = followed.ends[1], float(followed.values[-1])
-    return Edge(kind, float(device.omega0) * at / kappa, 100 * (at / kappa - 1))
+    return Edge(kind, float(omega0) * at / kappa, 100 * (at / kappa - 1))
 
 
 @door

@@ -144,7 +144,7 @@ def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, pe
 def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
     """Find the cells that met an attractor of their pair first; by impacts, greatest speed and depth."""
     left, right = ended.impacts_left, ended.impacts_right
-    swap = (pair.gamma == 0) & (right > left)
+    swap = pair.symmetric & (right > left)
     measures = [np.round(np.log(x) / _SAME) for x in (ended.fastest, ended.deepest)]
     counts = ended.period, np.where(swap, right, left), np.where(swap, left, right)
     _, first = np.unique(np.column_stack([*jax.tree.leaves(pair), *counts, *measures]), axis=0, return_index=True)

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vijax.model.device import CONSTANTS
+from vijax.model.device import CONSTANTS, WALLS_OWN
+from vijax.model.quantities import SIDES
 from vijax.runtime import checks
 
 _MOST_SAMPLES = 10**5  # random devices: at 1/sqrt(10**5) noise is 0.3 % of the scatter
@@ -15,13 +16,14 @@ _NODES = {1: 17, 2: 9, 3: 5}  # how many nodes a constant has, by the number of 
 
 # beta, often zero, has no relative tolerance.
 SCATTERED = tuple(name for name in CONSTANTS if name != "beta")
+SCATTERED += tuple(f"{name}_{side}" for name in WALLS_OWN for side in SIDES)
 
 
 class Tolerance(NamedTuple):
     """How a constant of the device scatters about its nominal value.
 
     Attributes:
-        name: A field of `Harvester`.
+        name: A field of `Harvester`, or of one wall alone, as omega0_left.
         spread: Relative: half width of a uniform distribution, standard deviation of the logarithm of a log-normal one.
         kind: "uniform" or "lognormal".
     """

@@ -1,7 +1,7 @@
 """What of a device is tuned: quantities by name, the variables that an optimiser sees, and their bounds."""
 
-import dataclasses
 import math
+import operator
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vijax.model import units
-from vijax.model.device import CONSTANTS, Harvester
+from vijax.model.device import CONSTANTS, Harvester, changed, constant_of
 from vijax.model.pair import ImpactPair
-from vijax.model.quantities import PARAMETERS, check
+from vijax.model.quantities import PARAMETERS, SIDES, check, of_both_walls
+from vijax.model.sides import Sides, apart, each
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.programs import jitted
@@ -27,7 +28,8 @@ LINEAR = ("beta", "gamma")  # may be zero or negative: their variable is the val
 _LEAST_KAPPA, _MOST_KAPPA = 2.0, 400.0
 _LEAST_R, _MOST_R = 0.05, 0.95
 _TILT = 0.1
-NAMES = CONSTANTS + tuple(_ALIASES)
+_OF_ONE_WALL = tuple(name for name in PARAMETERS if of_both_walls(name) and name not in _ALIASES)
+NAMES = CONSTANTS + _OF_ONE_WALL + tuple(_ALIASES)
 
 
 def constant(name: str) -> str:
@@ -57,7 +59,7 @@ def variables(names: tuple[str, ...], x: Any) -> np.ndarray:
 def tuned(device: Harvester, names: tuple[str, ...], z: Any) -> Harvester:
     """Make the device with the quantities that the variables say."""
     given = dict(zip(names, values(names, z), strict=True))
-    device = dataclasses.replace(device, **{name: x for name, x in given.items() if name not in _ALIASES})
+    device = changed(device, {name: x for name, x in given.items() if name not in _ALIASES})
     for name in _ALIASES:
         if name in given:
             device = _decided(device, name, given[name])
@@ -73,22 +75,31 @@ def cells(devices: Harvester, z: Float[Array, "cell variable"], names: tuple[str
 
 def _decided(device: Harvester, name: str, x: Any) -> Harvester:
     """Make the device in which a quantity that is no constant has the given value."""
+    whole = of_both_walls(name) or name
     value = {
         "k": lambda: jnp.sqrt(x / device.m_b),
         "kappa": lambda: x * device.omega / math.pi,
         "d": lambda: x * device.length_unit,
         "gamma": lambda: jnp.arcsin(x * device.A / device.g),
-    }[name]()
-    return dataclasses.replace(device, **{_ALIASES[name]: value})
+    }[whole]()
+    return changed(device, {_ALIASES[name]: value})
+
+
+def scattered(device: Harvester, names: tuple[str, ...], factors: Any) -> Harvester:
+    """Make the device in which some constants are off by factors; those of both walls, or of one."""
+    for name, factor in zip(names, factors, strict=True):
+        off = each(partial(operator.mul, factor), constant_of(device, name))
+        device = changed(device, {name: off}, checked=False)
+    return device
 
 
 def value_of(device: Harvester, name: str) -> Any:
     """Find the quantity's value in a device."""
-    if name not in _ALIASES:
-        return getattr(device, name)
-    if name == "k":
-        return device.k
-    return getattr(device.pair(), name)
+    whole = of_both_walls(name) or name
+    if name not in _ALIASES or whole == "k":
+        return constant_of(device, name)
+    field = getattr(device.pair(), whole)
+    return field if whole == name else getattr(apart(field), name.removeprefix(f"{whole}_"))
 
 
 def check_names(names: tuple[str, ...]) -> None:
@@ -97,7 +108,7 @@ def check_names(names: tuple[str, ...]) -> None:
         raise ValueError("tune must name at least one quantity; got none; omega0 is the membrane's")
     for name in names:
         checks.choice("tune", name, NAMES)
-        rivals = [one for one in names if constant(one) == constant(name)]
+        rivals = [one for one in names if constant(one) in (constant(name), of_both_walls(constant(name)))]
         if len(rivals) > 1:
             raise ValueError(f"tune must name a quantity once; got {' and '.join(rivals)}")
 
@@ -135,6 +146,9 @@ def _checked(name: str, bounds: tuple[float, float], device: Harvester) -> tuple
 def _default(name: str, device: Harvester) -> tuple[float, float]:
     kappa = np.array([_LEAST_KAPPA, _MOST_KAPPA])
     omega0 = kappa * float(device.omega) / math.pi
+    if isinstance(now := value_of(device, name), Sides):
+        told = " and ".join(f"{name}_{side}" for side in SIDES)
+        raise ValueError(f"tune must name {told}, each or both, where walls differ; got {name}")
     known: dict[str, Any] = {
         "kappa": kappa,
         "omega0": omega0,
@@ -143,6 +157,5 @@ def _default(name: str, device: Harvester) -> tuple[float, float]:
         "beta": (-_TILT, _TILT),
         "gamma": np.array([-1, 1]) * math.sin(_TILT) * float(device.g) / float(device.A),
     }
-    now = float(value_of(device, name))
-    low, high = known.get(name, (0.5 * now, 2 * now))
+    low, high = known.get(of_both_walls(name) or name, (0.5 * float(now), 2 * float(now)))
     return float(low), float(high)

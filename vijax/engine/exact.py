@@ -153,17 +153,21 @@ def step(
     flight, side, v_in, reached = _onset(pair, state, horizon, wanted)
     t, periods = flow.wrap_phase(state.t + flight)
     meets = reached | held
-    if pair.rigid:
-        out, stuck, stay = _rigid_contact(pair, side, t, side * v_in, held)
-        depth = side * v_in * energy.rigid_penetration(pair.r)
-        work = energy.membrane_work_rigid(v_in, pair.r)
-    else:
+
+    def rigid(wall: ImpactPair) -> tuple[Any, ...]:
+        out, stuck, stay = _rigid_contact(wall, side, t, side * v_in, held)
+        depth = side * v_in * energy.rigid_depth(wall)
+        return stay, out, depth, energy.membrane_work_rigid(v_in, wall.r), stuck
+
+    def soft(wall: ImpactPair) -> tuple[Any, ...]:
         w0 = jnp.where(held, side * state.u - 0.5 * pair.d, 0.0)
-        wall = flow.membrane(pair, rolled=rolled)
-        stay, out, depth = _soft_contact(pair, wall, side, t, w0, side * v_in, meets, deep, patience)
-        stuck = jnp.zeros_like(held)
+        given = wall, flow.membrane(wall, rolled=rolled), side, t, w0, side * v_in
+        stay, out, depth = _soft_contact(*given, meets & ~pair.hard(side), deep, patience)
         ended = jnp.where(jnp.isfinite(stay), stay, 1.0)
-        work = energy.membrane_work(pair.kappa, pair.mu, pair.gamma, side, t, ended, v_in, -side * out)
+        work = energy.membrane_work(wall.kappa, wall.mu, pair.gamma, side, t, ended, v_in, -side * out)
+        return stay, out, depth, work, jnp.zeros_like(held)
+
+    stay, out, depth, work, stuck = pair.met(side, rigid, soft)
     permanent = meets & jnp.isinf(stay)
     ends = meets & ~permanent
     n = state.n + periods.astype(state.n.dtype)
@@ -190,8 +194,8 @@ def start_mode(pair: ImpactPair, u: Values, v: Values, t: Values) -> Values:
     gap = 0.5 * pair.d - side * u
     pressed = spell_after(flow.contact_force(pair.gamma, side, t), jnp.zeros_like(t)).positive
     resting = (gap == 0) & (v == 0) & pressed
-    held = resting if pair.rigid else (gap < 0) | resting | ((gap == 0) & (side * v > 0))
-    return jnp.where(held, side, 0.0)
+    entered = (gap < 0) | ((gap == 0) & (side * v > 0))
+    return jnp.where(resting | (entered & ~pair.hard(side)), side, 0.0)
 
 
 def tangent(pair: ImpactPair, outcome: Outcome) -> Float[Array, "2 2"]:
@@ -199,10 +203,13 @@ def tangent(pair: ImpactPair, outcome: Outcome) -> Float[Array, "2 2"]:
 
     A stuck ball forgets how it came: the zero matrix.
     """
-    if pair.rigid:
+
+    def rigid(wall: ImpactPair) -> Float[Array, "2 2"]:
         push = flow.acceleration(pair.gamma, outcome.impact.t)
-        contact = flow.rigid_matrix(pair.r, push, outcome.impact.v_in)
-        contact = jnp.where(outcome.stuck, 0.0, contact)
-    else:
-        contact = flow.contact_matrix(flow.membrane(pair), outcome.stay)
+        return jnp.where(outcome.stuck, 0.0, flow.rigid_matrix(wall.r, push, outcome.impact.v_in))
+
+    def soft(wall: ImpactPair) -> Float[Array, "2 2"]:
+        return flow.contact_matrix(flow.membrane(wall), outcome.stay)
+
+    contact = pair.met(outcome.state.u, rigid, soft)  # the ball has just left the wall
     return contact @ flow.flight_matrix(outcome.flight)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from vijax.model.membrane import Linear, MembraneLaw, Wall
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
+from vijax.model.sides import Sides
 from vijax.runtime.arrays import Flag, Scalar
 
 # A method that chooses its steps and takes more of them per impact and period is stopped.
@@ -111,12 +112,14 @@ class Method(eqx.Module, Generic[C]):
         """
 
     @abstractmethod
-    def step(self, pair: ImpactPair, wall: Wall, carry: C, *, recorded: bool = False) -> tuple[C, ImpactOutcome, Flag]:
+    def step(
+        self, pair: ImpactPair, walls: Wall | Sides, carry: C, *, recorded: bool = False
+    ) -> tuple[C, ImpactOutcome, Flag]:
         """Try one step.
 
         Args:
             pair: One cell (scalars).
-            wall: Its membrane, (w, w') -> acceleration.
+            walls: Its membrane, (w, w') -> acceleration; one for each wall where they differ.
             carry: From `start` or an earlier step.
             recorded: For trajectories: a step ends at phase 0, and can be differentiated in reverse.
 

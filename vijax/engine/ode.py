@@ -6,6 +6,7 @@ w = side u - d/2; `mode` says which, and no sign of a rounded number is asked. W
 state, `ode_events` says. This is the only file that imports diffrax.
 """
 
+from functools import reduce
 from typing import Any
 
 import diffrax
@@ -22,6 +23,7 @@ from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair, Real
 from vijax.model.records import Impact, State
+from vijax.model.sides import Sides, at, named
 from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 
@@ -104,7 +106,8 @@ class Ode(Method[OdeCarry]):
         held = state.mode != 0
         x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
         if self.dt is None:
-            first, inside = zero + _FIRST_STEP, jnp.minimum(_FIRST_STEP, 0.1 / pair._soft_kappa())
+            stiffest = reduce(jnp.maximum, named("kappa", pair._soft_kappa()).values())
+            first, inside = zero + _FIRST_STEP, jnp.minimum(_FIRST_STEP, 0.1 / stiffest)
         else:
             first = inside = zero + self.dt
         no = jnp.zeros_like(held)
@@ -135,10 +138,12 @@ class Ode(Method[OdeCarry]):
         )
 
     def step(
-        self, pair: ImpactPair, wall: Wall, m: OdeCarry, *, recorded: bool = False
+        self, pair: ImpactPair, walls: Wall | Sides, m: OdeCarry, *, recorded: bool = False
     ) -> tuple[OdeCarry, ImpactOutcome, Flag]:
         """Try one step of the solver; one that vanishes beside the time, or is not finite, makes an impact of NaN."""
         half, held = 0.5 * pair.d, m.mode != 0
+        side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
+        wall = at(walls, side)
         trial = _try(self, _solver(self, recorded), m, FieldArguments(pair.gamma, m.mode, wall), recorded)
         landing = land(m, half, trial)
         sight = look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
@@ -149,7 +154,6 @@ class Ode(Method[OdeCarry]):
         # and has met it is taken as it is: what its dense output shows there is that same event.
         seen = trial.passes & sight.seen & ~shut & ~landing.crest
         seen, moved = decided((seen, trial.passes & ~seen))
-        side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
         y = meet(m, half, side, wall, trial, landing)
         t = trial.t + landing.delay
         # The phase stays within one period: a time that only grew would lose digits as it does.

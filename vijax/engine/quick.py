@@ -14,8 +14,10 @@ from vijax.engine.impact import Arrival, Ball, Lane, LaneImpact
 from vijax.engine.quick_contact import touch
 from vijax.engine.quick_flight import Flight, fly
 from vijax.engine.quick_inclined_flight import fly as fly_inclined
-from vijax.engine.quick_wall import RigidWall, SoftWall, Wall
+from vijax.engine.quick_wall import RigidWall, SoftWall, TwoWalls, Wall
 from vijax.model import energy
+from vijax.model.sides import apart, at
+from vijax.runtime.arrays import choose
 
 
 def through(contact: tuple[Lane, ...], elapsed: Lane) -> tuple[Lane, Lane, Lane, Lane]:
@@ -87,24 +89,33 @@ def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: L
     return _Exit(duration, out, leave - 2 * passed, onset.n + passed, depth, work, contact, sure)
 
 
-def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tangent: bool = False) -> Quick:
+def quick_step(walls: TwoWalls, gamma: Lane, lane: Ball, *, deep: bool = False, tangent: bool = False) -> Quick:
     """Take every lane one impact on by the regular path.
 
     Args:
-        wall: Made for ground that gamma fits.
+        walls: Made for ground that gamma fits.
         deep: Also find the greatest depth and the work given to the membrane.
         tangent: Also give the tangent map of the step, flight and saltations included.
     """
-    flight = fly(wall.half, lane) if wall.incline is None else fly_inclined(wall.half, wall.incline, lane)
+    both = apart(walls)
+    room = both.left
+    flight = fly(room.half, lane) if room.incline is None else fly_inclined(room.half, room.incline, lane)
     side = flight.flip * flight.wall
     arrival = Arrival(flight.elapsed, flight.speed, side, flight.sure & ~flight.never)
     meets = lane.t + flight.elapsed
     passed = jnp.floor(0.5 * meets)
     onset = _Onset(meets - 2 * passed, lane.n + passed, side, v_in=side * flight.speed)
-    if isinstance(wall, RigidWall):
-        leaves = _rebound(wall, flight, onset, deep)
+
+    def leave(wall: Wall) -> _Exit:
+        if isinstance(wall, RigidWall):
+            return _rebound(wall, flight, onset, deep)
+        return _release(wall, flight, onset, deep, gamma)
+
+    if type(both.left) is type(both.right):
+        leaves = leave(at(walls, side))
     else:
-        leaves = _release(wall, flight, onset, deep, gamma)
+        # One of each kind: what both do is computed, and every lane takes that of its wall.
+        leaves = choose(side > 0, leave(both.right), leave(both.left))
     impact = LaneImpact(
         onset.t,
         onset.n,
@@ -113,7 +124,7 @@ def quick_step(wall: Wall, gamma: Lane, lane: Ball, *, deep: bool = False, tange
         v_out=-side * leaves.speed,
         flight=flight.elapsed,
         duration=leaves.duration,
-        after=Ball(side * wall.half, -side * leaves.speed, leaves.t, leaves.n),
+        after=Ball(side * room.half, -side * leaves.speed, leaves.t, leaves.n),
         depth=leaves.depth,
         work=leaves.work,
         tangent=through(leaves.contact, flight.elapsed) if tangent else None,

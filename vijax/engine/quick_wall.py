@@ -1,4 +1,4 @@
-"""Walls as the quick step needs them: constants of a cell that no impact changes, with bounds of its certificates.
+"""TwoWalls as the quick step needs them: constants of a cell that no impact changes, with bounds of its certificates.
 
 `RigidWall` or `SoftWall`: which of them a program has is known when it is traced.
 """
@@ -13,6 +13,7 @@ from vijax.engine.quick_inclined_flight import Incline, incline
 from vijax.model import energy
 from vijax.model.flow import PI, Membrane, membrane
 from vijax.model.pair import ImpactPair
+from vijax.model.sides import Sides
 from vijax.runtime.arrays import AnyArray
 
 DOUBT = 1e-3  # A sign or a bound that is closer is not trusted to single precision.
@@ -69,14 +70,23 @@ class SoftWall(eqx.Module):
 
 
 Wall = RigidWall | SoftWall
+TwoWalls = Wall | Sides
+"""Of walls that differ one each: what no wall changes, `half` and `incline`, is the same in both."""
 
 
-def prepare(pair: ImpactPair, *, ground: Ground = Ground.LEVEL) -> Wall:
+def prepare(pair: ImpactPair, *, ground: Ground = Ground.LEVEL) -> TwoWalls:
     """Compute the constants of the quick step for every cell."""
+    if pair.unequal:
+        return Sides(*(_prepare(pair.at(side), pair.rigid or pair.hard_wall == side, ground) for side in (-1, 1)))
+    return _prepare(pair, pair.rigid, ground)
+
+
+def _prepare(pair: ImpactPair, rigid: bool, ground: Ground) -> Wall:
+    """Compute the constants of walls that are both alike."""
     level = ground is Ground.LEVEL
     slope = None if level else incline(pair.gamma)
-    if pair.rigid:
-        return RigidWall(0.5 * pair.d, pair.r, chi=energy.rigid_penetration(pair.r), incline=slope)
+    if rigid:
+        return RigidWall(0.5 * pair.d, pair.r, chi=energy.rigid_depth(pair), incline=slope)
     wall = membrane(pair)
     kappa, zeta, omega1 = wall.kappa, wall.zeta, wall.omega1
     square = kappa * kappa

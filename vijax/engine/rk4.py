@@ -25,6 +25,7 @@ from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, Real
 from vijax.model.records import Impact, State
+from vijax.model.sides import Sides, at
 from vijax.runtime.arrays import Scalar
 from vijax.runtime.xla import share
 
@@ -96,15 +97,15 @@ class Rk4(Method[Rk4Carry]):
         )
 
     def step(
-        self, pair: ImpactPair, wall: Wall, m: Rk4Carry, *, recorded: bool = False
+        self, pair: ImpactPair, walls: Wall | Sides, m: Rk4Carry, *, recorded: bool = False
     ) -> tuple[Rk4Carry, ImpactOutcome, Bool[Array, ""]]:
         """Take one step, and see what its sample shows; one at phase 0 and derivatives in reverse cost nothing."""
         h = 2 / self.steps
-        new = _moved(self.steps, pair, wall, m)
+        new = _moved(self.steps, pair, walls, m)
         w = jnp.abs(new.u) - 0.5 * pair.d
         mode = decided(jnp.where(w >= 0, jnp.where(new.u < 0, -1, 1), 0).astype(m.mode.dtype))
         leaves, onset = (m.mode != 0) & (mode != m.mode), (mode != 0) & (mode != m.mode)
-        power = _power(pair, wall, m.u, m.v) + _power(pair, wall, new.u, new.v)
+        power = _power(pair, walls, m.u, m.v) + _power(pair, walls, new.u, new.v)
         work = jnp.where(onset, 0.0, m.work + 0.5 * h * power)
         t = m.offset + new.k * h
         outcome = _outcome(replace(new, mode=mode, work=work), m.mode, t)
@@ -133,10 +134,10 @@ class Rk4(Method[Rk4Carry]):
         return State(m.u, m.v, m.offset + m.k * (2 / self.steps), m.n, m.mode)
 
 
-def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Rk4Carry) -> Rk4Carry:
+def _moved(steps: Real, pair: ImpactPair, walls: Wall | Sides, m: Rk4Carry) -> Rk4Carry:
     """Compute the next sample and the tangent map up to it; what the contact has seen is still that of the last one."""
     h = 2 / steps
-    move = partial(_runge_kutta, pair, wall, m.offset + m.k * h, h)
+    move = partial(_runge_kutta, pair, walls, m.offset + m.k * h, h)
     u, v = share(move(m.u, m.v))
     tangent = None
     if m.tangent is not None:
@@ -150,13 +151,15 @@ def _moved(steps: Real, pair: ImpactPair, wall: Wall, m: Rk4Carry) -> Rk4Carry:
     return replace(m, u=u, v=v, k=k, n=n, tangent=tangent)
 
 
-def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Real, u: Scalar, v: Scalar) -> tuple[Scalar, Scalar]:
+def _runge_kutta(
+    pair: ImpactPair, walls: Wall | Sides, t: Scalar, h: Real, u: Scalar, v: Scalar
+) -> tuple[Scalar, Scalar]:
     """Take one classical step; every stage is in contact if it lies beyond the wall."""
 
     def push(forcing, u, v):
         side = jnp.where(u < 0, -1.0, 1.0)
         w = side * u - 0.5 * pair.d
-        return share(v), share(forcing + jnp.where(w >= 0, side * wall(w, side * v), 0.0))
+        return share(v), share(forcing + jnp.where(w >= 0, side * at(walls, side)(w, side * v), 0.0))
 
     middle = 0.5 * h
     first, second, last = share(tuple(jnp.cos(PI * (t + s)) - pair.gamma for s in (0.0, middle, h)))
@@ -167,11 +170,11 @@ def _runge_kutta(pair: ImpactPair, wall: Wall, t: Scalar, h: Real, u: Scalar, v:
     return u + h / 6 * (u1 + 2 * (u2 + u3) + u4), v + h / 6 * (v1 + 2 * (v2 + v3) + v4)
 
 
-def _power(pair: ImpactPair, wall: Wall, u: Scalar, v: Scalar) -> Scalar:
+def _power(pair: ImpactPair, walls: Wall | Sides, u: Scalar, v: Scalar) -> Scalar:
     """Compute the power into the membrane at a sample inside; 0 at one outside."""
     along = jnp.where(u < 0, -v, v)
     depth = jnp.abs(u) - 0.5 * pair.d
-    return jnp.where(depth >= 0, -wall(depth, along) * along, 0.0)
+    return jnp.where(depth >= 0, -at(walls, u)(depth, along) * along, 0.0)
 
 
 def _outcome(m: Rk4Carry, side: Int[Array, ""], t: Scalar) -> ImpactOutcome:

@@ -11,7 +11,9 @@ from vijax.explorer.overlay import LaidCurves, through
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
 from vijax.explorer.theme import amount, symbol, unit_of
 from vijax.model.label import label
+from vijax.model.pair import quantities
 from vijax.model.records import Status
+from vijax.model.sides import named
 from vijax.plots.curve_lines import KINDS, screen_style
 from vijax.plots.style import LABEL_NEEDS
 
@@ -27,14 +29,13 @@ def heading(found: CellMotion) -> str:
 def cell_rows(plane: ExploredPlane, cell: ExploredCell, found: CellMotion) -> Rows:
     """Say of a cell where it is, what it yields, how far it keeps from its limits, and how it ended."""
     place = [[symbol(name), amount(value, unit_of(name))] for name, value in cell.arguments.items()]
-    pair = {"d": cell.pair.d, "kappa": cell.pair.kappa, "gamma": cell.pair.gamma}
     place += [
         [symbol(name), amount(float(value))]
-        for name, value in pair.items()
-        if value is not None and name not in cell.arguments
+        for name, value in quantities(cell.pair).items()
+        if not name.startswith("r") and name not in cell.arguments
     ]
     numbers = found.numbers
-    limit = float(cell.device.depth_limit)
+    limit = min(map(float, named("limit", cell.device.depth_limit).values()))
     rows = [
         ["label", found.name],
         ["P", f"{amount(numbers['P'], 'J')} per half period"],

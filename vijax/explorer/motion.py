@@ -17,6 +17,7 @@ from vijax.model.device import depth_unit
 from vijax.model.energy import harvested_energy
 from vijax.model.label import label
 from vijax.model.records import Impact, Status
+from vijax.model.sides import at
 from vijax.orbits import orbit_properties
 from vijax.orbits.motion import curve
 from vijax.orbits.orbit_search import from_state
@@ -179,19 +180,20 @@ def _window(line: Any, first: float, span: float) -> list[np.ndarray]:
     ends = [(low, high) for low, high in ((0.0, 0), (span, -1)) if t.size and t[0] <= low <= t[-1]]
     rows = [t, np.asarray(line.u), np.asarray(line.v)]
     cut = [row[inside] for row in rows]
-    for at, side in ends:
-        values = (at, *(float(np.interp(at, t, row)) for row in rows[1:]))
-        cut = [np.insert(row, row.size if side else 0, value) for row, value in zip(cut, values, strict=True)]
+    for end, last in ends:
+        values = (end, *(float(np.interp(end, t, row)) for row in rows[1:]))
+        cut = [np.insert(row, row.size if last else 0, value) for row, value in zip(cut, values, strict=True)]
     return cut
 
 
 def _impacts(cell: ExploredCell, hits: Impact, span: float) -> dict[str, np.ndarray]:
     """Lay out where impacts are on the course, and what each gives and yields."""
     device, speed = cell.device, float(cell.device.speed_unit)
-    depth = np.asarray(hits.depth) * float(depth_unit(device, cell.pair))
+    side = np.asarray(hits.side)
+    depth = np.asarray(hits.depth) * np.asarray(at(depth_unit(device, cell.pair), side))
     given = float(device.m_b) * speed**2 * np.asarray(hits.work)
-    harvested = np.asarray(harvested_energy(device, depth))
-    good = (harvested <= given) & (depth <= float(device.depth_limit))
+    harvested = np.asarray(harvested_energy(device.at(side), depth))
+    good = (harvested <= given) & (depth <= np.asarray(at(device.depth_limit, side)))
     return {
         "t": np.mod(2 * np.asarray(hits.n) + np.asarray(hits.t), span),
         "u": 0.5 * float(cell.pair.d) * np.asarray(hits.side, float),

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vijax.model.device import Harvester, told_device, with_constants, with_pair
-from vijax.model.pair import ImpactPair, impact_pair
+from vijax.model.device import Harvester, constant_of, realised, told_device
+from vijax.model.pair import ImpactPair
 from vijax.model.quantities import AXES, START, START_REACH, synonyms
 from vijax.planes.axes import cells
 from vijax.planes.sweep_settings import SweepSettings
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+# Of a map of equal walls those without an end; of others those of each wall.
+_PAIR = ("d", "kappa", "kappa_left", "kappa_right", "gamma", "r", "r_left", "r_right")
 MOST_PERIODS = 100_000
 """Forcing periods of a cell, at most: what a store says must not keep a page busy without an end."""
 
@@ -177,26 +179,30 @@ def _axis(dataset: "xr.Dataset", name: str) -> Axis:
 
 
 def _fixed(dataset: "xr.Dataset", along: list[str]) -> dict[str, float]:
-    """Find what the map holds fixed: as d, kappa and gamma or, where these vary with omega or A, as s, omega0, beta."""
+    """Find what the map holds fixed: as d, kappa and gamma or, where these vary with omega or A, as s, omega0, beta.
+
+    Of walls that differ kappa and r are those of each.
+    """
 
     def first(name: str) -> float:
         return float(dataset[name].values.flat[0])
 
     # Read where it is needed: no inclination gives some gamma of a plane.
     def device() -> Harvester:
-        given = with_constants(told_device(dataset.attrs), A=first("A"), omega=first("omega"))
-        return with_pair(given, impact_pair(*(first(name) for name in ("d", "kappa", "r", "gamma"))))
+        table = {name: first(name) for name in (*_PAIR, "A", "omega") if name in dataset.coords}
+        return realised(told_device(dataset.attrs), table, dataset.attrs.get("wall", SweepSettings.wall))[1]
 
-    inner = {"d": "s", "kappa": "omega0", "gamma": "beta"}
-    found = {}
-    for name, constant in inner.items():
-        if set(synonyms(name)) & set(along):
+    found: dict[str, float] = {}
+    taken = {f"{one}{end}" for name in along for one in synonyms(name) for end in ("", "_left", "_right")}
+    for name in (name for name in _PAIR if name in dataset.coords and name not in taken):
+        if not math.isfinite(first(name)):  # of the rigid wall beside a soft one
             continue
-        if dataset[name].ndim == 0:
+        if dataset[name].ndim == 0 or name.startswith("r"):
             found[name] = first(name)
         else:
-            found[constant] = float(getattr(device(), constant))
-    found |= {name: first(name) for name in ("r", "omega", "A") if name not in along}
+            constant = {"d": "s", "gamma": "beta"}.get(name, name.replace("kappa", "omega0"))
+            found[constant] = float(constant_of(device(), constant))
+    found |= {name: first(name) for name in ("omega", "A") if name not in along}
     starts = {name: dataset[name] for name in ("u0", "v0") if name not in along and dataset[name].ndim == 0}
     usual = {"u0": min(START[0], START_REACH * found["d"]) if "d" in found else None, "v0": START[1]}
     return found | {name: float(start) for name, start in starts.items() if float(start) != usual[name]}
@@ -235,9 +241,5 @@ def cell(plane: ExploredPlane, pick: tuple[int, int], values: Mapping[str, float
     """
     arguments = plane.arguments(pick, values)
     found = {name: float(value.values) for name, value in cells(arguments, plane.device, plane.wall).quantities.items()}
-    rigid = plane.wall == "rigid"
-    pair = impact_pair(found["d"], None if rigid else found["kappa"], found["r"], found["gamma"])
-    moved = with_constants(
-        plane.device, A=found["A"], omega=found["omega"], omega0=found["kappa"] * found["omega"] / math.pi
-    )
-    return ExploredCell(pair, with_pair(moved, pair), found["u0"], found["v0"], arguments, plane.settings())
+    pair, device = realised(plane.device, found, plane.wall)
+    return ExploredCell(pair, device, found["u0"], found["v0"], arguments, plane.settings())

@@ -12,13 +12,15 @@ from vijax.explorer.motion import CellMotion
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
 from vijax.explorer.source import Source
 from vijax.explorer.view import View
-from vijax.model.device import CONSTANTS, Harvester
-from vijax.model.quantities import AXES
+from vijax.model.device import CONSTANTS, WALLS_OWN, Harvester
+from vijax.model.quantities import AXES, SIDES
+from vijax.model.sides import Sides, named
 from vijax.planes.sweep_settings import SPEED
 
 _DEVICE = Harvester()
 # Axes that need not be told where they are the device's own.
 _USUAL = {"gamma": 0.0} | {name: float(getattr(_DEVICE, name)) for name in ("r", "omega", "A")}
+_USUAL |= {"r_left": _USUAL["r"], "r_right": _USUAL["r"]}
 
 
 @dataclass(frozen=True)
@@ -49,11 +51,37 @@ def told(arguments: Mapping[str, float]) -> dict[str, float]:
 
 
 def _constants(cell: ExploredCell | _Run) -> dict[str, float]:
-    """Name the constants that differ from those of Tables I and II, other than those that axes stand for."""
-    found = {name: float(getattr(cell.device, name)) for name in CONSTANTS if name not in AXES}
+    """Name the constants that differ from those of Tables I and II, other than those that axes stand for.
+
+    What a wall has of its own is under a name of its own, such as V_left.
+    """
+    found: dict[str, float] = {}
+    for name in CONSTANTS:
+        if name not in AXES:
+            own = named(name, getattr(cell.device, name)).items()
+            found |= {argument: float(value) for argument, value in own if value != getattr(_DEVICE, name)}
     if cell.device.penetration_limit is not None:
         found["penetration_limit"] = float(cell.device.penetration_limit)
-    return {name: value for name, value in found.items() if value != getattr(_DEVICE, name)}
+    return found
+
+
+def _device(constants: Mapping[str, float]) -> str:
+    """Write the call that makes the device of Tables I and II with other constants."""
+    given: dict[str, str] = {}
+    for name, value in constants.items():
+        whole, _, side = name.rpartition("_")
+        if side not in SIDES or whole not in WALLS_OWN:
+            given[name] = repr(value)
+        elif whole not in given:
+            both = (constants.get(f"{whole}_{one}", getattr(_DEVICE, whole)) for one in SIDES)
+            given[whole] = f"vijax.Sides({', '.join(map(repr, both))})"
+    return f"vijax.Harvester({', '.join(f'{name}={text}' for name, text in given.items())})"
+
+
+def _told(device: Harvester, names: tuple[str, ...]) -> dict[str, float]:
+    """Name some constants of a device, of walls that differ those of each."""
+    told = (named(name, getattr(device, name)) for name in names)
+    return {argument: float(value) for own in told for argument, value in own.items()}
 
 
 def _named(arguments: Mapping[str, Any]) -> str:
@@ -76,20 +104,27 @@ def _arguments(cell: ExploredCell | _Run, without: tuple[str, ...] = ()) -> str:
     given: dict[str, Any] = {name: value for name, value in told(cell.arguments).items() if name not in without}
     parts = [f"{name}={value!r}" for name, value in (given | cell.settings).items() if name not in without]
     if constants := _constants(cell):
-        parts.append(f"device=vijax.Harvester({_named(constants)})")
+        parts.append(f"device={_device(constants)}")
     return ", ".join(parts)
+
+
+def _number(value: Any) -> str:
+    """Write a number of a pair, or what each wall has."""
+    if isinstance(value, Sides):
+        return f"vijax.Sides({_number(value.left)}, {_number(value.right)})"
+    return repr(None if value is None else float(value))
 
 
 def of_motion(cell: ExploredCell, found: CellMotion) -> Recipe:
     """Say how a motion, its label, P and multipliers are had."""
     pair = cell.pair
-    kappa = None if pair.kappa is None else float(pair.kappa)
-    point = f"along='r', values=[{cell.arguments['r']!r}], direction='up', periods={motion.SETTLE}, recorded_periods=1"
+    r = "r" if "r" in cell.arguments else "r_left"
+    point = f"along={r!r}, values=[{cell.arguments[r]!r}], direction='up', periods={motion.SETTLE}, recorded_periods=1"
     lines = [
         "import vijax",
         f"found = vijax.sweep({_arguments(cell)})",
-        f"pair = vijax.impact_pair({float(pair.d)!r}, {kappa!r}, {float(pair.r)!r}, {float(pair.gamma)!r})",
-        f"end = vijax.orbit_diagram({point}, {_arguments(cell, ('r', 'periods'))}).isel(r=0, strobe=-1)",
+        f"pair = vijax.impact_pair({', '.join(map(_number, (pair.d, pair.kappa, pair.r, pair.gamma)))})",
+        f"end = vijax.orbit_diagram({point}, {_arguments(cell, (r, 'periods'))}).isel({r}=0, strobe=-1)",
     ]
     if found.orbit is not None:
         period = int(found.numbers["period"])
@@ -132,9 +167,8 @@ def of_basin(cell: ExploredCell) -> Recipe:
 def of_branch(cell: ExploredCell, found: CellMotion, axis: Axis) -> Recipe:
     """Say how the branch through a cell is had; its lines go on from those of the motion."""
     low, high = float(axis.values[0]), float(axis.values[-1])
-    constants = {name: float(getattr(cell.device, name)) for name in ("A", "omega", "omega0")} | _constants(cell)
     more = (
-        f"device = vijax.Harvester({_named(constants)})\n"
+        f"device = {_device(_told(cell.device, ('A', 'omega', 'omega0')) | _constants(cell))}\n"
         f"branches = vijax.follow_families(orbit, {axis.name!r}, ({low!r}, {high!r}), device=device, "
         f"max_switches={branch.MOST_SWITCHES}, points={branch.MOST_POINTS}, "
         f"settings=vijax.ContinuationSettings(max_grazings={branch.MOST_GRAZINGS}))"
@@ -145,16 +179,14 @@ def of_branch(cell: ExploredCell, found: CellMotion, axis: Axis) -> Recipe:
 def of_optimum(cell: ExploredCell, axis: Axis) -> Recipe:
     """Say how the optima near a cell are had."""
     low, high = float(axis.values[0]), float(axis.values[-1])
-    device = cell.device
-    names = ("s", "omega0", "r", "A", "omega", "beta")
-    constants = {name: float(getattr(device, name)) for name in names} | _constants(cell)
+    constants = _told(cell.device, ("s", "omega0", "r", "A", "omega", "beta")) | _constants(cell)
     options = " ".join(
-        f"--{name} {value!r}" if name in names else f"--set {name}={value!r}" for name, value in constants.items()
+        f"--{name} {value!r}" if name in AXES else f"--set {name}={value!r}" for name, value in constants.items()
     )
     words = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in optimum.EFFORT.items())
     return Recipe(
         f"vijax design {options} --tune {axis.name} --bounds {axis.name}={low!r}:{high!r} {words}",
-        f"import vijax\nvijax.optimise(vijax.Harvester({_named(constants)}), tune={axis.name!r}, "
+        f"import vijax\nvijax.optimise({_device(constants)}, tune={axis.name!r}, "
         f"bounds={{{axis.name!r}: ({low!r}, {high!r})}}, {_named(optimum.EFFORT)})",
     )
 

@@ -6,7 +6,7 @@ known to the room that acts on it.
 
 from typing import Literal
 
-Walls = Literal["soft", "rigid"]
+Walls = Literal["soft", "rigid", "rigid_left", "rigid_right"]
 Until = Literal["attractor", "window"]
 MethodName = Literal["exact", "ode", "rk4"]
 SolverName = Literal["Bosh3", "Tsit5", "Dopri5", "Dopri8", "Kvaerno3", "Kvaerno4", "Kvaerno5"]

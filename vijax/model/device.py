@@ -3,25 +3,33 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vijax.model import units
-from vijax.model.pair import WALLS, ImpactPair, Real, check_pair
-from vijax.model.quantities import check
+from vijax.model.choices import Walls
+from vijax.model.pair import WALLS, ImpactPair, Real, check_pair, impact_pair, pair_of
+from vijax.model.quantities import SIDES, check
+from vijax.model.sides import Sides, apart, at, each, named
 from vijax.runtime import checks
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
+
+Own = Real | Sides[Real]
+"""A number, or the `Sides` of what the two walls have of their own."""
 
 
 class Harvester(eqx.Module):
     """The device in SI units; the defaults are Tables I and II of the paper.
 
     Every field is a number or an array, traced and never static; quantities of pint become plain numbers. The stiffness
-    k is m_b omega0^2, so a membrane of known k has omega0 = sqrt(k/m_b); `sweep` takes k as an axis, too.
+    k is m_b omega0^2, so a membrane of known k has omega0 = sqrt(k/m_b); `sweep` takes k as an axis, too. What walls
+    have, omega0, r, w0, R0, eps_M and V, may be a `Sides` of the two.
 
     Attributes:
         m_b: Mass of the ball [kg].
@@ -47,17 +55,17 @@ class Harvester(eqx.Module):
 
     m_b: Real = 0.0035
     s: Real = 0.3
-    omega0: Real = 400.0
-    r: Real = 0.5
+    omega0: Own = 400.0
+    r: Own = 0.5
     A: Real = 1.0
     omega: Real = math.pi
     beta: Real = 0.0
     g: Real = 9.8
-    w0: Real = 0.00025
-    R0: Real = 0.0063
-    eps_M: Real = 4.15e-11
+    w0: Own = 0.00025
+    R0: Own = 0.0063
+    eps_M: Own = 4.15e-11
     C_T: Real = 99.35e-9
-    V: Real = 2000.0
+    V: Own = 2000.0
     r_b: Real = 0.0050
     penetration_limit: Real | None = None
 
@@ -72,23 +80,45 @@ class Harvester(eqx.Module):
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
-            setattr(self, field.name, units.plain(field.name, getattr(self, field.name)))
+            plain = partial(units.plain, field.name)
+            setattr(self, field.name, each(plain, getattr(self, field.name)))
 
     def __check_init__(self):
         for field in dataclasses.fields(self):
-            if field.name != "penetration_limit" or self.penetration_limit is not None:
-                check(field.name, getattr(self, field.name))
-        if is_concrete(self.r_b, self.R0) and not np.all(np.asarray(self.r_b) < np.asarray(self.R0)):
-            raise ValueError(
-                f"r_b must be smaller than R0, the radius of the membrane that the ball sinks into; "
-                f"got r_b = {checks.shown(self.r_b)}, R0 = {checks.shown(self.R0)}"
-            )
+            value = getattr(self, field.name)
+            if isinstance(value, Sides) and field.name not in WALLS_OWN:
+                raise ValueError(
+                    f"{field.name} must be of the whole device, as only {', '.join(WALLS_OWN)} are a wall's own; "
+                    f"got {checks.shown(value)}"
+                )
+            if field.name != "penetration_limit" or value is not None:
+                for argument, one in named(field.name, value).items():
+                    check(field.name, one, argument)
+        for argument, R0 in named("R0", self.R0).items():
+            if is_concrete(self.r_b, R0) and not np.all(np.asarray(self.r_b) < np.asarray(R0)):
+                raise ValueError(
+                    f"r_b must be smaller than {argument}, the radius of the membrane that the ball sinks into; "
+                    f"got r_b = {checks.shown(self.r_b)}, {argument} = {checks.shown(R0)}"
+                )
+
+    @property
+    def unequal(self) -> bool:
+        """Say whether the two walls may differ in anything."""
+        return any(isinstance(getattr(self, name), Sides) for name in WALLS_OWN)
+
+    def at(self, side: Any) -> "Harvester":
+        """Give the device whose walls are both as the one on a side is, +1 right or -1 left: itself if they are equal.
+
+        Args:
+            side: A number, or an array of them; fields become arrays that broadcast against it.
+        """
+        return jax.tree.map(lambda x: at(x, side), self, is_leaf=lambda x: isinstance(x, Sides))
 
     @property
     @door
-    def k(self) -> Real:
+    def k(self) -> Own:
         """Compute the stiffness of the membrane, m_b omega0^2 [N/m]."""
-        return self.m_b * self.omega0**2
+        return each(lambda omega0: self.m_b * omega0**2, self.omega0)
 
     @property
     @door
@@ -103,24 +133,31 @@ class Harvester(eqx.Module):
         return self.A * (math.pi / self.omega)
 
     @property
-    def depth_limit(self) -> Real:
+    def depth_limit(self) -> Own:
         """Compute the largest admissible penetration [m]."""
         return self.R0 if self.penetration_limit is None else self.penetration_limit
 
     @door
-    def pair(self, wall: str = "soft") -> ImpactPair:
+    def pair(self, wall: Walls = "soft") -> ImpactPair:
         """Bring the device into nondimensional form, Eqs. (37)-(38).
 
         d = s omega^2/(A pi^2), kappa = omega0 pi/omega, gamma = g sin(beta)/A.
 
         Args:
-            wall: "soft" for the membrane, "rigid" for the wall that it becomes as omega0 grows (kappa = None).
+            wall: "soft" for the membranes, "rigid" for the walls that they become as omega0 grows (kappa = None);
+                "rigid_left" or "rigid_right" where one of them alone is rigid, and is no membrane.
         """
         checks.choice("wall", wall, WALLS)
         d, gamma = self.s / self.length_unit, self.g * jnp.sin(self.beta) / self.A
-        d, kappa, r, gamma = jnp.broadcast_arrays(d, self.omega0 * (math.pi / self.omega), self.r, gamma)
-        return ImpactPair(d, None if wall == "rigid" else kappa, r, gamma)
+        kappa = each(lambda omega0: omega0 * (math.pi / self.omega), self.omega0)
+        given = {"d": d, **named("kappa", kappa), **named("r", self.r), "gamma": gamma}
+        pair = pair_of(given, wall)
+        fields, tree = jax.tree.flatten(pair.apart() if self.unequal else pair)
+        return jax.tree.unflatten(tree, jnp.broadcast_arrays(*fields))
 
+
+WALLS_OWN = "omega0", "r", "w0", "R0", "eps_M", "V"
+"""Constants that each wall may have of its own."""
 
 CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field.name != "penetration_limit")
 """Constants of the device; the penetration limit is none, but a choice of who builds it."""
@@ -128,8 +165,13 @@ CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field
 
 def told_device(attributes: Mapping[Any, Any]) -> Harvester:
     """Read the device that a map's attributes tell; what they do not tell, as its axes, is that of Tables I and II."""
-    names = (*CONSTANTS, "penetration_limit")
-    told = {name: float(attributes[f"harvester_{name}"]) for name in names if f"harvester_{name}" in attributes}
+    told: dict[str, Any] = {}
+    for name in (*CONSTANTS, "penetration_limit"):
+        whole, sides = f"harvester_{name}", [f"harvester_{name}_{side}" for side in SIDES]
+        if whole in attributes:
+            told[name] = float(attributes[whole])
+        elif sides[0] in attributes:
+            told[name] = Sides(*(float(attributes[one]) for one in sides))
     # The limit is told as a number even where it is the radius of the membrane, as a device says by None.
     if told.get("penetration_limit") == told.get("R0"):
         told.pop("penetration_limit", None)
@@ -154,42 +196,106 @@ def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
             f"gamma must lie in [-g/A, g/A] for an inclination to give it; got {checks.first(sine, np.abs(sine) <= 1)} "
             f"for gamma A/g; lower A or raise g"
         )
-    omega0 = device.omega0 if pair.kappa is None else pair.kappa * device.omega / math.pi
+    if pair.hard_wall:
+        raise ValueError("pair must have two walls of one kind for a device; got one rigid and one soft")
+    omega0 = device.omega0 if pair.kappa is None else each(lambda kappa: kappa * device.omega / math.pi, pair.kappa)
     return dataclasses.replace(device, s=pair.d * device.length_unit, omega0=omega0, r=pair.r, beta=jnp.arcsin(sine))
 
 
 @door
-def with_constants(device: Harvester, **constants: Real) -> Harvester:
+def with_constants(device: Harvester, **constants: Own) -> Harvester:
     """Change some constants of a device, checked by name; `k` [N/m] sets omega0 = sqrt(k/m_b).
+
+    What one wall alone is to have is given as omega0_left, V_right and so on.
 
     Raises:
         ValueError: An unknown constant, both k and omega0, or a value that cannot be.
     """
-    known = [field.name for field in dataclasses.fields(check_device(device))]
+    known = ["k", *(field.name for field in dataclasses.fields(check_device(device)))]
+    walls = [f"{name}_{side}" for name in ("k", *WALLS_OWN) for side in SIDES]
     for name in constants:
-        if name not in (*known, "k"):
-            raise ValueError(f"{name} must be a constant of the device; got {name!r}; known are k, {', '.join(known)}")
-    constants = {name: units.plain(name, value) for name, value in constants.items()}
-    if "k" in constants:
-        if "omega0" in constants:
+        if name not in (*known, *walls):
+            raise ValueError(f"{name} must be a constant of the device; got {name!r}; known are {', '.join(known)}")
+    m_b = constants.get("m_b", device.m_b)
+    given: dict[str, Any] = {}
+    for name, value in constants.items():
+        whole = name if name in known else name.rpartition("_")[0]
+        value = each(partial(units.plain, whole), value)
+        if whole == "k":
+            for argument, one in named(name, value).items():
+                check("k", one, argument)
+            check("m_b", m_b)
+            name, value = name.replace("k", "omega0", 1), each(lambda k: jnp.sqrt(k / m_b), value)
+        if name in given:
             raise ValueError("k and omega0 must not both be given, as k = m_b omega0^2; got both; leave one out")
-        k, m_b = constants.pop("k"), constants.get("m_b", device.m_b)
-        check("k", k)
-        check("m_b", m_b)
-        constants["omega0"] = jnp.sqrt(k / m_b)
-    return dataclasses.replace(device, **constants)
+        given[name] = value
+    return changed(device, given)
+
+
+def realised(device: Harvester, table: Mapping[Any, Any], wall: Walls) -> tuple[ImpactPair, Harvester]:
+    """Give the pair of a table of numbers by name, and the device that has it with the table's A and omega.
+
+    Args:
+        device: Gives all that the table does not.
+        table: What `pair_of` reads, A and omega; of rigid walls kappa says how deep a membrane they are lent.
+        wall: What the walls are.
+    """
+    pair = impact_pair(**vars(pair_of(table, wall)))
+    natural = {name.replace("kappa", "omega0"): value for name, value in table.items() if name.startswith("kappa")}
+    held = {name: value * table["omega"] / math.pi for name, value in natural.items() if math.isfinite(value)}
+    moved = with_constants(device, A=table["A"], omega=table["omega"], **held)
+    return pair, moved if pair.hard_wall else with_pair(moved, pair)
+
+
+def changed(device: Harvester, constants: Mapping[str, Any], *, checked: bool = True) -> Harvester:
+    """Change constants of a device, or under names such as omega0_left what one wall has of them.
+
+    Args:
+        checked: Whether to look whether they may be, for which arrays of many devices take long.
+    """
+    fields: dict[str, Any] = {}
+    for name, value in constants.items():
+        whole, _, side = name.rpartition("_")
+        if side not in SIDES or whole not in WALLS_OWN:
+            fields[name] = value
+            continue
+        both = apart(fields.get(whole, getattr(device, whole)))
+        fields[whole] = Sides(value, both.right) if side == SIDES[0] else Sides(both.left, value)
+    if checked:
+        return dataclasses.replace(device, **fields)
+    return eqx.tree_at(
+        lambda one: [getattr(one, name) for name in fields],
+        device,
+        list(fields.values()),
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
+def constant_of(device: Harvester, name: str) -> Any:
+    """Find a constant of a device or its k, or under a name such as omega0_left what one wall has of it."""
+    whole, _, side = name.rpartition("_")
+    if side not in SIDES or whole not in ("k", *WALLS_OWN):
+        return getattr(device, name)
+    return getattr(apart(getattr(device, whole)), side)
 
 
 @door
-def depth_unit(device: Harvester, pair: ImpactPair) -> Real:
+def depth_unit(device: Harvester, pair: ImpactPair) -> Own:
     """Compute metres per unit of an impact's depth; a rigid wall's depth is recorded as that of kappa = 1."""
     if pair.rigid:
-        return device.length_unit * device.omega / (math.pi * device.omega0)
+        return each(lambda omega0: device.length_unit * device.omega / (math.pi * omega0), device.omega0)
     return device.length_unit
 
 
-def electrical(device: Harvester) -> Harvester:
-    """Leave out of a device what the energy of an impact of known depth does not depend on: those fields are None."""
+def electrical(device: Harvester, *, unequal: bool = False) -> Harvester:
+    """Leave out of a device what the energy of an impact of known depth does not depend on: those fields are None.
+
+    Args:
+        unequal: Whether to give each wall its own of all that is left and may differ: one form for many devices.
+    """
+    if unequal:
+        names = [name for name in WALLS_OWN if name not in ("omega0", "r")]
+        device = changed(device, {name: apart(getattr(device, name)) for name in names}, checked=False)
     return eqx.tree_at(
         lambda one: (one.s, one.omega0, one.r, one.A, one.omega, one.beta, one.g, one.penetration_limit),
         device,
@@ -208,8 +314,10 @@ def one_device(device: Any) -> Harvester:
     if device is None:
         return Harvester()
     for name, value in vars(checks.known("device", check_device(device))).items():
-        if value is not None and np.ndim(value):
-            raise ValueError(
-                f"device.{name} must be one number; got shape {np.shape(value)}; give it as an axis, or one device each"
-            )
+        for argument, one in named(name, value).items():
+            if one is not None and np.ndim(one):
+                raise ValueError(
+                    f"device.{argument} must be one number; got shape {np.shape(one)}; "
+                    "give it as an axis, or one device each"
+                )
     return device

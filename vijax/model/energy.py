@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool
 from vijax.model import units
 from vijax.model.device import Harvester, check_device
 from vijax.model.flow import half_turn
+from vijax.model.pair import ImpactPair
 from vijax.model.units import Given
 from vijax.runtime import checks
 from vijax.runtime.arrays import Values
@@ -30,8 +31,9 @@ def stretch(device: Harvester, depth: Values) -> Values:
 
     Source: Eqs. (30)-(31) with r_b sin(alpha) for the printed r_b cos(alpha), so that the area is continuous at 0.
     """
-    ball = device.r_b / device.R0
-    x = jnp.where(depth < 0, 0.0, depth) / device.R0
+    R0: Any = device.R0
+    ball = device.r_b / R0
+    x = jnp.where(depth < 0, 0.0, depth) / R0
     tangent = jnp.sqrt(1 + x * (x - 2 * ball))
     reach = 1 + (ball - x) ** 2
     # 1 - cos(alpha) = rise/(over reach): the difference itself has no digit left below depth 1e-8 R0.
@@ -42,7 +44,10 @@ def stretch(device: Harvester, depth: Values) -> Values:
 
 def _rest_capacitance(device: Harvester) -> Values:
     """Compute the capacitance of the undeformed membrane [F]."""
-    return jnp.asarray(device.eps_M * PI * device.R0**2 / device.w0)
+    eps_M: Any = device.eps_M
+    R0: Any = device.R0
+    w0: Any = device.w0
+    return jnp.asarray(eps_M * PI * R0**2 / w0)
 
 
 @door
@@ -68,7 +73,8 @@ def harvested_energy(device: Harvester, depth: Given) -> Values:
 
     Source: Eq. (34).
     """
-    check_device(device)
+    if check_device(device).unequal:
+        raise ValueError("device must be that of one wall, device.at(1) or device.at(-1); got one whose walls differ")
     given: Any = units.plain("depth", depth)
     if checks.is_concrete(given):
         found = checks.numbers("depth", given, some=False)
@@ -79,11 +85,12 @@ def harvested_energy(device: Harvester, depth: Given) -> Values:
 
 @once
 def _harvested(device: Harvester, depth: Values) -> Values:
+    V: Any = device.V
     growth = stretch(device, depth)
     least = _rest_capacitance(device)
     gain = least * growth * (2 + growth)
     # One division for the device, not one for every impact.
-    return (0.5 * device.V**2) * gain * (1 + gain * (1 / (least + device.C_T)))
+    return (0.5 * V**2) * gain * (1 + gain * (1 / (least + device.C_T)))
 
 
 @door
@@ -96,6 +103,11 @@ def rigid_penetration(r: Values) -> Values:
     """
     decrement = 0.0 - jnp.log(r)
     return jnp.exp(-decrement / PI * jnp.arctan2(jnp.full_like(decrement, PI), decrement))
+
+
+def rigid_depth(pair: ImpactPair) -> Values:
+    """Compute the depth per speed of rigid walls, that of kappa = 1; 0 of one beside a soft wall, which lends none."""
+    return rigid_penetration(pair.r) if pair.rigid else jnp.zeros_like(pair.r)
 
 
 @door
@@ -269,4 +281,5 @@ def admissible(device: Harvester, energy: Values, work: Values, depth: Values) -
         work: W_j [J], the result of `membrane_work` times m_b speed_unit^2.
         depth: Largest penetration [m].
     """
-    return (energy <= work) & (depth <= device.depth_limit)
+    limit: Any = device.depth_limit
+    return (energy <= work) & (depth <= limit)

@@ -67,7 +67,7 @@ class Force(eqx.Module):
 
 @shared
 def membrane(pair: ImpactPair, *, rolled: bool = False) -> Membrane:
-    """Find the soft wall of a pair, as `restitution` calibrates it."""
+    """Find the soft wall of a pair whose walls are equal, as `restitution` calibrates it."""
     kappa = pair._soft_kappa()
     zeta, omega1 = calibrated(kappa, pair.r)
     # Else every loop that needs omega1 makes its own, and some lanes of a loop round PI - omega1 once and others twice.

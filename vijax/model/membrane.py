@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.model.pair import ImpactPair, Real
+from vijax.model.sides import Sides
 from vijax.runtime import checks
 from vijax.runtime.arrays import Values
 from vijax.runtime.pages import see
@@ -58,6 +59,10 @@ class MembraneLaw(eqx.Module):
     def wall(self, pair: ImpactPair) -> Wall:
         """Give the law the numbers of a pair."""
         return _Bound(jax.tree.map(lambda x: jnp.asarray(x, pair.d.dtype), self), pair)
+
+    def walls(self, pair: ImpactPair) -> "Wall | Sides":
+        """Give the law the numbers of a pair; for each wall where they differ."""
+        return Sides(self.wall(pair.at(-1)), self.wall(pair.at(1))) if pair.unequal else self.wall(pair)
 
     def __str__(self) -> str:
         """Name the law and its numbers, as maps do in their attributes."""

@@ -7,7 +7,7 @@ once what its options are.
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 
@@ -92,7 +92,7 @@ _AMPLITUDE = "it is the forcing amplitude in m/s^2; without forcing there is no 
 _GRAVITY = "it is the acceleration of gravity in m/s^2; level ground is beta = 0"
 _TILT = "it is the inclination in rad; level ground is beta = 0"
 
-PARAMETERS = _named(
+_COMMON = _named(
     Quantity("d", "gap between the walls", _POSITIVE, formula="s omega^2 / (A pi^2)", alias_of="s", advice=_GAP),
     Quantity(
         "kappa",
@@ -139,7 +139,28 @@ PARAMETERS = _named(
     Quantity("A", "amplitude of the forcing", _POSITIVE, "m/s^2", default="1", advice=_AMPLITUDE),
     Quantity("beta", "inclination", _FINITE, "rad", symbol=r"\beta", default="0", advice=_TILT),
 )
-"""What of pair and device may be an axis."""
+
+SIDES = "left", "right"
+"""The two walls, at u = -d/2 and u = d/2."""
+
+_OF_ONE_WALL = {
+    "kappa": "stiffness of the {} wall",
+    "r": "coefficient of restitution of a free contact with the {} wall",
+    "omega0": "natural frequency of ball and {} membrane",
+    "k": "stiffness of the {} membrane",
+}
+
+
+def _of_one_wall(name: str, side: str) -> Quantity:
+    whole = _COMMON[name]
+    symbol = rf"{whole.symbol or name}^\mathrm{{{side}}}"
+    alias_of = f"{whole.alias_of}_{side}" if whole.alias_of else ""
+    text = _OF_ONE_WALL[name].format(side)
+    return replace(whole, name=f"{name}_{side}", text=text, symbol=symbol, alias_of=alias_of, default="")
+
+
+PARAMETERS = _COMMON | _named(*(_of_one_wall(name, side) for name in _OF_ONE_WALL for side in SIDES))
+"""What of pair and device may be an axis; what each wall has of its own last."""
 
 STARTS = _named(
     Quantity(
@@ -189,6 +210,12 @@ QUANTITIES = AXES | _named(
 def synonyms(name: str) -> tuple[str, ...]:
     """Find the axes that decide the same as one does, itself among them: kappa, omega0 and k."""
     return tuple(one for one, axis in AXES.items() if axis.constant == AXES[name].constant)
+
+
+def of_both_walls(name: str) -> str:
+    """Name the axis that gives both walls what this one gives one of them; "" for an axis of the whole."""
+    whole, _, side = name.rpartition("_")
+    return whole if side in SIDES and whole in _OF_ONE_WALL else ""
 
 
 def check(name: str, value: Any, argument: str | None = None) -> None:

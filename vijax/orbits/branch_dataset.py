@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vijax.model.device import Harvester, depth_unit, one_device, with_constants
-from vijax.model.pair import ImpactPair
+from vijax.model.pair import quantities
 from vijax.model.quantities import AXES, MEASURED
+from vijax.model.sides import at
 from vijax.orbits import orbit_properties
 from vijax.orbits.continuation import Branch
-from vijax.orbits.parameter import MOVED
+from vijax.orbits.parameter import MOVED, of_pair
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 
@@ -57,16 +58,16 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
         attrs={
             "title": "Branches of periodic orbits of a vibro-impact pair",
             "along": along,
-            "wall": "rigid" if branches[0].orbit.pair.rigid else "soft",
+            "wall": branches[0].orbit.pair.walls,
         },
     )
 
 
 def _constants(branch: Branch) -> "dict[str, tuple]":
     """Name the parameters that do not move."""
-    still = [name for name in ("d", "kappa", "r", "gamma") if name not in MOVED[branch.along]]
-    pair = {name: getattr(branch.orbit.pair, name) for name in still}
-    return {name: ((), float(values[0]), AXES[name].attributes) for name, values in pair.items() if values is not None}
+    pair = quantities(branch.orbit.pair)
+    still = {name: values for name, values in pair.items() if name not in MOVED[branch.along]}
+    return {name: ((), float(values[0]), AXES[name].attributes) for name, values in still.items()}
 
 
 _ENDS = ((0, "first"), (1, "last"))
@@ -82,10 +83,10 @@ _ABOUT = {
 
 def _columns(branch: Branch, device: Harvester) -> dict[str, np.ndarray]:
     """Lay out what the dataset holds of a branch, a row a point."""
-    if branch.along not in ImpactPair.__dataclass_fields__:
+    if not of_pair(branch.along):
         device = with_constants(device, **{branch.along: tiles.arrays(branch.values[:, None])})
     hits, label = orbit_properties.impacts(branch.orbit), orbit_properties.counts(branch.orbit)
-    length = depth_unit(device, branch.orbit.pair)
+    length = at(depth_unit(device, branch.orbit.pair), hits.side)
     columns = {
         branch.along: branch.values,
         "multiplier": np.abs(np.asarray(branch.orbit.multipliers)).max(axis=1),

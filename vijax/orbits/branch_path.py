@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vijax.model.pair import ImpactPair
-from vijax.orbits import grazing, shooting
+from vijax.orbits import grazing, multipliers, shooting
 from vijax.orbits.arclength_step import BranchPlace, PathEquations, across, advance
 from vijax.orbits.parameter import Values, moved
 from vijax.orbits.shooting import Sequence
@@ -88,7 +88,7 @@ class Arc(eqx.Module):
         """Compute the test functions; which way the step was that led here does not matter to them."""
         knots, x = self.unpack(y)
         pair = self.at(x)
-        around = shooting.monodromy(pair, self.sequence, knots)
+        around = multipliers.monodromy(pair, self.sequence, knots)
         trace = around[0, 0] + around[1, 1]
         determinant = around[0, 0] * around[1, 1] - around[0, 1] * around[1, 0]
         room = grazing.between(pair, self.sequence, knots).clearance

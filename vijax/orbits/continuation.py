@@ -17,7 +17,7 @@ from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.branch_path import FIRST_END, FOLD, Arc, Tests, heading, upwards
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import BranchEvent, Point, blur, events, kind_of, locate, orbits_at
-from vijax.orbits.parameter import check_along, check_bounds, tilts
+from vijax.orbits.parameter import able, check_along, check_bounds, skews
 from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit
 from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
 from vijax.orbits.soft_graze import Passage, branch_passage
@@ -90,6 +90,7 @@ def follow(
     """
     checks.choice("direction", direction, _WAYS)
     points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
+    orbit = able(check_orbit(orbit), along)
     arcs, y = set_out(orbit, along, within, device, settings)
     begin_proofs(orbit.pair, orbit.sequence, orbit.knots)
     first = settled(upwards(arcs, y), FIRST_END)
@@ -110,7 +111,7 @@ def set_out(
     device = one_device(device)
     within = check_along(orbit.pair, along, within)
     x = check_bounds(orbit.pair, along, within, device)
-    if tilts(along) and bool(orbit.sequence.mirrored.any()):
+    if skews(along) and bool(orbit.sequence.mirrored.any()):
         raise ValueError(
             f"orbit must be closed in full to be followed along {along}; got one closed half way; unfold it"
         )
@@ -205,7 +206,7 @@ def _point(arc: Arc, kind: str, y: np.ndarray, orbit: Orbit, settings: Continuat
     """
     value = float(y[-1] * (arc.high - arc.low))
     plain = Point(kind, value, orbit)
-    if kind != "pitchfork" or bool(arc.sequence.mirrored) or tilts(arc.along):
+    if kind != "pitchfork" or bool(arc.sequence.mirrored) or skews(arc.along):
         return plain
     half, row = symmetry.halved(orbit, blur(settings)), jax.tree.map(np.atleast_1d, arc)
     arcs, known = arcs_from(half, arc.along, np.array([value]), row.steepest, (row.low, row.high), settings)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vijax.model.label import label
+from vijax.model.pair import quantities
 from vijax.model.quantities import AXES, MEASURED
 from vijax.orbits import orbit_properties
 from vijax.orbits.branch_dataset import padded
@@ -70,7 +71,7 @@ def curve_dataset(curves: list[BifurcationCurve] | MapCurves) -> "xr.Dataset":
         attrs={
             "title": "Curves of bifurcations of a vibro-impact pair",
             "along": " ".join(along),
-            "wall": "rigid" if listed[0].orbit.pair.rigid else "soft",
+            "wall": listed[0].orbit.pair.walls,
         },
     )
     return made if of_map is None else _with_borders(made, of_map)
@@ -96,8 +97,8 @@ def _events(listed: list[BifurcationCurve]) -> dict[str, tuple]:
 
 def _constants(curve: BifurcationCurve) -> dict[str, tuple]:
     """Name the parameters that are the same all along a curve."""
-    pair = {name: getattr(curve.orbit.pair, name) for name in ("d", "kappa", "r", "gamma") if name not in curve.along}
-    still = {name: np.asarray(x) for name, x in pair.items() if x is not None and np.ptp(np.asarray(x)) == 0}
+    pair = {name: x for name, x in quantities(curve.orbit.pair).items() if name not in curve.along}
+    still = {name: np.asarray(x) for name, x in pair.items() if np.ptp(np.asarray(x)) == 0}
     return {name: ((), float(x[0]), AXES[name].attributes) for name, x in still.items()}
 
 
@@ -130,7 +131,7 @@ def _label(curve: BifurcationCurve) -> str:
     middle = len(curve.values) // 2
     orbit = curve.orbit[middle : middle + 1]
     counts = orbit_properties.counts(orbit)
-    merge = np.asarray(orbit.pair.gamma) == 0
+    merge = np.asarray(orbit.pair.symmetric)
     return str(label(counts.period, counts.left, counts.right, merge_mirrors=merge)[0])
 
 

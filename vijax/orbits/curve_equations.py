@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float, Int
 from vijax.model import flow
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.orbits import grazing, shooting, steady
+from vijax.model.sides import at
+from vijax.orbits import grazing, multipliers, shooting, steady
 from vijax.orbits.arclength_step import PathEquations
 from vijax.orbits.parameter import moved_together
 from vijax.orbits.shooting import Sequence
@@ -135,14 +136,15 @@ class CurvePath(eqx.Module):
         """Compute what vanishes on the curve besides the gap of the orbit."""
         pair, knots = self.pair_and_knots(y)
         if self.condition == "multiplier":
-            both = shooting.multiplier_conditions(pair, self.sequence, knots)
+            both = multipliers.multiplier_conditions(pair, self.sequence, knots)
             return jnp.where(self.multiplier > 0, both.plus, both.minus)[None]
         if self.device is not None:
             return self._loads(self.device, y[-2:], pair, knots)[self.touch.impact][None] - 1
         if self.condition == "split":
             t, speed, _ = knots[self.touch.impact]
             force = flow.contact_force(pair.gamma, self.touch.wall, t)
-            return jnp.stack(flow.oscillate(flow.membrane(pair, rolled=True), force, 0.0 * t, speed, y[-3]))
+            wall = flow.membrane(pair.at(self.touch.wall), rolled=True)
+            return jnp.stack(flow.oscillate(wall, force, 0.0 * t, speed, y[-3]))
         leave = jax.tree.map(lambda leaf: leaf[self.touch.impact], shooting.departures(pair, self.sequence, knots))
         rise, v = flow.flight(flow.flight_force(pair.gamma, leave.t), -leave.side * leave.speed, y[-3])
         return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])
@@ -155,7 +157,8 @@ class CurvePath(eqx.Module):
         # When a contact is deepest is found by a search, and moves with the knots by its own equation.
         frozen = jax.tree.map(lax.stop_gradient, (pair, self.sequence, knots))
         depth, energy, work = steady.yields(device, pair, self.sequence, knots, grazing.between(*frozen).deepest)
-        return depth / device.depth_limit if self.condition == "depth" else energy / work
+        limit = at(device.depth_limit, self.sequence.side)
+        return depth / limit if self.condition == "depth" else energy / work
 
     def equations(self, y) -> PathEquations:
         """Compute the gap and the condition, and their derivatives in all unknowns."""
@@ -183,14 +186,14 @@ class CurvePath(eqx.Module):
         one = jnp.ones_like(pair.d)
         plus, minus, push, resonance, touches = one, one, one, one, {}
         if self.condition in ("touch", "split"):
-            plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
+            plus, minus = multipliers.multiplier_conditions(pair, self.sequence, knots)
             here = jnp.arange(knots.shape[0], dtype=jnp.int32) == self.touch.impact
             touches = {self.condition: jnp.where(here, y[-3], jnp.nan)}
             push = self._push(pair, knots, y[-3])
             if pair.rigid:
-                resonance = shooting.returned(pair, self.sequence, knots, self.touch.impact, y[-3])
+                resonance = multipliers.returned(pair, self.sequence, knots, self.touch.impact, y[-3])
         elif self.device is not None and self.touch.alike is not None:
-            plus, minus = shooting.multiplier_conditions(pair, self.sequence, knots)
+            plus, minus = multipliers.multiplier_conditions(pair, self.sequence, knots)
             loads = self._loads(self.device, y[-2:], pair, knots)
             push = jnp.where(self.touch.alike, 1.0, loads[self.touch.impact] - loads).min()
         room = grazing.between(pair, self.sequence, knots, **touches).clearance

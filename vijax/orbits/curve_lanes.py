@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from vijax.model.device import Harvester
+from vijax.model.sides import Sides
 from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.arclength_step import BranchPlace, across, advance, settled
 from vijax.orbits.continuation_settings import ContinuationSettings
@@ -16,6 +17,7 @@ from vijax.orbits.curve_plane import Plane, logarithmic, units
 from vijax.orbits.curve_starts import CurveStart
 from vijax.orbits.events import orbits_at
 from vijax.orbits.limits import alike
+from vijax.orbits.parameter import able
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import tiles
 
@@ -137,14 +139,14 @@ def traits(orbit: Orbit, images: bool = False) -> Traits:
     # An orbit closed half way goes on as its own mirror image.
     again = orbit_properties.marks_of_knots(-side, later(host.sequence.span))
     own = half + np.where(host.sequence.mirrored[:, None], again, 0.0)
-    if not images or np.any(host.pair.gamma) or host.sequence.mirrored.any():
+    if not images or not np.all(host.pair.symmetric) or host.sequence.mirrored.any():
         return own
     return np.concatenate([own, orbit_properties.marks_of_knots(-side, later(1.0))])
 
 
 def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings: ContinuationSettings):
     """Make paths and unknowns of starts with as many impacts."""
-    orbit = periodic.concatenate([start.orbit for start in starts])
+    orbit = periodic.concatenate([able(start.orbit, *plane) for start in starts])
     size, (one, other), logarithms = len(starts), plane, logarithmic(plane)
     place = np.array([start.place for start in starts], float)
     condition: Condition = CONDITIONS.get(starts[0].kind, "multiplier")
@@ -180,5 +182,7 @@ def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings
 
 def _broadcast(device: Harvester, size: int) -> Harvester:
     """Give every lane the constants of the device, its penetration limit among them."""
-    whole = dataclasses.replace(device, penetration_limit=device.depth_limit)
+    limit = device.depth_limit
+    # Limits that differ are the radii of the membranes, which every lane has besides.
+    whole = device if isinstance(limit, Sides) else dataclasses.replace(device, penetration_limit=limit)
     return jax.tree.map(lambda x: np.full(size, float(x)), whole)

@@ -6,11 +6,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from vijax.model.device import Harvester
+from vijax.model.device import Harvester, constant_of
 from vijax.model.pair import ImpactPair
-from vijax.model.quantities import synonyms
+from vijax.model.quantities import of_both_walls, synonyms
 from vijax.orbits.events import Point
-from vijax.orbits.parameter import check_along, moved_together
+from vijax.orbits.parameter import check_along, moved_together, of_pair, value_at
 from vijax.runtime import checks
 
 # A quantity whose bounds are farther apart than this counts in its logarithm.
@@ -25,7 +25,7 @@ def check_plane(pair: Any, within: Any) -> Plane:
         raise ValueError(f"within must give two parameters their bounds; got {checks.shown(within)}")
     plane = {name: check_along(pair, name, bounds) for name, bounds in within.items()}
     one, other = plane
-    if other in synonyms(one):
+    if {other, of_both_walls(other)} & {*synonyms(one), *(synonyms(of_both_walls(one)) if of_both_walls(one) else ())}:
         raise ValueError(f"within must name two parameters; got {one} and {other}, which say the same; keep one")
     for name, (low, high) in plane.items():
         ends = [_moved(pair, plane, name, value) for value in (low, high)]
@@ -53,10 +53,10 @@ def place_of(point: Point, along: str, plane: Plane, device: Harvester) -> tuple
     for name, (low, high) in plane.items():
         if name == along:
             value = point.value
-        elif name in ("d", "kappa", "r", "gamma"):
-            value = float(getattr(pair, name)[0])
+        elif of_pair(name):
+            value = float(np.asarray(value_at(pair, name, device))[0])
         elif along in plane:
-            value = float(device.m_b * device.omega0**2 if name == "k" else getattr(device, name))
+            value = float(constant_of(device, name))
         else:
             raise ValueError(f"along must be in the plane of {' and '.join(plane)}; got branches along {along}")
         if not low <= value <= high:

@@ -70,9 +70,10 @@ class Between(NamedTuple):
 def _contact(pair: ImpactPair, side, knot, real) -> contact_search.Turns:
     """Find when a contact is deepest, and where it is shallowest between."""
     t, speed, stay = knot
-    zero, wanted = jnp.zeros_like(t), real & (stay > 0)
+    zero, wanted = jnp.zeros_like(t), real & (stay > 0) & ~pair.hard(side)
     force = flow.contact_force(pair.gamma, side, t)
-    return contact_search.turning_points(flow.membrane(pair, rolled=True), force, zero, speed, wanted, length=stay)
+    wall = flow.membrane(pair.at(side), rolled=True)
+    return contact_search.turning_points(wall, force, zero, speed, wanted, length=stay)
 
 
 def _contacts(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real):
@@ -118,7 +119,9 @@ def between(
         deepest, shallow, _ = _contacts(pair, departure, knots, real)
         if split is not None:
             shallow = _halves(pair, departure, knots, real, split)
-        contact, leaves = least(shallow), least(departure.speed / knots[:, 1])
+        # At a rigid wall a ball that comes at all leaves.
+        exits = jnp.where(pair.hard(departure.side), _NOTHING, departure.speed / knots[:, 1])
+        contact, leaves = least(shallow), least(exits)
     return Between(Clearance(least(knots[:, 1]), least(flight), contact, leaves), deepest)
 
 

@@ -7,13 +7,13 @@ import numpy as np
 
 from vijax.model.device import Harvester, depth_unit, one_device, with_constants
 from vijax.model.energy import energy_ratio, harvested_energy
-from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
+from vijax.model.sides import at
 from vijax.orbits import symmetry
 from vijax.orbits.continuation import Branch
 from vijax.orbits.curve_starts import CurveStart
 from vijax.orbits.events import Point
-from vijax.orbits.parameter import tilts
+from vijax.orbits.parameter import of_pair, skews
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
@@ -32,11 +32,15 @@ def loads(orbit: Orbit, device: Harvester) -> dict[str, np.ndarray]:
         device: Its constants are numbers, or [orbit, 1].
     """
     depth, work = np.asarray(orbit.depth), np.asarray(orbit.work)
-    metres = depth * np.asarray(depth_unit(device, orbit.pair))
+    side = np.asarray(orbit.sequence.side)
+    metres = depth * np.asarray(at(depth_unit(device, orbit.pair), side))
     energy, given = tiles.arrays(
-        (np.asarray(harvested_energy(device, metres)), work * np.asarray(device.m_b * device.speed_unit**2))
+        (np.asarray(harvested_energy(device.at(side), metres)), work * np.asarray(device.m_b * device.speed_unit**2))
     )
-    found = {LIMITS[0]: metres / float(device.depth_limit), LIMITS[1]: np.asarray(energy_ratio(energy, given))}
+    found = {
+        LIMITS[0]: metres / np.asarray(at(device.depth_limit, side)),
+        LIMITS[1]: np.asarray(energy_ratio(energy, given)),
+    }
     real = np.asarray(orbit.sequence.real)
     return {kind: np.where(real, load, 0.0) for kind, load in found.items()}
 
@@ -76,7 +80,7 @@ def _crossings(branch: Branch, device: Harvester) -> list[Point]:
 
 def device_at(device: Harvester, along: str, values: Any) -> Harvester:
     """Give the device where a parameter has other values, if it is the device's."""
-    if along in ImpactPair.__dataclass_fields__:
+    if of_pair(along):
         return device
     return with_constants(device, **{along: tiles.arrays(np.asarray(values, float))})
 
@@ -95,7 +99,7 @@ def limit_start(
     if int(orbit.status[0]) != Status.OK:
         return "no ball flies its orbit"
     mirrored = bool(orbit.sequence.mirrored[0])
-    if not mirrored and not any(map(tilts, plane)) and bool(symmetry.symmetric(orbit, asymmetry)[0]):
+    if not mirrored and not any(map(skews, plane)) and bool(symmetry.symmetric(orbit, asymmetry)[0]):
         # Both of an impact and its mirror image are at the limit: half way there is one.
         orbit = symmetry.halved(orbit, asymmetry)
     for name, value in zip(plane, place, strict=True):
@@ -114,7 +118,7 @@ def alike(starts: list[CurveStart], orbit: Orbit, plane: tuple[str, ...], device
     impact = np.array([start.impact for start in starts])
     close = np.abs(load - load[rows, impact][:, None]) < _ALIKE
     itself = np.arange(load.shape[1]) == impact[:, None]
-    return itself | ~np.asarray(orbit.sequence.real) | (close & (not any(map(tilts, plane))))
+    return itself | ~np.asarray(orbit.sequence.real) | (close & (not any(map(skews, plane))))
 
 
 def near_limits(

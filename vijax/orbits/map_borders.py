@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vijax.model.choices import Walls
 from vijax.model.device import Harvester, told_device, with_constants
 from vijax.model.label import label
-from vijax.model.pair import ImpactPair
-from vijax.model.quantities import PARAMETERS
+from vijax.model.pair import ImpactPair, pair_of, symmetric
+from vijax.model.quantities import PARAMETERS, of_both_walls
 from vijax.orbits.curve_plane import check_plane
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
     import xarray as xr
 
-_PAIR = ("d", "kappa", "r", "gamma")
 # Constants of the device that a map has as coordinates.
-_MOVED = ("A", "omega", "kappa", "s", "r", "beta")
+_MOVED = ("A", "omega", "s", "beta")
 _NEEDED = ("period", "impacts_left", "impacts_right", "status")
 
 
@@ -32,7 +32,8 @@ class LabelledPlane:
         axes: Their values, ascending.
         names: Label of each cell; "" where the motion is not periodic, or has no impacts. Mirror images have one.
         period: Forcing periods of each cell's motion.
-        cells: d, kappa (None at rigid walls), r, gamma, u0 and v0 of each cell.
+        cells: What the pair of each cell is made of, by name, and u0 and v0.
+        wall: What the walls are.
         admissible: Whether each cell is, where the map tells.
     """
 
@@ -41,7 +42,13 @@ class LabelledPlane:
     names: np.ndarray
     period: np.ndarray
     cells: dict[str, Any]
+    wall: Walls
     admissible: np.ndarray | None
+
+    def pairs(self, cells: np.ndarray) -> ImpactPair:
+        """Give the pairs of some cells, whose rows and columns stand along the last axis."""
+        index = tuple(np.moveaxis(cells, -1, 0))
+        return pair_of({name: values[index] for name, values in self.cells.items()}, self.wall)
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
@@ -51,11 +58,17 @@ class LabelledPlane:
 
 def device_of(dataset: "xr.Dataset") -> Harvester:
     """Read the device of a map, as far as the map says; along its axes it is that of the first cell."""
-    first = {name: float(dataset[name].values.flat[0]) for name in _MOVED if name in dataset.coords}
-    device = replace(told_device(dataset.attrs), **{name: first[name] for name in first if name != "kappa"})
-    if "kappa" in first:
-        device = with_constants(device, omega0=first["kappa"] * device.omega / math.pi)
-    return device
+    walls = [name for name in dataset.coords if (of_both_walls(str(name)) or name) in ("kappa", "r")]
+    first = {str(name): float(dataset[name].values.flat[0]) for name in (*_MOVED, *walls) if name in dataset.coords}
+    device = replace(told_device(dataset.attrs), **{name: first.pop(name) for name in _MOVED if name in first})
+    natural = device.omega / math.pi
+    return with_constants(
+        device,
+        **{
+            name.replace("kappa", "omega0"): value * natural if name.startswith("kappa") else value
+            for name, value in first.items()
+        },
+    )
 
 
 def labelled_plane(dataset: "xr.Dataset") -> LabelledPlane:
@@ -70,7 +83,7 @@ def labelled_plane(dataset: "xr.Dataset") -> LabelledPlane:
     period = ordered["period"]
     like = {name: ordered[name].broadcast_like(period).transpose(*period.dims).values for name in _NEEDED}
     cells = _cells(ordered, period)
-    names = label(*(like[name] for name in _NEEDED), merge_mirrors=cells["gamma"] == 0)
+    names = label(*(like[name] for name in _NEEDED), merge_mirrors=symmetric(cells))
     impacts = like["impacts_left"] + like["impacts_right"]
     names = np.where((like["period"] > 0) & (impacts > 0), names, "")
     if not (names != "").any():
@@ -79,7 +92,8 @@ def labelled_plane(dataset: "xr.Dataset") -> LabelledPlane:
     told = ordered.get("admissible")
     # Along an axis that the motion does not depend on there may be several verdicts a cell.
     kept = None if told is None or set(told.dims) != set(along) else told.transpose(*along).values.astype(bool)
-    return LabelledPlane(along, (axes[0], axes[1]), names, like["period"], cells, kept)
+    wall = dataset.attrs.get("wall", "soft")
+    return LabelledPlane(along, (axes[0], axes[1]), names, like["period"], cells, wall, kept)
 
 
 def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
@@ -99,19 +113,17 @@ def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
         raise ValueError(f"dataset must have at least two values along each axis; got {got}")
     if dataset.attrs.get("membrane", "linear") != "linear":
         raise ValueError(f"dataset must be of linear membranes; got one of {dataset.attrs['membrane']}")
-    first: dict[str, Any] = {name: x.flat[0] for name, x in _cells(dataset).items() if x is not None}
-    pair = ImpactPair(first["d"], first.get("kappa"), first["r"], first["gamma"])
+    first = {name: x.flat[0] for name, x in _cells(dataset).items()}
+    pair = pair_of(first, dataset.attrs.get("wall", "soft"))
     check_plane(pair, {name: (float(dataset[name].min()), float(dataset[name].max())) for name in dims})
     return one, other
 
 
 def _cells(dataset: "xr.Dataset", like: "xr.DataArray | None" = None) -> dict[str, Any]:
-    """Give d, kappa (None at rigid walls), r, gamma, u0 and v0 of the cells of a map."""
-    cells: dict[str, Any] = {"kappa": None}
-    rigid = dataset.attrs.get("wall") == "rigid"
-    for name in (*_PAIR, "u0", "v0"):
-        # A map of rigid walls has a kappa, too, for its energies.
-        if name in dataset.coords and not (rigid and name == "kappa"):
+    """Give what the pairs of the cells of a map are made of, and u0 and v0."""
+    cells: dict[str, Any] = {}
+    for name in map(str, dataset.coords):
+        if (of_both_walls(name) or name) in ("d", "kappa", "r", "gamma", "u0", "v0"):
             values = dataset[name]
             cells[name] = (values if like is None else values.broadcast_like(like).transpose(*like.dims)).values
     return cells

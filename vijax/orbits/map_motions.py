@@ -8,7 +8,6 @@ import numpy as np
 from vijax.batch import simulate
 from vijax.model.device import Harvester
 from vijax.model.label import label
-from vijax.model.pair import ImpactPair
 from vijax.orbits.map_borders import Borders, LabelledPlane
 
 _SETTLE = 400  # forcing periods that a ball is flown in a cell at most, as in a sweep
@@ -40,17 +39,11 @@ def both_attract(plane: LabelledPlane, beside: Borders) -> np.ndarray:
             break
         chains = np.stack([here, there], axis=1)
         found = _flown(plane, chains, _CELLS)
-        level = plane.cells["gamma"][tuple(np.moveaxis(chains, -1, 0))] == 0
+        level = plane.pairs(chains).symmetric
         counts = found.period, found.impacts_left, found.impacts_right, found.status
         names = label(*counts, merge_mirrors=level)
         kept &= (names == plane.names[tuple(here.T)][:, None]).all(axis=1)
     return kept
-
-
-def pairs(plane: LabelledPlane, cells: np.ndarray) -> dict[str, Any]:
-    """Give d, kappa, r and gamma of some cells, whose rows and columns stand along the last axis."""
-    index = tuple(np.moveaxis(cells, -1, 0))
-    return {name: None if x is None else x[index] for name, x in plane.cells.items() if name not in ("u0", "v0")}
 
 
 def _flown(plane: LabelledPlane, chains: np.ndarray, links: int) -> Any:
@@ -65,7 +58,7 @@ def _flown(plane: LabelledPlane, chains: np.ndarray, links: int) -> Any:
 def _tile(plane: LabelledPlane, chains: np.ndarray, links: int) -> Any:
     # Rows are repeated, for one number of chains needs one program. No attractor depends on sizes in SI units.
     more = np.resize(chains, (_TILE, *chains.shape[1:]))
-    pair = ImpactPair(**pairs(plane, more))
+    pair = plane.pairs(more)
     u, v = (plane.cells[name][tuple(more[:, 0].T)] for name in ("u0", "v0"))
     start = simulate.Starts(u, v, np.zeros_like(u))
     one: Any = np.ones((_TILE, _CELLS))

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 
 from vijax.model.device import Harvester
-from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import orbit_search, periodic, symmetry
 from vijax.orbits.arclength_walk import Walked, walk
@@ -17,8 +16,8 @@ from vijax.orbits.curve_starts import CurveStart, curve_start
 from vijax.orbits.events import Point, changed, locate
 from vijax.orbits.limits import near_limits
 from vijax.orbits.map_borders import LabelledPlane
-from vijax.orbits.map_motions import pairs, settled
-from vijax.orbits.parameter import tilts
+from vijax.orbits.map_motions import settled
+from vijax.orbits.parameter import skews
 from vijax.orbits.periodic import Orbit
 from vijax.runtime import tiles
 
@@ -86,7 +85,7 @@ def _orbits(plane: LabelledPlane, cells: np.ndarray) -> list[tuple[Orbit, np.nda
         rows = np.flatnonzero(kept & (period == number) & (width == wide))
         # As often as a power of two, so that few programs are compiled.
         more = np.resize(rows, tiles.padded(rows.size))
-        pair = ImpactPair(**tiles.arrays(pairs(plane, cells[more])))
+        pair = tiles.arrays(plane.pairs(cells[more]))
         orbit = orbit_search.from_state(pair, *states[more].T, period=int(number))[: rows.size]
         for some, good in _by_symmetry(plane, orbit):
             size = tiles.padded(int(np.asarray(some.count).max()))
@@ -101,7 +100,7 @@ def _by_symmetry(plane: LabelledPlane, orbit: Orbit) -> list[tuple[Orbit, np.nda
     """Part attracting orbits into symmetric ones, closed half way, and others; with their rows."""
     attracts = np.abs(np.asarray(orbit.multipliers)).max(axis=1) < 1
     good = np.flatnonzero((np.asarray(orbit.status) == Status.OK) & attracts)
-    closes = np.asarray(symmetry.symmetric(orbit))[good] & (not any(map(tilts, plane.along)))
+    closes = np.asarray(symmetry.symmetric(orbit))[good] & (not any(map(skews, plane.along)))
     parts = [(good[closes], True), (good[~closes], False)]
     return [(symmetry.halved(orbit[rows]) if half else orbit[rows], rows) for rows, half in parts if rows.size]
 

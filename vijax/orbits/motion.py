@@ -111,9 +111,13 @@ def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int
 
 def _contact(pair: ImpactPair, t, side, v_in, s) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Compute displacement and velocity a time s after an onset; at rest on a rigid wall, where only sticking lasts."""
-    if pair.rigid:
-        return 0.5 * side * pair.d, jnp.where(s > 0, 0.0, v_in)
-    w, z = flow.oscillate(
-        flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t), 0.0 * s, side * v_in, s
-    )
-    return side * (0.5 * pair.d + w), side * z
+
+    def rigid(_: ImpactPair) -> tuple:
+        return 0.5 * side * pair.d + 0.0 * s, jnp.where(s > 0, 0.0, v_in)
+
+    def soft(wall: ImpactPair) -> tuple:
+        force = flow.contact_force(pair.gamma, side, t)
+        w, z = flow.oscillate(flow.membrane(wall, rolled=True), force, 0.0 * s, side * v_in, s)
+        return side * (0.5 * pair.d + w), side * z
+
+    return pair.met(side, rigid, soft)

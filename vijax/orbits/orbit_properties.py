@@ -13,6 +13,7 @@ from vijax.model.device import Harvester, check_device, depth_unit
 from vijax.model.energy import harvested_energy
 from vijax.model.label import label
 from vijax.model.records import Impact
+from vijax.model.sides import at
 from vijax.orbits import shooting
 from vijax.orbits.motion import MOST_SAMPLES, pieces
 from vijax.orbits.periodic import SAME, TILES, Orbit, check_orbit
@@ -95,7 +96,9 @@ def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
     check_device(device)
     own = tiles.library((check_orbit(orbit), device))
     orbit, device = jax.tree.map(own.asarray, (orbit, device))
-    energy = own.asarray(harvested_energy(device, orbit.depth * depth_unit(device, orbit.pair)))
+    side = orbit.sequence.side
+    depth = orbit.depth * at(depth_unit(device, orbit.pair), side)
+    energy = own.asarray(harvested_energy(device.at(side), depth))
     # The span of an orbit is in half forcing periods, for their length is the unit of time.
     return tiles.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
 

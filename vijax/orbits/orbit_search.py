@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax.batch.trajectory import trajectory
-from vijax.model.pair import ImpactPair, check_pair, check_start
+from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
 from vijax.orbits.periodic import SAME, Orbit, begin_judgement, check_orbit, concatenate, guessed, judged, shot, solved
@@ -47,7 +47,7 @@ def from_state(
     given = {"u": u, "v": v, "t": t}
     # By NumPy, as JAX would compile a program for each number of states.
     u, v, t = (np.atleast_1d(np.asarray(checks.finite(name, x), float)) for name, x in given.items())
-    shape = checks.shapes(u=u, v=v, t=t, d=pair.d, kappa=0 if pair.rigid else pair.kappa, r=pair.r)
+    shape = checks.shapes(u=u, v=v, t=t, **quantities(pair))
     check_start(pair, "u", u)
     pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)
     u, v, t = (np.broadcast_to(x, shape) for x in (u, v, t))
@@ -151,7 +151,8 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     gaps = draw.dirichlet(np.ones(count), guesses) * 2 * period
     t = draw.uniform(0, 2, (guesses, 1)) + np.cumsum(gaps, axis=1) - gaps[:, :1]
     speed = draw.uniform(0, _FASTEST, (guesses, count))
-    free = np.zeros(()) if pair.rigid else np.pi / np.asarray(pair.omega1)
+    lasts = pair.met(np.asarray(walls), lambda wall: 0.0 * wall.r, lambda wall: np.pi / wall.omega1)
+    free = np.asarray(lasts)  # contacts without forcing
     knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
     wide = jax.tree.map(lambda x: np.broadcast_to(x, guesses), pair)
     side = np.broadcast_to(np.asarray(walls, np.int32), (guesses, count))

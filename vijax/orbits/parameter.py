@@ -4,7 +4,10 @@ Of the pair itself it moves alone; of the device it moves several of the pair's 
 """
 
 import math
+import operator
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -13,7 +16,8 @@ import numpy as np
 from vijax.model import units
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.model.quantities import check
+from vijax.model.quantities import SIDES, check, of_both_walls
+from vijax.model.sides import Sides, apart, each
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import Values
 from vijax.runtime.context import door
@@ -26,23 +30,49 @@ _POWERS: dict[str, dict[str, float]] = {
     "s": {"d": 1},
     "A": {"d": -1, "gamma": -1},
 }
+_POWERS |= {f"{name}_{side}": {f"kappa_{side}": _POWERS[name]["kappa"]} for name in ("omega0", "k") for side in SIDES}
+_OWN = "d", "kappa", "r", "gamma", "kappa_left", "kappa_right", "r_left", "r_right"
 # What moves with each quantity that a branch can be followed along: of the pair itself alone, of the device several.
-MOVED: dict[str, tuple[str, ...]] = {name: (name,) for name in ("d", "kappa", "r", "gamma")}
+MOVED: dict[str, tuple[str, ...]] = {name: (name,) for name in _OWN}
 MOVED |= {name: tuple(powers) for name, powers in _POWERS.items()} | {"beta": ("gamma",)}
 # When each is moved, of several: the inclination sets gamma, which other quantities of the device change then.
-_TURN = {"beta": 0} | {name: 2 for name in ("d", "kappa", "r", "gamma")}
+_TURN = {"beta": 0} | {name: 2 for name in _OWN}
 
 
 def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Values) -> ImpactPair:
-    """Move a parameter of a pair from `start` to x; `steepest` is g/A, gamma of a vertical tube."""
-    fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
+    """Move a parameter of a pair from `start` to x; `steepest` is g/A, gamma of a vertical tube.
+
+    What both walls have is set at both of them, or goes at both in one proportion.
+    """
     if along == "beta":
-        fields["gamma"] = steepest * tiles.library((pair, x)).sin(x)
-    elif along not in _POWERS:
-        fields[along] = x
-    for name, power in _POWERS.get(along, {}).items():
-        if fields[name] is not None:  # a rigid wall has no kappa
-            fields[name] = fields[name] * (x / start) ** power
+        return _with(pair, gamma=steepest * tiles.library((pair, x)).sin(x))
+    if along in _OWN:
+        return _with(pair, **{along: x})
+    fields: dict[str, Any] = {}
+    for name, power in _POWERS[along].items():
+        value, factor = _of(pair, name), (x / start) ** power
+        # Rigid walls have no kappa.
+        fields[name] = None if value is None else each(partial(operator.mul, factor), value)
+    return _with(pair, **fields)
+
+
+def _of(pair: ImpactPair, name: str) -> Any:
+    """Take a field of a pair, or what one wall has of it."""
+    whole = of_both_walls(name)
+    return getattr(apart(getattr(pair, whole)), name.removeprefix(f"{whole}_")) if whole else getattr(pair, name)
+
+
+def _with(pair: ImpactPair, **values: Any) -> ImpactPair:
+    """Change fields of a pair, or what one wall has of them."""
+    fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
+    for name, value in values.items():
+        whole = of_both_walls(name)
+        if not whole:
+            fields[name] = value
+        elif name.endswith("left"):
+            fields[whole] = Sides(value, apart(fields[whole]).right)
+        else:
+            fields[whole] = Sides(apart(fields[whole]).left, value)
     return ImpactPair(**fields)
 
 
@@ -59,8 +89,11 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
     """Find the parameter's value where a device, by that parameter, has a pair."""
     of, by = jax.tree.map(np.asarray, (pair, device))
 
+    whole = of_both_walls(along) or along
+    end = along.removeprefix(whole)
+
     def omega0() -> np.ndarray:
-        return of.kappa * by.omega / math.pi
+        return _of(of, f"kappa{end}") * by.omega / math.pi
 
     known: dict[str, Callable[[], Any]] = {
         "omega": lambda: math.pi * np.sqrt(of.d * by.A / by.s),
@@ -70,7 +103,7 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
         "A": lambda: by.s * (by.omega / math.pi) ** 2 / of.d,
         "beta": lambda: np.arcsin(of.gamma * by.A / by.g),
     }
-    return known[along]() if along in known else getattr(of, along)
+    return known[whole]() if whole in known else _of(of, along)
 
 
 @door
@@ -79,6 +112,14 @@ def pair_at(pair: ImpactPair, along: str, value: float, device: Harvester) -> Im
     pair, x, steepest = tiles.arrays(jax.tree.map(np.asarray, (pair, value, device.g / device.A)))
     begun: Any = value_at(pair, along, device)
     return moved(pair, along, x, begun, steepest)
+
+
+def able(orbit: Any, *along: str) -> Any:
+    """Give an orbit whose pair can be moved along parameters: with walls of their own where one moves one wall."""
+    pair = orbit.pair
+    if not any(map(of_both_walls, along)) or pair.unequal:
+        return orbit
+    return replace(orbit, pair=pair.apart())
 
 
 def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], device: Harvester) -> np.ndarray:
@@ -92,15 +133,27 @@ def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], devi
 
 def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tuple[float, float]:
     """Take the bounds of a parameter; raise ValueError unless branches of such a pair can be followed between them."""
-    stiff = [name for name, several in MOVED.items() if several == ("kappa",) and pair.rigid]
-    hint = f"a rigid wall has no {' or '.join(stiff)}" if stiff else ""
+    if pair.hard_wall:
+        raise ValueError("orbit must be between two walls of one kind to be followed; got one rigid and one soft")
+    stiff = [name for name, (first, *_) in MOVED.items() if (of_both_walls(first) or first) == "kappa" and pair.rigid]
+    of_both = [name for name in stiff if not of_both_walls(name)]
+    hint = f"a rigid wall has no {' or '.join(of_both)}" if stiff else ""
     checks.choice("along", along, [name for name in MOVED if name not in stiff], hint)
+    (first, *more) = MOVED[along]
+    if not more and isinstance(getattr(pair, first, None), Sides):
+        of_walls = " or ".join(f"{along}_{side}" for side in SIDES)
+        raise ValueError(f"along must be {of_walls}, of one wall, where walls differ; got {along!r}")
     bounds = checks.bounds("within", units.plain(along, within))
     for bound in bounds:
         check(along, bound, "within")
     return bounds
 
 
-def tilts(along: str) -> bool:
-    """Say whether gravity along the axis moves alone, and with it the symmetry of the walls goes."""
-    return along in ("gamma", "beta")
+def of_pair(along: str) -> bool:
+    """Say whether a parameter is the pair's own, and not the device's."""
+    return along in _OWN
+
+
+def skews(along: str) -> bool:
+    """Say whether the symmetry of the walls goes along a parameter: gravity moves alone, or one wall does."""
+    return along in ("gamma", "beta") or bool(of_both_walls(along))

@@ -15,7 +15,7 @@ from vijax.engine.ground import Ground, ground_of
 from vijax.model import flow
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
-from vijax.orbits import shooting
+from vijax.orbits import multipliers, shooting
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks, context, tiles
 from vijax.runtime.arrays import AnyArray
@@ -204,9 +204,11 @@ def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbi
 
 
 def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"]) -> Claim:
-    around = jax.vmap(shooting.monodromy)(pair, sequence, knots)
+    around = jax.vmap(multipliers.monodromy)(pair, sequence, knots)
     departure = jax.vmap(shooting.departures)(pair, sequence, knots)
-    return Claim(knots, residual, shooting.floquet(around, sequence.mirrored), departure, *flow.wrap_phase(departure.t))
+    return Claim(
+        knots, residual, multipliers.floquet(around, sequence.mirrored), departure, *flow.wrap_phase(departure.t)
+    )
 
 
 def _prove(ground: Ground, rows: tuple) -> Orbit:

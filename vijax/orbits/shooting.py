@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Complex, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
@@ -76,9 +76,22 @@ def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _ContactEnd:
     Automatic derivatives would run a tangent of the closed form for every unknown, at five times the cost.
     """
     t, speed, stay, _, _ = knot
-    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
-    if pair.rigid:
-        return _ContactEnd(stay, -pair.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -pair.r, zero]))
+
+    def rigid(wall: ImpactPair) -> _ContactEnd:
+        zero, one = jnp.zeros_like(t), jnp.ones_like(t)
+        return _ContactEnd(stay, -wall.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -wall.r, zero]))
+
+    def soft(wall: ImpactPair) -> _ContactEnd:
+        # A contact with a rigid wall beside a soft one has no length to divide by.
+        length = jnp.where(pair.hard(side), 0.5, stay) if pair.hard_wall else stay
+        return _soft_contact(wall, side, t, speed, length)
+
+    return pair.met(side, rigid, soft)
+
+
+def _soft_contact(pair: ImpactPair, side, t, speed, stay) -> _ContactEnd:
+    """Do what `_contact` does, where both walls are as soft as the one that is met."""
+    zero = jnp.zeros_like(t)
     wall, force = flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t)
     w, rate = flow.oscillate(wall, force, zero, speed, stay)
     h, slope = flow.free_response(wall, stay)
@@ -128,7 +141,7 @@ def _following(sequence: Sequence):
     return after, wall, closes
 
 
-def _joined(sequence: Sequence, knots: Knots, onward: Knots | None = None):
+def joined_knots(sequence: Sequence, knots: Knots, onward: Knots | None = None):
     """Give wall, next wall and joint knots of every impact; harmless numbers where there is none.
 
     The orbit closes onto its own first impact, or leads to that of a next turn where one is given.
@@ -151,7 +164,7 @@ def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None
     Args:
         onward: Knots of the next turn, a span earlier than they come, where they differ from those of this one.
     """
-    side, wall, joined = _joined(sequence, knots, onward)
+    side, wall, joined = joined_knots(sequence, knots, onward)
     pieces, _ = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
@@ -162,7 +175,7 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
     Args:
         moved: Changes of the pair along parameters, whose derivatives become the last columns.
     """
-    side, wall, joined = _joined(sequence, knots)
+    side, wall, joined = joined_knots(sequence, knots)
 
     def each(pair):
         return jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
@@ -204,7 +217,7 @@ class Departure(NamedTuple):
 
 def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
     """Say how each contact ends, and where the flight after it is to lead."""
-    side, wall, joined = _joined(sequence, knots)
+    side, wall, joined = joined_knots(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
     rate = jax.vmap(lambda side, knot: _contact(pair, side, knot).rate)(side, joined)
     next_stay = knots[_following(sequence)[0], 2]
@@ -213,9 +226,9 @@ def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
 
 def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, ""]:
     """Say whether every speed, contact and flight is longer than nothing."""
-    _, _, joined = _joined(sequence, knots)
+    side, _, joined = joined_knots(sequence, knots)
     t, speed, stay, next_t, _ = joined.T
-    touches = jnp.ones_like(speed, bool) if pair.rigid else stay > 0
+    touches = (stay > 0) | pair.hard(side)
     return ((speed > 0) & touches & (next_t - t - stay > 0)).all()
 
 
@@ -284,110 +297,3 @@ def newton(
     residual = jnp.abs(jax.vmap(gap)(pair, sequence, knots)).max(axis=1)
     arrived = arrived & jax.vmap(possible)(pair, sequence, knots)
     return knots, jnp.where(arrived, residual, jnp.inf)
-
-
-def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "2 2"]:
-    """Compute the tangent map once around in (du, du'), from the last contact's end; onto a mirror image where need be.
-
-    Saltations included; its determinant is exp(-mu (contact time)), or r^(2 impacts) at rigid walls.
-    """
-    side, _, joined = _joined(sequence, knots)
-    t, speed, stay, next_t, _ = joined.T
-
-    def one(before, here):
-        side, t, speed, stay, flight, real = here
-        if pair.rigid:
-            contact = flow.rigid_matrix(pair.r, flow.acceleration(pair.gamma, t), side * speed)
-        else:
-            contact = flow.contact_matrix(flow.membrane(pair, rolled=True), stay)
-        step = flow.flight_matrix(flight) @ contact
-        return jnp.where(real, step @ before, before), None
-
-    # A cyclic shift of the product: contact then flight, which has the multipliers of flight then contact.
-    start = jnp.eye(2, dtype=knots.dtype)
-    around, _ = lax.scan(one, start, (side, t, speed, stay, next_t - t - stay, sequence.real))
-    return jnp.where(sequence.mirrored, -1.0, 1.0) * around
-
-
-def returned(pair: ImpactPair, sequence: Sequence, knots: Knots, impact: Int[Array, ""], wait) -> Float[Array, ""]:
-    """Compute how far u is off once around, over how far u' was, from so long after an impact at a rigid wall.
-
-    Where the ball just touches a wall then, orbits that hit it there depart from the graze by their speed times this.
-    """
-    side, _, joined = _joined(sequence, knots)
-    t, speed, _, next_t, _ = joined.T
-    flight, index = next_t - t, jnp.arange(side.size, dtype=jnp.int32)
-    count = sequence.real.sum(dtype=jnp.int32)
-
-    def one(before, here):
-        place, real = here
-        hit = flow.rigid_matrix(pair.r, flow.acceleration(pair.gamma, t[place]), side[place] * speed[place])
-        after = flow.flight_matrix(jnp.where(place == impact, wait, flight[place]))
-        return jnp.where(real, after @ hit @ before, before), None
-
-    # From there the impacts follow in their order, and that before it is the last.
-    order = (impact + 1 + index) % jnp.maximum(count, 1)
-    around, _ = lax.scan(one, flow.flight_matrix(flight[impact] - wait), (order, index < count))
-    return jnp.where(sequence.mirrored, -1.0, 1.0) * around[0, 1]
-
-
-# Speed into a rigid wall below which its matrix is weighed down. It is asked when weighted matrices vanish, no more, so
-# that it may be anything that is small beside an impact.
-_SLOW = 0.1
-
-
-class MultiplierConditions(NamedTuple):
-    """det(M - 1) and det(M + 1) once around, times a positive weight that makes them regular at a graze."""
-
-    plus: Float[Array, ""]
-    minus: Float[Array, ""]
-
-
-def multiplier_conditions(pair: ImpactPair, sequence: Sequence, knots: Knots) -> MultiplierConditions:
-    """Compute what vanishes where a multiplier is 1, and where one is -1, regular at a graze of a rigid wall too.
-
-    There the matrix of an impact grows as 1/v. Each is weighed by v/(v + 0.1), and det M taken in closed form.
-    """
-    side, _, joined = _joined(sequence, knots)
-    t, speed, stay, next_t, _ = joined.T
-    real = sequence.real
-    if pair.rigid:
-        slow = speed + _SLOW
-        weight = jnp.where(real, speed / slow, 1.0).prod()
-        product = pair.r ** (2.0 * real.sum(dtype=speed.dtype))
-    else:
-        slow, weight = jnp.ones_like(speed), jnp.ones_like(pair.d)
-        product = jnp.exp(-flow.membrane(pair, rolled=True).mu * jnp.where(real, stay, 0.0).sum())
-
-    def one(before, here):
-        side, t, speed, stay, flight, slow, real = here
-        if pair.rigid:
-            # The matrix for v = v + 0.1, and that part of r which remains.
-            contact = flow.rigid_matrix(pair.r, flow.acceleration(pair.gamma, t), side * slow)
-            keep = speed / slow
-            contact = contact * jnp.array([[keep, 1.0], [1.0, keep]])
-        else:
-            contact = flow.contact_matrix(flow.membrane(pair, rolled=True), stay)
-        return jnp.where(real, flow.flight_matrix(flight) @ contact @ before, before), None
-
-    start = jnp.eye(2, dtype=knots.dtype)
-    around, _ = lax.scan(one, start, (side, t, speed, stay, next_t - t - stay, slow, real))
-    trace = jnp.where(sequence.mirrored, -1.0, 1.0) * (around[0, 0] + around[1, 1])
-    return MultiplierConditions(weight * (1 + product) - trace, weight * (1 + product) + trace)
-
-
-def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
-    """Find the eigenvalues of monodromy matrices, the larger modulus first; squared where an orbit closes half way.
-
-    The smaller of two real ones is the determinant over the larger: their difference would cancel.
-    """
-    half = 0.5 * (around[:, 0, 0] + around[:, 1, 1])
-    product = around[:, 0, 0] * around[:, 1, 1] - around[:, 0, 1] * around[:, 1, 0]
-    spread = half * half - product
-    root = jnp.sqrt(jnp.abs(spread))
-    large = half + jnp.where(half < 0, -root, root)
-    small = product / jnp.where(large == 0, 1.0, large)
-    real = (spread >= 0)[:, None]
-    parts = jnp.where(real, jnp.stack([large, small], axis=1), half[:, None])
-    values = lax.complex(parts, jnp.where(real, 0.0, jnp.stack([root, -root], axis=1)))
-    return jnp.where(mirrored[:, None], values * values, values)

@@ -14,9 +14,11 @@ from jaxtyping import Array, Float, Int
 
 from vijax.engine.roots import implicit_root
 from vijax.model import energy, flow
+from vijax.model.choices import Walls
 from vijax.model.device import Harvester, check_device
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
+from vijax.model.sides import at
 from vijax.orbits import shooting
 from vijax.orbits.grazing import Between, Clearance
 from vijax.orbits.periodic import Orbit
@@ -103,10 +105,9 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
         raise ValueError(
             f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbits.periodic` found it"
         )
-    wall = "rigid" if orbit.pair.rigid else "soft"
     # Numbers of one kind, however they are given: each kind would be a program of its own.
     device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
-    return _near((device, pair), (orbit.sequence, orbit.knots), kind=wall)
+    return _near((device, pair), (orbit.sequence, orbit.knots), kind=orbit.pair.walls)
 
 
 class Found(NamedTuple):
@@ -123,12 +124,12 @@ class Found(NamedTuple):
     validity: Validity
 
 
-def _pair_of(moved: tuple[Harvester, ImpactPair | None], kind: str) -> ImpactPair:
+def _pair_of(moved: tuple[Harvester, ImpactPair | None], kind: Walls) -> ImpactPair:
     device, pair = moved
     return device.pair(kind) if pair is None else pair
 
 
-def _found(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], *, kind: str) -> Found:
+def _found(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], *, kind: Walls) -> Found:
     """Find the orbit near a guess."""
     (sequence, guess), pair = about, _pair_of(moved, kind)
     knots, residual = find(pair, sequence, jnp.where(sequence.real[:, None], guess, 0.0))
@@ -145,7 +146,7 @@ def _like_found(about: tuple[Sequence, Knots]) -> Found:
 
 
 def _respond(
-    moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], found: Found, *, kind: str
+    moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], found: Found, *, kind: Walls
 ) -> Steady:
     """Compute what the orbit yields that was found."""
     return _response(moved[0], _pair_of(moved, kind), about[0], found)
@@ -165,7 +166,8 @@ def _check(device: Any, orbit: Any, pair: Any) -> None:
         )
     if jnp.ndim(orbit.knots) != 2:
         raise ValueError(f"orbit must be a single one; got knots of shape {jnp.shape(orbit.knots)}; take found[0]")
-    if pair is not None and check_pair(pair).rigid != orbit.pair.rigid:
+    walls = [(one.rigid, one.hard_wall) for one in (orbit.pair if pair is None else check_pair(pair), orbit.pair)]
+    if walls[0] != walls[1]:
         raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
 
 
@@ -229,29 +231,40 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
     Padded impacts have none of the first two and infinitely much of the last.
     Where several results need a derivative XLA would compute it for each of them: sharing them halves what it compiles.
     """
-    real = sequence.real
+    real, side = sequence.real, jnp.where(sequence.real, sequence.side, 1)
     t, speed, stay = knots.T
-    if pair.rigid:
-        kappa = device.omega0 * flow.PI / device.omega
-        depth = speed * energy.rigid_penetration(pair.r) / kappa
-        work = energy.membrane_work_rigid(speed, pair.r)
-    else:
+
+    def rigid(wall: ImpactPair) -> tuple:
+        depth = speed * energy.rigid_depth(wall)
+        if pair.rigid:
+            depth = depth * device.omega / (flow.PI * at(device.omega0, side))
+        return depth, energy.membrane_work_rigid(speed, wall.r)
+
+    def soft(wall: ImpactPair) -> tuple:
         departure = shooting.departures(pair, sequence, knots)
         depth = shared_slopes(_depths(pair, departure.side, knots, deepest))
         signed = departure.side * speed, -departure.side * shared_slopes(departure.speed)
-        work = shared_slopes(energy.membrane_work(pair.kappa, pair.mu, pair.gamma, departure.side, t, stay, *signed))
+        return depth, shared_slopes(
+            energy.membrane_work(wall.kappa, wall.mu, pair.gamma, departure.side, t, stay, *signed)
+        )
+
+    depth, work = pair.met(side, rigid, soft)
     depth = jnp.where(real, depth, 0.0) * device.length_unit
     work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
-    return depth, energy.harvested_energy(device, depth), work
+    return depth, energy.harvested_energy(device.at(side), depth), work
 
 
 def _depths(pair: ImpactPair, side, knots: Knots, deepest) -> Float[Array, "impact"]:
     """Find the depth of each contact on a soft wall: that of its deepest turning point, which moves along."""
-    wall = flow.membrane(pair, rolled=True)
 
     def one(side, knot, when):
         t, speed, _ = knot
-        args = wall, flow.contact_force(pair.gamma, side, t), jnp.zeros_like(t), speed
+        args = (
+            flow.membrane(pair.at(side), rolled=True),
+            flow.contact_force(pair.gamma, side, t),
+            jnp.zeros_like(t),
+            speed,
+        )
         return flow.oscillate(*args, implicit_root(_rate, when, args))[0]
 
     return jax.vmap(one)(side, knots, jnp.nan_to_num(deepest))

@@ -13,8 +13,8 @@ from vijax.orbits.branch_path import Tests, heading, upwards
 from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, set_out
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
-from vijax.orbits.parameter import check_bounds, tilts
-from vijax.orbits.periodic import Orbit, begin_proofs
+from vijax.orbits.parameter import able, check_bounds, skews
+from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.programs import begin, jitted
@@ -107,6 +107,7 @@ def family(
     """
     max_switches = checks.whole("max_switches", max_switches, 0, MOST_SWITCHES)
     points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
+    orbit = able(check_orbit(orbit), along)
     set_out(orbit, along, within, device, settings)
     # What follow and switch are told alike.
     told: Any = {"device": device, "points": points, "settings": settings}
@@ -132,7 +133,7 @@ def family(
 
 def _halved(orbit: Orbit, along: str) -> Orbit:
     """Close an orbit half way where it is symmetric, and stays so along the branch."""
-    return symmetry.halved(orbit) if not tilts(along) and bool(symmetry.symmetric(orbit)[0]) else orbit
+    return symmetry.halved(orbit) if not skews(along) and bool(symmetry.symmetric(orbit)[0]) else orbit
 
 
 def _new(found: list[Branch], known: list[Branch], settings: ContinuationSettings) -> list[Branch]:

@@ -21,7 +21,7 @@ def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"
     opposite = np.take_along_axis(host.sequence.side, half, axis=1) == -host.sequence.side
     first = index < (count // 2)[:, None]
     same = (np.abs(moved).max(axis=2) < tolerance) & opposite
-    return host.sequence.mirrored | ((count % 2 == 0) & (host.pair.gamma == 0) & (same | ~first).all(axis=1))
+    return host.sequence.mirrored | ((count % 2 == 0) & host.pair.symmetric & (same | ~first).all(axis=1))
 
 
 @door

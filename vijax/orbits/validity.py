@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
-from vijax.orbits import shooting
+from vijax.orbits import multipliers
 from vijax.orbits.grazing import Between, between
 from vijax.orbits.shooting import Knots, Sequence
 
@@ -35,8 +35,8 @@ class Validity(NamedTuple):
 
 def validity(pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]) -> Validity:
     """Judge an orbit by what is left of its equations, its clearances and its multipliers."""
-    around = shooting.monodromy(pair, sequence, knots)
-    multiplier = jnp.abs(shooting.floquet(around[None], sequence.mirrored[None])).max()
+    around = multipliers.monodromy(pair, sequence, knots)
+    multiplier = jnp.abs(multipliers.floquet(around[None], sequence.mirrored[None])).max()
     away = jnp.eye(2, dtype=knots.dtype) - around
     condition = (away * away).sum() / jnp.abs(away[0, 0] * away[1, 1] - away[0, 1] * away[1, 0])
     motion = between(pair, sequence, knots)

@@ -13,8 +13,11 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from vijax.model import units
-from vijax.model.device import Harvester
-from vijax.model.quantities import AXES, START, START_REACH, check, synonyms
+from vijax.model.choices import Walls
+from vijax.model.device import WALLS_OWN, Harvester
+from vijax.model.pair import RIGID_ON, ImpactPair, pair_of
+from vijax.model.quantities import AXES, SIDES, START, START_REACH, check, of_both_walls, synonyms
+from vijax.model.sides import Sides
 from vijax.model.units import Given
 from vijax.runtime import checks
 from vijax.runtime.pages import see
@@ -36,6 +39,14 @@ class Parameters(TypedDict, total=False):
     k: Given
     A: Given
     beta: Given
+    kappa_left: Given
+    kappa_right: Given
+    r_left: Given
+    r_right: Given
+    omega0_left: Given
+    omega0_right: Given
+    k_left: Given
+    k_right: Given
 
 
 class Axes(Parameters, total=False):
@@ -164,7 +175,8 @@ class Cells:
         sizes: Length of every dimension, in the order given.
         dynamic: Dimensions that the dynamics depend on: one simulation for each of their points.
         variant: The other dimensions, which enter the energies alone.
-        quantities: d, kappa, r, gamma, u0, v0, omega [rad/s] and A [m/s^2], each over the dimensions it depends on.
+        quantities: d, kappa, r, gamma, u0, v0, omega [rad/s] and A [m/s^2], each over the dimensions it depends on;
+            where the walls may differ, kappa_left, kappa_right, r_left and r_right.
         length: Metres per unit of displacement (rigid wall: of speed over omega0, the engine's depth).
         speed: Metres per second per unit of velocity.
     """
@@ -176,6 +188,20 @@ class Cells:
     quantities: "dict[str, xr.Variable]"
     length: "xr.Variable"
     speed: "xr.Variable"
+
+    @property
+    def pair_names(self) -> tuple[str, ...]:
+        """Name the quantities of the pair."""
+        return tuple(name for name in self.quantities if (of_both_walls(name) or name) in ("d", "kappa", "r", "gamma"))
+
+    @property
+    def unequal(self) -> bool:
+        """Say whether the walls may differ."""
+        return "r_left" in self.quantities
+
+    def pair(self, index: np.ndarray, wall: Walls) -> ImpactPair:
+        """Make the pair of the cells with the given flat indices, of NumPy's arrays."""
+        return pair_of({name: self.flat(self.quantities[name], index) for name in self.pair_names}, wall)
 
     @property
     def count(self) -> int:
@@ -232,19 +258,27 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
         rivals = [name for name in several if name in given]
         if len(rivals) > 1:
             raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
-    if "r" in given and not restitution:
-        raise ValueError(f"r must be left out with a membrane that has no restitution; got {checks.shown(given['r'])}")
+    for name in given:
+        whole = of_both_walls(name)
+        for rival in synonyms(whole) if whole else ():
+            if rival in given:
+                raise ValueError(f"{rival} and {name} give the same quantity; give one for both walls, or one for each")
+        if (whole or name) == "r" and not restitution:
+            raise ValueError(
+                f"{name} must be left out with a membrane that has no restitution; got {checks.shown(given[name])}"
+            )
     arrays = {name: check_axis(name, values) for name, values in given.items()}
     values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
     sizes = {name: array.size for name, array in arrays.items() if array.ndim}
     _check_sizes(sizes)
-    quantities = _quantities(values, device, xr)
+    quantities = _quantities(values, device, wall, xr)
     if not restitution:
-        quantities["r"] = xr.Variable((), np.nan)
-    if wall == "rigid":
-        _check_start(quantities["d"], quantities["u0"])
-    motion = [quantities[name] for name in ("d", "r", "gamma", "u0", "v0")]
-    motion += [quantities["kappa"]] if wall == "soft" else []
+        quantities |= {name: xr.Variable((), np.nan) for name in quantities if (of_both_walls(name) or name) == "r"}
+    if wall != "soft":
+        _check_start(quantities["d"], quantities["u0"], wall)
+    stiff = [name for name in quantities if (of_both_walls(name) or name) == "kappa"]
+    energies = {"omega", "A", *(stiff if wall == "rigid" else ())}
+    motion = [quantity for name, quantity in quantities.items() if name not in energies]
     dynamic = tuple(dim for dim in sizes if any(dim in quantity.dims for quantity in motion))
     length = quantities["A"] * math.pi**2 / quantities["omega"] ** 2
     return Cells(
@@ -253,14 +287,15 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
         dynamic=dynamic,
         variant=tuple(dim for dim in sizes if dim not in dynamic),
         quantities=quantities,
-        length=length if wall == "soft" else length / quantities["kappa"],
+        length=length / quantities[stiff[0]] if wall == "rigid" else length,
         speed=quantities["A"] * math.pi / quantities["omega"],
     )
 
 
 def _check_sizes(sizes: dict[str, int]) -> None:
     """Raise unless there is room for the quantities that follow from several axes, and for the indices of cells."""
-    for rows in (("s", "omega", "A"), ("omega0", "k", "omega"), ("beta", "A")):
+    stiff = [(f"omega0_{side}", f"k_{side}", "omega") for side in SIDES]
+    for rows in (("s", "omega", "A"), ("omega0", "k", "omega"), *stiff, ("beta", "A")):
         along = [name for name in rows if name in sizes]
         checks.fits(along, _BYTES * math.prod(sizes[name] for name in along), "the quantities of cells")
     if (count := math.prod(sizes.values())) > _MOST_CELLS:
@@ -270,22 +305,20 @@ def _check_sizes(sizes: dict[str, int]) -> None:
         )
 
 
-def _quantities(values: "dict[str, xr.Variable]", device: Harvester, xr: Any) -> "dict[str, xr.Variable]":
+def _quantities(values: "dict[str, xr.Variable]", device: Harvester, wall: str, xr: Any) -> "dict[str, xr.Variable]":
     def own(name: str) -> "xr.Variable":
         if name in values:
             return values[name]
         return xr.Variable((), check_axis(name, getattr(device, name)))
 
-    r, omega, amplitude, beta = own("r"), own("omega"), own("A"), own("beta")
-    omega0 = np.sqrt(values["k"] / float(device.m_b)) if "k" in values else own("omega0")
+    omega, amplitude, beta = own("omega"), own("A"), own("beta")
     d = values["d"] if "d" in values else own("s") * omega**2 / (amplitude * math.pi**2)
     # A level tube has gamma = 0 whatever A is: dividing would make an energy-only axis a dynamic one.
     tilt = float(device.g) * np.sin(beta)
     gamma = values["gamma"] if "gamma" in values else (tilt / amplitude if tilt.values.any() else tilt)
     return {
         "d": d,
-        "kappa": values["kappa"] if "kappa" in values else omega0 * math.pi / omega,
-        "r": r,
+        **_of_walls(values, device, omega, wall, xr),
         "gamma": gamma,
         "u0": values["u0"] if "u0" in values else np.minimum(START[0], START_REACH * d),
         "v0": values["v0"] if "v0" in values else xr.Variable((), START[1]),
@@ -294,8 +327,48 @@ def _quantities(values: "dict[str, xr.Variable]", device: Harvester, xr: Any) ->
     }
 
 
-def _check_start(d: "xr.Variable", u0: "xr.Variable") -> None:
-    room = 0.5 * d - abs(u0)
+def _of_walls(
+    values: "dict[str, xr.Variable]", device: Harvester, omega: "xr.Variable", wall: str, xr: Any
+) -> "dict[str, xr.Variable]":
+    """Give kappa and r: of both walls, or of each where anything may differ."""
+    if wall == "rigid":
+        _check_rigid(values, device)
+    unequal = device.unequal or wall in RIGID_ON or any(map(of_both_walls, values))
+    table = {}
+    for side, end in ((-1, "_left"), (1, "_right")) if unequal else ((1, ""),):
+        own = device.at(side)
+
+        def given(name: str, end: str = end) -> "xr.Variable | None":
+            return values.get(name + end, values.get(name))
+
+        def constant(name: str, value: Any, end: str = end) -> "xr.Variable":
+            return xr.Variable((), check_axis(name + end, value, name))
+
+        r, kappa, omega0, k = (given(name) for name in ("r", "kappa", "omega0", "k"))
+        if kappa is None:
+            natural = np.sqrt(k / float(device.m_b)) if k is not None else omega0
+            kappa = (constant("omega0", own.omega0) if natural is None else natural) * math.pi / omega
+        table["kappa" + end] = xr.Variable((), np.inf) if end and wall == f"rigid{end}" else kappa
+        table["r" + end] = constant("r", own.r) if r is None else r
+    return dict(sorted(table.items()))
+
+
+def _check_rigid(values: "dict[str, xr.Variable]", device: Harvester) -> None:
+    """Raise ValueError where two rigid walls are given two membranes: they are lent the depth of one."""
+    for name in values:
+        if of_both_walls(name) not in ("", "r"):
+            raise ValueError(
+                f"{name} must be left out of rigid walls, which are lent the depth of one membrane; "
+                f"got {checks.shown(values[name].values)}; give {of_both_walls(name)}"
+            )
+    for name in WALLS_OWN:
+        if name != "r" and isinstance(getattr(device, name), Sides):
+            raise ValueError(f"device.{name} must be one number for rigid walls, lent one membrane; got Sides")
+
+
+def _check_start(d: "xr.Variable", u0: "xr.Variable", wall: str) -> None:
+    beyond = {"rigid_left": -u0, "rigid_right": u0}.get(wall, abs(u0))
+    room = 0.5 * d - beyond
     first = np.argmin(room.values >= 0)
     if room.values.flat[first] < 0:
         got = [float((0 * room + value).values.flat[first]) for value in (u0, d)]

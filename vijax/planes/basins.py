@@ -14,6 +14,7 @@ import numpy as np
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, one_device
 from vijax.model.label import label, ordered
+from vijax.model.pair import symmetric
 from vijax.model.units import Given
 from vijax.planes import sweep
 from vijax.planes.attractor_marks import ENDED, INVARIANTS, SAME, invariants, kinds
@@ -193,6 +194,8 @@ def _plan(axes: Mapping[str, Any], device: Harvester | None, settings: SweepSett
     if merge_mirrors and gamma.any():
         got = gamma[gamma != 0].flat[0]
         raise ValueError(f"merge_mirrors must be left out unless gamma is 0 everywhere; got gamma = {got:g}")
+    if merge_mirrors and not symmetric(planned.cells.quantities).values.all():
+        raise ValueError("merge_mirrors must be left out unless both walls are alike everywhere; got walls that differ")
     return planned
 
 

@@ -7,13 +7,14 @@ finished comparison.
 import enum
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
 from vijax.model.choices import Precision, Until, Walls
 from vijax.model.device import Harvester
 from vijax.model.label import ordered
+from vijax.model.pair import symmetric
 from vijax.model.quantities import synonyms
 from vijax.model.records import SETTLED, Status
 from vijax.planes import sweep
@@ -26,6 +27,7 @@ from vijax.runtime.context import door
 if TYPE_CHECKING:
     import xarray as xr
 
+_WALLS: tuple[Walls, ...] = ("soft", "rigid")
 COMPARED = ("P", "P_stderr", "period", "impacts_left", "impacts_right", "status")
 # Standard errors at which a verdict has to hold still: of a plane of thousands of cells two would often fail by chance.
 SURE = 3.0
@@ -125,7 +127,7 @@ def plan(
     if tolerance is not None:
         tolerance = _checked(tolerance)
     settings.only("a comparison", "periods", "until", "transient", "dtype")
-    soft, rigid = (sweep.plan(axes, COMPARED, device, replace(settings, wall=wall)) for wall in get_args(Walls))
+    soft, rigid = (sweep.plan(axes, COMPARED, device, replace(settings, wall=wall)) for wall in _WALLS)
     return Comparison(soft, rigid, tolerance)
 
 
@@ -175,7 +177,7 @@ def _label(found: "xr.Dataset") -> "xr.DataArray":
         [found[f"{name}_{wall}"] for name in ("period", "impacts_left", "impacts_right")] for wall in ("soft", "rigid")
     )
     (soft_few, soft_many), (rigid_few, rigid_many) = (
-        ordered(left, right, found["gamma"] == 0) for _, left, right in (soft, rigid)
+        ordered(left, right, symmetric(found)) for _, left, right in (soft, rigid)
     )
     agrees = (soft[0] == rigid[0]) & (soft_few == rigid_few) & (soft_many == rigid_many)
     known = (soft[0] >= 0) & (rigid[0] >= 0)

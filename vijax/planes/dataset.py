@@ -20,9 +20,10 @@ from vijax.engine.method_choice import record
 from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.quantities import AXES
 from vijax.model.records import Status
+from vijax.model.sides import named
 from vijax.planes.axes import Cells
 from vijax.planes.expected import NEEDS, ManyStarts
-from vijax.planes.outputs import VARIED, Found, Output, table
+from vijax.planes.outputs import VARIED, Found, Output, needs, table
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import tiles
 from vijax.runtime.pages import see
@@ -77,7 +78,7 @@ class SweepPlan:
     @property
     def needs(self) -> frozenset[str]:
         """Name the fields that the outputs are made of: of `Summary`, or of `expected.ManyStarts`."""
-        return frozenset(need for name in self.outputs for need in self.table[name].needs)
+        return frozenset(need for name in self.outputs for need in needs(self.table[name], self.device))
 
     def cut(self, block: Mapping[str, slice]) -> "SweepPlan":
         """Plan a block of the cells alone."""
@@ -100,8 +101,8 @@ def variables(planned: SweepPlan, fields_found: dict[str, np.ndarray]) -> "dict[
     for name, values in fields_found.items():
         dims = of.dynamic + (of.variant if values.ndim > 1 else ())
         found[name] = xr.Variable(dims, values.reshape([of.sizes[dim] for dim in dims]))
-    named = {name: _variable(name, found, planned) for name in planned.outputs}
-    return named | {"status": flagged(named["status"])}
+    wanted = {name: _variable(name, found, planned) for name in planned.outputs}
+    return wanted | {"status": flagged(wanted["status"])}
 
 
 def specimen(planned: SweepPlan) -> "xr.Dataset":
@@ -112,7 +113,7 @@ def specimen(planned: SweepPlan) -> "xr.Dataset":
     if planned.starts == 1:
         return label(first, {name: np.asarray(getattr(blank, name)) for name in planned.needs})
     one = ManyStarts(np.array([True]))
-    one.add({name: np.asarray(getattr(blank, name)) for name in NEEDS})
+    one.add({name: np.asarray(getattr(blank, name)) for name in NEEDS | (planned.needs & simulate.DEEP)})
     return label(first, one.fields())
 
 
@@ -201,8 +202,15 @@ def asked(planned: SweepPlan) -> dict[str, Any]:
         **record(planned.method),
         "outputs": " ".join(planned.outputs),
         **({} if planned.starts == 1 else {"starts": planned.starts}),
-        **{f"harvester_{name}": float(getattr(planned.device, name)) for name in constants},
-        "harvester_penetration_limit": float(planned.device.depth_limit),
+        **{
+            f"harvester_{argument}": float(value)
+            for name in constants
+            for argument, value in named(name, getattr(planned.device, name)).items()
+        },
+        **{
+            f"harvester_{argument}": float(value)
+            for argument, value in named("penetration_limit", planned.device.depth_limit).items()
+        },
         **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings.dtype).items()},
     }
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.batch import simulate
-from vijax.model.pair import ImpactPair
 from vijax.planes import tile_size
 from vijax.planes.dataset import SweepPlan
 from vijax.planes.expected import NEEDS, ManyStarts
@@ -160,13 +159,13 @@ def _summarise(
         u0, v0 = (of.flat(of.quantities[name], rows) for name in ("u0", "v0"))
         return _run(call, rows, count, place, (u0, v0), planned.needs)
     d = of.flat(of.quantities["d"], rows)
-    folded = ManyStarts(of.flat(of.quantities["gamma"], rows[:count]) == 0)
+    folded = ManyStarts(of.pair(rows[:count], planned.settings.wall).symmetric)
     # Where programs are compiled and no cell is run, one start does.
     for across, speed in start_places(planned.starts if count else 1).T:
         if stopped is not None and stopped.is_set():
             raise CancelledError
         start = across * d, np.full(d.shape, 2 * SPEED * speed)
-        folded.add(_run(call, rows, count, place, start, NEEDS))
+        folded.add(_run(call, rows, count, place, start, NEEDS | (planned.needs & simulate.DEEP)))
     found = folded.fields()
     return {name: found[name] for name in planned.needs}
 
@@ -190,10 +189,11 @@ def _run(
         own = of.factors(scale).astype(settings.dtype)
         return jnp.asarray(np.resize(own, padded(own.size)))
 
-    d, kappa, r, gamma = (column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma"))
+    kind = jnp.dtype(settings.dtype)
+    pair = jax.tree.map(lambda x: jnp.asarray(x.astype(kind)), of.pair(rows, settings.wall))
     u0, v0 = (jnp.asarray(values.astype(settings.dtype)) for values in start)
     summary = simulate.summarise(
-        ImpactPair(d=d, kappa=kappa if settings.wall == "soft" else None, r=r, gamma=gamma),
+        pair,
         u0,
         v0,
         simulate.Scale(

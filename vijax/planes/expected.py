@@ -15,6 +15,8 @@ _FIELDS = {"max_impact_speed": "fastest"}
 NEEDS = frozenset({"P", "deepest", "energy_ratio", *ENDED, *(_FIELDS.get(name, name) for name in INVARIANTS)})
 """Fields of the `Summary` of every start."""
 
+_DEEPEST = "deepest", "deepest_left", "deepest_right"
+
 
 class _Attractor:
     """An attractor of every cell: how many starts ended there, what marks it, the mean power of these starts."""
@@ -61,13 +63,15 @@ class ManyStarts:
         power = found["P"]
         if not self._number:
             self._mean, self._square = np.zeros_like(power), np.zeros_like(power)
-            self._deepest, self._ratio = np.zeros_like(found["deepest"]), np.zeros_like(found["energy_ratio"])
+            self._deepest = {name: np.zeros_like(found[name]) for name in _DEEPEST if name in found}
+            self._ratio = np.zeros_like(found["energy_ratio"])
         self._number += 1
         # Welford's way: where all starts harvest alike, nothing is left of their spread.
         off = power - self._mean
         self._mean += off / self._number
         self._square += off * (power - self._mean)
-        self._deepest = np.maximum(self._deepest, found["deepest"])
+        for name, depth in self._deepest.items():
+            self._deepest[name] = np.maximum(depth, found[name])
         self._ratio = np.maximum(self._ratio, found["energy_ratio"])
         self._match(found)
 
@@ -113,7 +117,7 @@ class ManyStarts:
             "best_share_stderr": np.sqrt(share * (1 - share) / number),
             "attractors": ((period >= 0) & (count > 0)).sum(axis=0).astype(np.int32),
             "undecided": np.where(period < 0, count, 0).sum(axis=0) / number,
-            "deepest": self._deepest,
+            **self._deepest,
             "energy_ratio": self._ratio,
             "status": status[ended, cell],
         }

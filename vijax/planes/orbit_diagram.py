@@ -19,9 +19,10 @@ from vijax.batch.impact_log import Record, record
 from vijax.model import energy
 from vijax.model.choices import Direction, Precision, Walls
 from vijax.model.device import Harvester, one_device
-from vijax.model.pair import ImpactPair
+from vijax.model.pair import pair_of
 from vijax.model.quantities import MEASURED, PARAMETERS, STARTS
 from vijax.model.records import State, Status
+from vijax.model.sides import named
 from vijax.model.units import Given
 from vijax.planes import estimate
 from vijax.planes.axes import Axes, cells, check_axis
@@ -246,11 +247,12 @@ def _table(diagram: Diagram) -> dict[str, np.ndarray]:
         full = quantity.set_dims(dims).transpose(*dims).values.reshape(-1, diagram.points)
         return np.take_along_axis(np.tile(full, (len(diagram.ways), 1)), orders, axis=1)
 
-    table = {name: column(of.quantities[name]) for name in ("d", "kappa", "r", "gamma", "u0", "v0")}
+    table = {name: column(of.quantities[name]) for name in (*of.pair_names, "u0", "v0")}
     # In metres per unit of displacement; of a rigid wall the engine's depth is that of kappa = 1.
     table |= {"metres": column(of.length), "speed": column(of.speed)}
+    stiff = "kappa_left" if of.unequal else "kappa"
     rigid = diagram.settings.wall == "rigid"
-    table["depth"] = table["metres"] / table["kappa"] if rigid else table["metres"]
+    table["depth"] = table["metres"] / table[stiff] if rigid else table["metres"]
     return table
 
 
@@ -300,7 +302,7 @@ def _simulate(
         "period_number": impacts["n"],
         "restitution": -impacts["v_out"] / impacts["v_in"],
         "depth": depth,
-        "E": np.asarray(energy.harvested_energy(planned.device, depth)),
+        "E": np.asarray(energy.harvested_energy(planned.device.at(impacts["side"]), depth)),
         **{name: impacts[name] for name in ("side", "v_in", "v_out", "duration")},
         "u_strobe": flown.u,
         "v_strobe": flown.v,
@@ -311,8 +313,9 @@ def _simulate(
         "energy_ratio": summary.energy_ratio[..., 0],
     }
     points["max_penetration"] = summary.deepest * table["depth"]
-    within = points["max_penetration"] <= float(planned.device.depth_limit)
-    points["admissible"] = within & (points["energy_ratio"] <= 1)
+    limits = named("deepest", planned.device.depth_limit)
+    within = [getattr(summary, name) * table["depth"] <= float(limit) for name, limit in limits.items()]
+    points["admissible"] = np.all(within, axis=0) & (points["energy_ratio"] <= 1)
     points |= {name: getattr(summary, name) for name in ("period", "impacts_left", "impacts_right", "status")}
     return points | {name: values.reshape(shape + values.shape[1:]) for name, values in fields.items()}
 
@@ -331,10 +334,9 @@ def _follow(planned: SweepPlan, table: dict[str, np.ndarray], lanes: int, period
             widths = ((0, lanes - chains), (0, _LINKS - links))
             return jnp.asarray(np.pad(x[:, first : first + links], widths, mode="edge"))
 
-        soft = planned.settings.wall == "soft"
-        d, kappa, r, gamma = (extended(table[name]) for name in ("d", "kappa", "r", "gamma"))
+        pair = pair_of({name: extended(table[name]) for name in planned.cells.pair_names}, planned.settings.wall)
         summary = simulate.follow(
-            ImpactPair(d, kappa if soft else None, r, gamma),
+            pair,
             simulate.Starts(*(jnp.asarray(np.pad(x, (0, lanes - chains), mode="edge")) for x in state)),
             simulate.Growth(extended(growth["metres"]), extended(growth["speed"])),
             extended(table["depth"]),
@@ -354,14 +356,11 @@ def _follow(planned: SweepPlan, table: dict[str, np.ndarray], lanes: int, period
 
 def _fly(planned: SweepPlan, table: dict[str, np.ndarray], summary: Any, recorded_periods: int) -> Record:
     """Fly the kept periods of every point again, from where they begin."""
-    soft = planned.settings.wall == "soft"
-    d, kappa, r, gamma = arrays([table[name].ravel() for name in ("d", "kappa", "r", "gamma")])
+    pair = arrays(pair_of({name: table[name].ravel() for name in planned.cells.pair_names}, planned.settings.wall))
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
     whole_numbers = (x.astype(np.int32) for x in (n, held))
     lost = np.isin(summary.status, (Status.EVENT_BUDGET, Status.NONFINITE)).ravel()
-    return record(
-        ImpactPair(d, kappa if soft else None, r, gamma), State(u, v, t, *whole_numbers), recorded_periods, ~lost
-    )
+    return record(pair, State(u, v, t, *whole_numbers), recorded_periods, ~lost)
 
 
 def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":

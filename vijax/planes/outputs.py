@@ -1,12 +1,15 @@
 """The outputs of a map: what each variable is, its unit, what it needs of a `Summary`, and how it follows from that."""
 
 from collections.abc import Callable
+from functools import reduce
+from operator import and_
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vijax.model.device import Harvester
 from vijax.model.quantities import MEASURED
+from vijax.model.sides import Sides, named
 from vijax.planes.axes import Cells
 
 if TYPE_CHECKING:
@@ -37,8 +40,9 @@ def _speed(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
 
 
 def _admissible(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
-    within = _penetration(found, cells, device) <= float(device.depth_limit)
-    return (found["energy_ratio"] <= 1) & within
+    limits = named("deepest", device.depth_limit)
+    within = [found[name] * cells.length <= float(limit) for name, limit in limits.items()]
+    return reduce(and_, within, found["energy_ratio"] <= 1)
 
 
 def _risk(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
@@ -95,13 +99,20 @@ EXPECTED = {
     "status": Output("1", "how most starts ended, or that one failed", ("status",)),
 }
 """The outputs of a map over many starts in every cell, made of the fields of `expected.ManyStarts`."""
+SIDES_DEEPEST = "deepest_left", "deepest_right"
 # Fields in units that vary where the motion does not: a column for every variant.
 VARIED = {
-    *("P", "P_stderr", "energy_ratio", "deepest", "fastest"),
+    *("P", "P_stderr", "energy_ratio", "deepest", *SIDES_DEEPEST, "fastest"),
     *("P_least", "P_greatest", "best_share", "best_share_stderr"),
 }
 # Variables that few ask for, and that cost something: a tangent map along the motion, or another sum.
 ON_REQUEST = ("asymmetry", "lyapunov")
+
+
+def needs(output: Output, device: Harvester) -> tuple[str, ...]:
+    """Name the fields that an output needs of cells of a device: by wall where these have limits of their own."""
+    by_wall = output.formula is _admissible and isinstance(device.depth_limit, Sides)
+    return (*output.needs, *(SIDES_DEEPEST if by_wall else ()))
 
 
 def table(starts: int) -> dict[str, Output]:

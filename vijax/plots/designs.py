@@ -178,7 +178,7 @@ def _mark(axes: Axes, report: dict[str, Any], along: str) -> None:
     if band is not None:
         axes.axvspan(here * band[0], here * band[1], label="tolerance", **_BAND)
     if report["surroundings"]:
-        _edges(axes, report["surroundings"], best["omega0"], here, along)
+        _edges(axes, report["surroundings"], best.get("omega0"), here, along)
     _ends(axes, report["extents"], here, along)
     if along in report["tune"] and report["objective"] in _JOULES:
         column = np.asarray(best["path"])[:, report["tune"].index(along)]
@@ -195,11 +195,11 @@ def _ends(axes: Axes, extents: list[dict[str, Any]], here: float, along: str) ->
             axes.axvspan(*ends, label="as far as this motion lasts", **_WINDOW)
 
 
-def _edges(axes: Axes, around: dict[str, Any], omega0: float, here: float, along: str) -> None:
+def _edges(axes: Axes, around: dict[str, Any], omega0: float | None, here: float, along: str) -> None:
     """Show where the optimum's orbit meets its first bifurcations."""
     for side in ("below", "above"):
         edge = around[side]
-        if edge and constant(along) == "omega0" and edge["kind"] != "none":
+        if edge and omega0 and constant(along) == "omega0" and edge["kind"] != "none":
             power = 2 if along == "k" else 1
             axes.axvline(here * (edge["omega0"] / omega0) ** power, label=edge["kind"], **_EDGE)
 
@@ -207,7 +207,7 @@ def _edges(axes: Axes, around: dict[str, Any], omega0: float, here: float, along
 def _here(best: dict[str, Any], along: str) -> float:
     """Find where the optimum is on an axis."""
     known = best["values"] | best["pair"] | best["device"]
-    return float(known[along] if along in known else known["m_b"] * known["omega0"] ** 2)
+    return float(known[along] if along in known else known["m_b"] * known[constant(along)] ** 2)
 
 
 def _micro(energy: float) -> str:

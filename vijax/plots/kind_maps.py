@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
 
 from vijax.model.label import label
+from vijax.model.pair import symmetric
 from vijax.plots.cells import edges, panels
 from vijax.plots.figure import styled
 from vijax.plots.style import LABEL_NEEDS, layout_of_kinds, title
@@ -62,7 +63,7 @@ def label_map(dataset: "xr.Dataset") -> Figure:
 def of_labels(dataset: "xr.Dataset") -> "tuple[xr.Dataset, list[Category]]":
     """Turn labels into places among categories: the commonest by name, the others, and what is no orbit."""
     period = dataset["period"]
-    level = (dataset["gamma"] == 0).broadcast_like(period).transpose(*period.dims)
+    level = symmetric(dataset).broadcast_like(period).transpose(*period.dims)
     words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
     codes, categories = _named(words, int(dataset.attrs["periods"]))
     drawn = dataset[["lyapunov"] if "lyapunov" in dataset else []].assign(

@@ -10,6 +10,7 @@ from vijax.batch.run_records import Trajectory
 from vijax.model.device import Harvester, depth_unit, one_device
 from vijax.model.energy import harvested_energy
 from vijax.model.pair import ImpactPair
+from vijax.model.sides import at
 from vijax.orbits.motion import Curve, curve
 from vijax.plots.figure import styled
 from vijax.runtime import checks
@@ -76,10 +77,11 @@ def energies(pair: ImpactPair, path: Trajectory, device: Harvester | None = None
     line, onset, there = _followed(pair, path)
     device = one_device(device)
     speed = float(device.speed_unit)
-    depth = np.asarray(path.impacts.depth)[there] * float(depth_unit(device, pair))
+    side = np.asarray(path.impacts.side)[there]
+    depth = np.asarray(path.impacts.depth)[there] * np.asarray(at(depth_unit(device, pair), side))
     given = float(device.m_b) * speed**2 * np.asarray(path.impacts.work)[there]
-    harvested = np.asarray(harvested_energy(device, depth))
-    refused = (harvested > given) | (depth > float(device.depth_limit))
+    harvested = np.asarray(harvested_energy(device.at(side), depth))
+    refused = (harvested > given) | (depth > np.asarray(at(device.depth_limit, side)))
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     upper, lower = figure.subplots(2, sharex=True)
     upper.plot(line.t, 0.5 * float(device.m_b) * (speed * line.v) ** 2, **_BALL)

@@ -1,0 +1,146 @@
+"""Two walls that differ: what is taken from which, the pair and the device of such walls, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vijax
+from vijax import Sides
+from vijax.model import pair as pairs
+from vijax.model.device import changed, constant_of, depth_unit, realised, told_device, with_constants, with_pair
+from vijax.model.energy import admissible, harvested_energy
+from vijax.model.sides import apart, at, each, named
+
+
+def test_each_wall_has_its_own_and_both_what_they_share():
+    own = Sides(np.array([1.0, 2.0]), np.array([3.0, 4.0]))
+    np.testing.assert_array_equal(at(own, np.array([-1, 1])), [1.0, 4.0])
+    np.testing.assert_array_equal(at(own, 1), [3.0, 4.0])
+    assert at(5.0, -1) == 5.0
+    assert each(lambda a, b: a + b, Sides(1, 2), 10) == Sides(11, 12)
+    assert each(lambda a: a + 1, 1) == 2
+    assert apart(7) == Sides(7, 7)
+    assert named("r", Sides(1, 2)) == {"r_left": 1, "r_right": 2}
+    assert named("r", 1) == {"r": 1}
+
+
+def test_a_pair_takes_a_number_for_each_wall():
+    pair = vijax.impact_pair([0.2, 0.3], Sides(12.0, [50.0, 60.0]), 0.5, 0.1)
+    assert pair.unequal
+    assert not pair.rigid
+    for field in (pair.kappa, pair.r):
+        assert field.left.shape == field.right.shape == (2,)
+    left, right = pair.at(-1), pair.at(1)
+    assert not left.unequal
+    np.testing.assert_array_equal(left.kappa, [12.0, 12.0])
+    np.testing.assert_array_equal(right.kappa, [50.0, 60.0])
+    np.testing.assert_allclose(pair.mu.right, right.mu, rtol=1e-15)
+    np.testing.assert_allclose(pair.omega1.left, left.omega1, rtol=1e-15)
+    own = pairs.pair_of(pairs.quantities(pair), "soft")
+    assert jax.tree.structure(own) == jax.tree.structure(pair)
+    assert all(np.array_equal(*both) for both in zip(jax.tree.leaves(own), jax.tree.leaves(pair), strict=True))
+    plain = vijax.impact_pair(0.2, 12.0, 0.5)
+    assert plain.at(1) is plain
+    # A rigid wall beside a soft one, two rigid ones of which each loses its own, and two that are none.
+    mixed, hard = vijax.impact_pair(0.2, Sides(25.0, None), 0.5), vijax.impact_pair(0.2, None, Sides(0.5, 0.7))
+    assert (mixed.walls, mixed.hard_wall, mixed.rigid) == ("rigid_right", 1, False)
+    assert (hard.walls, hard.hard_wall, hard.rigid, hard.unequal) == ("rigid", 0, True, True)
+    assert vijax.impact_pair(0.2, Sides(None, None), 0.5).walls == "rigid"
+    assert vijax.impact_pair(0.2, Sides(None, 25.0), 0.5).walls == "rigid_left"
+    assert "kappa_right" not in pairs.quantities(mixed)
+
+
+def test_what_the_wall_on_a_side_does_is_computed_by_its_form():
+    side = jnp.array([-1.0, 1.0])
+    kappa = {"soft": 12.0, "rigid": None, "rigid_left": Sides(None, 12.0), "rigid_right": Sides(12.0, None)}
+    wanted = {"soft": [1, 1], "rigid": [2, 2], "rigid_left": [2, 1], "rigid_right": [1, 2]}
+    for walls, given in kappa.items():
+        pair = vijax.impact_pair(0.2, given, Sides(0.5, 0.7))
+        assert pair.walls == walls
+        kind, r = pair.met(side, lambda wall: (0 * side + 2, wall.r), lambda wall: (0 * side + 1, wall.r))
+        np.testing.assert_array_equal(kind, wanted[walls])
+        np.testing.assert_array_equal(r, [0.5, 0.7])
+        np.testing.assert_array_equal(pair.hard(side) & np.full(2, True), np.array(wanted[walls]) == 2)
+
+
+def test_a_mirror_image_is_a_motion_too_only_where_walls_are_alike():
+    levels = [0.0, 0.0, 0.1]
+    walls = {
+        "equal": (40.0, 0.5, [True, True, False]),
+        "kappa": (Sides(40.0, [40.0, 41.0, 40.0]), 0.5, [True, False, False]),
+        "r": (40.0, Sides(0.5, [0.5, 0.6, 0.5]), [True, False, False]),
+        "rigid r": (None, Sides(0.5, [0.5, 0.6, 0.5]), [True, False, False]),
+        "one rigid": (Sides(40.0, None), 0.5, [False, False, False]),
+    }
+    for kappa, r, wanted in walls.values():
+        pair = vijax.impact_pair(0.2, kappa, r, levels)
+        np.testing.assert_array_equal(pair.symmetric, wanted)
+        if not pair.hard_wall:
+            np.testing.assert_array_equal(pairs.symmetric(pairs.quantities(pair)), wanted)
+
+
+def test_a_device_gives_each_wall_its_own():
+    device = vijax.Harvester(omega0=Sides(300.0, 500.0), V=Sides(1000.0, 2000.0), A=2.0)
+    pair = device.pair()
+    assert pair.unequal
+    np.testing.assert_allclose([pair.kappa.left, pair.kappa.right], [300.0, 500.0], rtol=1e-15)
+    np.testing.assert_allclose([device.k.left, device.k.right], [315.0, 875.0], rtol=1e-15)
+    assert device.pair("rigid_left").walls == "rigid_left"
+    # Where anything differs the pair is of two walls, too: energies ask it which was met.
+    assert vijax.Harvester(V=Sides(1.0, 2.0)).pair().unequal
+    depth = 1e-4
+    for side, V in ((-1, 1000.0), (1, 2000.0)):
+        wanted = harvested_energy(vijax.Harvester(V=V), depth)
+        np.testing.assert_allclose(harvested_energy(device.at(side), depth), wanted, rtol=1e-15)
+    back = with_pair(vijax.Harvester(A=2.0), pair)
+    np.testing.assert_allclose([back.omega0.left, back.omega0.right], [300.0, 500.0], rtol=1e-14)
+    rims = vijax.Harvester(R0=Sides(0.0063, 0.007))
+    assert rims.depth_limit == Sides(0.0063, 0.007)
+    assert not admissible(rims.at(-1), 0.0, 1.0, jnp.asarray(0.0065))
+    assert admissible(rims.at(1), 0.0, 1.0, jnp.asarray(0.0065))
+    lent = depth_unit(device, vijax.impact_pair(0.2, None, 0.5))
+    assert lent.left / lent.right == pytest.approx(5 / 3)
+
+
+def test_constants_of_one_wall_have_names_of_their_own():
+    device = with_constants(vijax.Harvester(), omega0_left=300.0, k_right=875.0, V_right=1000.0)
+    assert float(device.omega0.left) == 300.0
+    assert float(device.omega0.right) == pytest.approx(500.0)
+    assert Sides(2000.0, 1000.0) == device.V
+    assert float(constant_of(device, "k_left")) == pytest.approx(315.0)
+    assert constant_of(device, "A") == 1.0
+    assert changed(device, {"r": 0.3}).r == 0.3
+    told = {f"harvester_{name}": value for name, value in named("V", device.V).items()}
+    assert told_device(told).V == device.V
+
+
+@pytest.mark.parametrize("wall", ["soft", "rigid_left"])
+def test_a_table_is_realised_by_the_device_that_has_it(wall):
+    table = {"d": 0.2, "kappa_left": 20.0, "kappa_right": 40.0, "r_left": 0.5, "r_right": 0.6, "gamma": 0.0}
+    pair, device = realised(vijax.Harvester(), table | {"A": 2.0, "omega": 6.0}, wall)
+    assert pair.walls == wall
+    assert float(pair.r.right) == 0.6
+    assert float(device.omega0.right) == pytest.approx(40 * 6 / np.pi)
+
+
+BAD = [
+    (lambda: vijax.impact_pair(0.2, Sides(12.0, -1.0), 0.5), r"kappa_right must be positive .*got -1"),
+    (lambda: vijax.impact_pair(0.2, 12.0, Sides(0.5, 1.5)), r"r_right must lie in \(0, 1\]"),
+    (lambda: vijax.impact_pair(0.2, Sides([12.0, 13.0], [1.0, 2.0, 3.0]), 0.5), "broadcast"),
+    (lambda: vijax.Harvester(A=Sides(1.0, 2.0)), "A must be of the whole device, as only omega0, r, w0"),
+    (lambda: vijax.Harvester(R0=Sides(0.0063, 0.004)), "r_b must be smaller than R0_right"),
+    (lambda: vijax.Harvester(omega0=Sides(1.0, 0.0)), "omega0_right must be positive"),
+    (lambda: harvested_energy(vijax.Harvester(V=Sides(1.0, 2.0)), 1e-4), "device must be that of one wall"),
+    (lambda: vijax.impact_pair(0.2, Sides(12.0, None), 0.5).mu, "kappa must be a number"),
+    (lambda: pairs.membrane_pair(vijax.impact_pair(0.2, Sides(12.0, 13.0), 0.5)), "pair must have equal walls"),
+    (lambda: with_pair(vijax.Harvester(), vijax.impact_pair(0.2, Sides(12.0, None), 0.5)), "one rigid and one soft"),
+    (lambda: with_constants(vijax.Harvester(), A_left=2.0), "A_left must be a constant of the device"),
+    (lambda: vijax.trajectory(vijax.impact_pair(0.2, Sides(None, 12.0), 0.5), -0.15, 0.0, 1), "u0 must lie within"),
+]
+
+
+@pytest.mark.parametrize(("act", "words"), BAD, ids=[words[:24] for _, words in BAD])
+def test_what_cannot_be_is_told(act, words):
+    with pytest.raises(ValueError, match=words):
+        act()

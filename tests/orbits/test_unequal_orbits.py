@@ -1,0 +1,206 @@
+"""Orbits between walls that differ: derivatives by wall, branches and curves along what one wall has, limits."""
+
+import warnings
+from functools import partial
+
+import jax
+import mpmath as mp
+import numpy as np
+import pytest
+
+import vijax
+from benchmarks.yardstick import DIGITS, mp_contact, mp_flight, newton
+from vijax import Sides
+from vijax.model.records import Status
+from vijax.orbits import limits, parameter, symmetry
+from vijax.orbits.curve_plane import check_plane
+
+DEVICE = vijax.Harvester(V=Sides(1500.0, 2000.0))
+# d, kappa and r of the left wall and of the right one, gamma: of 1:1 orbits that attract.
+CELLS = [
+    (0.25, 30.0, 60.0, 0.5, 0.4, 0.0),
+    (0.3, 12.0, 20.0, 0.6, 0.4, 0.05),
+    (0.28, 80.0, 25.0, 0.5, 0.5, -0.03),
+    (0.35, 40.0, 40.0, 0.3, 0.6, 0.0),
+    (0.22, 9.0, 14.0, 0.4, 0.45, 0.1),
+]
+
+
+def pair_of(d, left, right, r_left, r_right, gamma):
+    return vijax.impact_pair(d, Sides(left, right), Sides(r_left, r_right), gamma)
+
+
+@pytest.fixture(scope="module")
+def orbits():
+    """The attracting 1:1 orbit of every cell."""
+    found = []
+    for cell in CELLS:
+        some = vijax.find_orbits(pair_of(*cell), "LR", guesses=64)
+        size = np.abs(np.asarray(some.multipliers)).max(axis=1)
+        assert size.min() < 1
+        found.append(some[int(size.argmin())])
+    return found
+
+
+def mp_energy(depth, side):
+    """The energy of an impact that goes so deep [m], written down anew."""
+    constants = (DEVICE.r_b, DEVICE.R0, DEVICE.eps_M, DEVICE.w0, DEVICE.C_T)
+    ball, rim, eps_M, w0, C_T = map(mp.mpf, constants)
+    V = mp.mpf(DEVICE.V.right if side > 0 else DEVICE.V.left)
+    height = ball - depth
+    tangent = mp.sqrt(rim**2 + height**2 - ball**2)
+    cosine = (ball * height + rim * tangent) / (rim**2 + height**2)
+    touch = ball * mp.sqrt(1 - cosine**2)
+    area = 2 * mp.pi * ball**2 * (1 - cosine) + (mp.pi * rim**2 - mp.pi * touch**2) / cosine
+    least, most = (eps_M * size**2 / (w0 * mp.pi * rim**2) for size in (mp.pi * rim**2, area))
+    return (most + C_T) / (least + C_T) * (most - least) * V**2 / 2
+
+
+def mp_power(cell, knots, side):
+    """P of the orbit near a 1:1 orbit's knots, solved anew in 50 digits."""
+    d, *walls, gamma = map(mp.mpf, cell)
+    own = {-1: (walls[0], walls[2]), 1: (walls[1], walls[3])}
+
+    def ends(j, t, speed, stay):
+        course = partial(mp_contact, *own[side[j]], gamma, side[j], t, speed)
+        return course, *course(stay)[:2]
+
+    def gaps(*x):
+        out = []
+        for j in range(2):
+            t, speed, stay = x[3 * j : 3 * j + 3]
+            _, w, z = ends(j, t, speed, stay)
+            onward = x[3] if j == 0 else x[0] + 2
+            rise, v = mp_flight(gamma, t + stay, side[j] * z, onward - t - stay)
+            out += [w, side[j] * d / 2 + rise - side[1 - j] * d / 2, side[1 - j] * v - x[3 * (1 - j) + 1]]
+        return out
+
+    x = mp.findroot(gaps, [mp.mpf(float(value)) for value in np.ravel(knots)], tol=mp.mpf(10) ** -80, maxsteps=20)
+    total = mp.mpf(0)
+    for j in range(2):
+        course, _, _ = ends(j, *x[3 * j : 3 * j + 3])
+        deepest = newton(lambda s, course=course: course(s)[1:], x[3 * j + 2] / 2)
+        total += mp_energy(course(deepest)[0] * mp.mpf(1), side[j])
+    return total / 2
+
+
+def test_powers_and_derivatives_by_wall_are_those_of_fifty_digits(orbits):
+    """The unit of length of the device is a metre, as A is 1 and omega pi."""
+    slope = jax.jit(jax.value_and_grad(lambda pair, orbit: vijax.steady(DEVICE, orbit, pair=pair).P))
+    step = mp.mpf(10) ** -12
+    for cell, orbit in zip(CELLS, orbits, strict=True):
+        P, grad = slope(pair_of(*cell), orbit)
+        knots, side = np.asarray(orbit.knots)[:2], [int(s) for s in np.asarray(orbit.sequence.side)[:2]]
+        with mp.workdps(DIGITS):
+            assert float(P) == pytest.approx(float(mp_power(cell, knots, side)), rel=1e-12)
+            mine = [grad.kappa.left, grad.kappa.right, grad.r.left, grad.r.right]
+            for place, got in enumerate(mine, start=1):
+                moved = [list(map(mp.mpf, cell)) for _ in range(2)]
+                moved[0][place] += step
+                moved[1][place] -= step
+                high, low = (mp_power(one, knots, side) for one in moved)
+                assert float(got) == pytest.approx(float((high - low) / (2 * step)), rel=1e-9)
+
+
+def test_a_branch_along_one_wall_leads_from_equal_walls_to_any_other(orbits):
+    """Where it ends it has the orbit that is found there; what was a pitchfork of mirror images has become a fold."""
+    begun = vijax.find_orbits(vijax.impact_pair(0.25, 30.0, 0.5), "LR", guesses=64)
+    size = np.abs(np.asarray(begun.multipliers)).max(axis=1)
+    (branch,) = vijax.follow_orbits(begun[int(size.argmin()) :][:1], "kappa_right", (30.0, 60.0), direction="up")
+    assert branch.ends[1] == "high"
+    last = branch.orbit[-1:]
+    assert float(last.pair.kappa.right[0]) == pytest.approx(60.0)
+    assert float(last.pair.kappa.left[0]) == 30.0
+    there = vijax.find_orbits(vijax.impact_pair(0.25, Sides(30.0, 60.0), 0.5), "LR", guesses=64)
+    off = [np.abs(np.asarray(one.knots - last[0].knots)).max() for one in (there[i] for i in range(len(there)))]
+    assert min(off) < 1e-9
+    assert not symmetry.symmetric(last).any()
+    dataset = vijax.branch_dataset([branch], DEVICE)
+    assert float(dataset["kappa_left"]) == 30.0
+    assert "kappa_right" in dataset.coords
+    np.testing.assert_allclose(dataset["P"].values[0, -1], float(vijax.orbit_power(last, DEVICE)[0]), rtol=1e-12)
+
+
+def test_a_curve_in_the_plane_of_one_wall_passes_the_folds_of_branches_across_it():
+    pair = vijax.impact_pair(0.2, Sides(20.0, 40.0), 0.5)
+    orbit = vijax.find_orbits(pair, "LR", guesses=64)
+    index = int(np.abs(np.asarray(orbit.multipliers)).max(axis=1).argmin())
+    told = {"direction": "down"}
+    (one,) = vijax.follow_orbits(orbit[index : index + 1], "d", (0.13, 0.21), **told)
+    folds = [point for point in one.points if point.kind == "fold"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (curve, *_) = vijax.follow_curves(folds[:1], "d", {"d": (0.1, 0.3), "kappa_left": (15.0, 30.0)})
+    assert curve.kind == "fold"
+    _, kappa = curve.values[-1]
+    near = curve.orbit[-1:]
+    assert float(near.pair.kappa.left[0]) == pytest.approx(kappa, rel=1e-12)
+    assert float(near.pair.kappa.right[0]) == 40.0
+    multipliers = np.asarray(near.multipliers)[0]
+    assert np.abs(multipliers - 1).min() < 1e-6
+    dataset = vijax.curve_dataset([curve])
+    assert {"kappa_right", "r_left", "r_right"} < set(dataset.coords)
+    assert dataset.attrs["wall"] == "soft"
+
+
+def test_limits_are_those_of_the_wall_that_is_met(orbits):
+    orbit = orbits[0]
+    pair = jax.tree.map(lambda x: np.asarray(x)[None], orbit)
+    depth, side = np.asarray(orbit.depth), np.asarray(orbit.sequence.side)
+    real = side != 0
+    device = vijax.Harvester(r_b=0.004, R0=Sides(0.005, 0.02))
+    load = limits.loads(pair, device)["penetration limit"][0]
+    np.testing.assert_allclose(load[real], (depth / np.where(side > 0, 0.02, 0.005))[real], rtol=1e-14)
+
+
+MIXED = vijax.impact_pair(0.3, Sides(30.0, None), Sides(0.5, 0.7))
+
+
+def test_an_orbit_between_a_rigid_wall_and_a_membrane_is_steady_and_has_derivatives():
+    some = vijax.find_orbits(MIXED, "LR", guesses=64)
+    size = np.abs(np.asarray(some.multipliers)).max(axis=1)
+    one = some[int(size.argmin())]
+    device = vijax.Harvester()
+
+    def P(pair):
+        return vijax.steady(device, one, pair=pair)
+
+    state = P(MIXED)
+    assert int(state.status) == Status.OK
+    assert float(state.P) == pytest.approx(float(vijax.orbit_power(some, device)[int(size.argmin())]), rel=1e-12)
+    grad = jax.grad(lambda pair: P(pair).P)(MIXED)
+    assert grad.kappa.right is None
+    h = 1e-4
+
+    def moved(**by):
+        given = {"left": 30.0, "r_left": 0.5, "r_right": 0.7} | by
+        pair = vijax.impact_pair(0.3, Sides(given["left"], None), Sides(given["r_left"], given["r_right"]))
+        return float(P(pair).P)
+
+    for name, got in (("left", grad.kappa.left), ("r_left", grad.r.left), ("r_right", grad.r.right)):
+        here = {"left": 30.0, "r_left": 0.5, "r_right": 0.7}[name]
+        difference = (moved(**{name: here + h}) - moved(**{name: here - h})) / (2 * h)
+        assert float(got) == pytest.approx(difference, rel=1e-5)
+
+
+BAD = [
+    (lambda orbit: vijax.follow_orbits(orbit, "kappa", (10.0, 90.0)), "along must be kappa_left or kappa_right"),
+    (lambda orbit: vijax.follow_orbits(orbit, "k", (10.0, 90.0)), "along must be k_left or k_right, of one wall"),
+    (lambda orbit: vijax.follow_orbits(orbit, "r", (0.1, 0.9)), "along must be r_left or r_right"),
+    (
+        lambda orbit: check_plane(orbit.pair, {"kappa_left": (1.0, 2.0), "omega0_left": (1.0, 2.0)}),
+        "kappa_left and omega0_left, which say the same",
+    ),
+    (lambda orbit: parameter.check_along(MIXED, "d", (0.1, 0.2)), "between two walls of one kind"),
+    (
+        lambda orbit: vijax.steady(DEVICE, orbit[0], pair=vijax.impact_pair(0.2, Sides(20.0, None), 0.5)),
+        "pair must have the walls of the orbit",
+    ),
+]
+
+
+@pytest.mark.parametrize(("act", "words"), BAD, ids=[words[:24] for _, words in BAD])
+def test_what_cannot_be_is_told(orbits, act, words):
+    one = jax.tree.map(lambda x: np.asarray(x)[None], orbits[0])
+    with pytest.raises(ValueError, match=words):
+        act(one)
