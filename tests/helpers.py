@@ -15,7 +15,7 @@ SCRIPTS = Path(__file__).parent.parent / "scripts"
 
 def stand_in(pair, u0, v0, scale, device, *, count, **settings) -> simulate.Summary:
     """In place of `simulate.summarise`: at once, and every field tells which cell it is."""
-    kappa = np.ones_like(pair.d) if pair.kappa is None else np.asarray(pair.kappa)
+    kappa = np.ones_like(pair.d) if pair.kappa is None else np.asarray(pair.at(1).kappa)
     mark = np.asarray(pair.d) + 10 * kappa + 1e4 * np.asarray(pair.gamma) + 1e5 * np.asarray(u0) + 0 * np.asarray(v0)
     energy = mark[:, None] * np.asarray(scale.length)[:, None] * np.asarray(scale.length_variant)
     whole = np.arange(mark.size, dtype=np.int32)

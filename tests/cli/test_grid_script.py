@@ -204,6 +204,16 @@ def test_settings_and_constants_arrive(planned):
     assert (plan.device.V, plan.device.m_b) == (1000.0, 0.01)
 
 
+def test_walls_that_differ_arrive(planned):
+    """What one wall is given takes the default of both away."""
+    given = planned("--kappa_left", "20:40:3", "--r_right", "0.6", "--set", "V_left=1500")
+    assert list(given.cells.sizes) == ["d", "kappa_left"]
+    assert given.cells.unequal
+    assert float(given.cells.quantities["r_right"]) == 0.6
+    assert (float(given.device.V.left), float(given.device.V.right)) == (1500.0, 2000.0)
+    assert planned("--wall", "rigid_left").settings.wall == "rigid_left"
+
+
 def test_methods_and_membranes_arrive(planned):
     plan = planned("--method", "ode", "--solver", "Dopri8", "--rtol", "1e-9", "--atol", "1e-11")
     assert (plan.method.solver, plan.method.rtol, plan.method.atol) == ("Dopri8", 1e-9, 1e-11)

@@ -14,6 +14,7 @@ from vijax.design.average import Smoothness, average
 from vijax.engine.ground import Ground
 from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.energy import harvested_energy
+from vijax.model.sides import Sides
 
 DEVICE = Harvester(s=0.2, omega0=60.0, beta=0.02, penetration_limit=0.004)
 
@@ -183,3 +184,30 @@ def test_a_traced_ensemble_runs_the_program_of_its_ground(monkeypatch, beta):
 def test_what_cannot_be_is_said_at_the_door(given, said):
     with pytest.raises(ValueError, match=said):
         average(**{"device": DEVICE, **given})
+
+
+def test_walls_that_differ_have_derivatives_of_their_own(monkeypatch):
+    """Of a surface that is known: each wall's stiffness and restitution, and what its membrane is made of."""
+    device = dataclasses.replace(DEVICE, omega0=Sides(50.0, 70.0), r=Sides(0.4, 0.6), V=Sides(1500.0, 2000.0))
+
+    def P(pair, electric, length):
+        deep = 3e-3 * pair.d**0.3 * (pair.kappa.left / 60) ** -0.5 * (pair.kappa.right / 60) ** -0.3
+        deep = (deep * pair.r.left**0.4 * pair.r.right**0.1 * jnp.exp(pair.gamma))[..., None] * length
+        return sum(harvested_energy(electric.at(side), deep) for side in (-1, 1))
+
+    def flown(pair, start, length, electric, count, periods):
+        every = jnp.zeros(pair.d.shape, jnp.int32)
+        value = P(pair, electric, length)
+        return Ended(value, 0.0 * value, every)
+
+    monkeypatch.setattr(perturbed, "averages", flown)
+    found = average(device, balls=512, spread=1e-3)
+    exact = jax.grad(lambda device: P(device.pair(), device, device.length_unit)[0])(jax.tree.map(float, device))
+    assert bool(found.smooth)
+    for name in ("omega0", "r", "V"):
+        for side in ("left", "right"):
+            mine, wanted = (float(getattr(getattr(of, name), side)) for of in (found.by_device, exact))
+            assert mine == pytest.approx(wanted, rel=1e-4), (name, side)
+    assert float(found.by_device.s) == pytest.approx(float(exact.s), rel=1e-4)
+    turned = jax.grad(lambda device: average(device, balls=512, spread=1e-3).P)(jax.tree.map(float, device))
+    assert float(turned.omega0.left) == pytest.approx(float(found.by_device.omega0.left), rel=1e-12)

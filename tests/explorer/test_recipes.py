@@ -4,6 +4,7 @@ import shlex
 from dataclasses import replace
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
@@ -169,3 +170,41 @@ def test_a_rigid_cell_has_no_optimum_and_a_start_is_tuned_by_none(found):
         optimum.optima(replace(own, pair=vijax.impact_pair(0.2, None, 0.5)), plane.y)
     with pytest.raises(ValueError, match="along must be an axis that a design can tune"):
         optimum.optima(own, replace(plane.y, name="u0"))
+
+
+def test_a_cell_of_walls_that_differ_is_had_again_by_wall(heard):
+    device = vijax.Harvester(V=vijax.Sides(1500.0, 1700.0))
+    with no_cell_runs():
+        axes = {"d": np.linspace(0.1, 0.3, 3), "kappa_left": np.geomspace(40, 400, 3), "kappa_right": 60.0}
+        plane = explored(vijax.sweep(**axes, r_right=0.6, device=device))
+    own = cell(plane, (1, 2), {})
+    assert own.arguments == {"d": 0.2, "kappa_left": 400.0, "kappa_right": 60.0, "gamma": 0.0, "r_left": 0.5} | {
+        "r_right": 0.6,
+        "omega": plane.fixed["omega"],
+        "A": 1.0,
+    }
+    assert own.device.V == device.V
+    lines = recipes.of_motion(own, SimpleNamespace(orbit=None)).python.splitlines()
+    told = {}
+    exec("\n".join([lines[0], *(line for line in lines if line.startswith("pair ="))]), told)
+    for mine, theirs in zip(jax.tree.leaves(told["pair"]), jax.tree.leaves(own.pair), strict=True):
+        assert float(mine) == float(theirs)
+    assert eval(recipes._device(recipes._constants(own)), {"vijax": vijax}).V == device.V
+    calls = heard(line, "orbit_diagram", "orbit_diagram")
+    with pytest.raises(CalledError):
+        line.line(own, plane.y, lambda done, total: None)
+    with pytest.raises(CalledError):
+        exec(recipes.of_line(own, plane.y).python, {})
+    (_, named, _), (_, again, _) = calls
+    assert {name: named[name] for name in ("d", "kappa_right", "r_right")} == {
+        "d": 0.2,
+        "kappa_right": 60.0,
+        "r_right": 0.6,
+    }
+    assert named["along"] == again["along"] == "kappa_left"
+    words = read(recipes.of_basin(own).command)
+    assert (words["kappa_left"], words["r_right"], words["constants"]) == (
+        "400.0",
+        "0.6",
+        ("V_left=1500.0", "V_right=1700.0"),
+    )

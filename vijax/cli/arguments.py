@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vijax.cli.options import PHYSICAL
-from vijax.model.quantities import AXES
+from vijax.model.quantities import AXES, of_both_walls
 
 if TYPE_CHECKING:
     from vijax.model.choices import Walls
@@ -26,7 +26,8 @@ def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, A
     texts = {name: text for name, text in axes.items() if text is not None}
     # The defaults come first, so that what is given besides makes panels of their plane.
     if not PHYSICAL & set(texts):
-        texts = {name: text for name, text in defaults.items() if name not in texts} | texts
+        taken = {*texts, *map(of_both_walls, texts)}
+        texts = {name: text for name, text in defaults.items() if name not in taken} | texts
     return {name: parse_axis(name, text) for name, text in texts.items()}
 
 

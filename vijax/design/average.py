@@ -18,13 +18,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.batch import perturbed
 from vijax.batch.summary import Summary
+from vijax.design.local_fit import LocalFit, local_fit
 from vijax.model import flow
 from vijax.model.device import Harvester, check_device, electrical
 from vijax.model.energy import capacitance
-from vijax.model.pair import ImpactPair
+from vijax.model.pair import ImpactPair, pair_of, quantities
+from vijax.model.sides import named
 from vijax.planes.basins import SPEED
 from vijax.runtime import checks, tiles
-from vijax.runtime.arrays import present
+from vijax.runtime.arrays import Values, present
 from vijax.runtime.context import door
 from vijax.runtime.lattice import lattice
 from vijax.runtime.programs import jitted
@@ -123,7 +125,7 @@ class _FlownBalls(NamedTuple):
     """
 
     width: Float[Array, ""]
-    x: Float[Array, "ball 4"]
+    x: Float[Array, "ball variable"]
     real: Bool[Array, "ball"]
     failed: Bool[Array, ""]
     P: Float[Array, "ball"]
@@ -145,9 +147,10 @@ def average(
         jax.grad(lambda device: average(device).P)(device)  # the same derivatives
 
     One ensemble flies. Its balls start all over the gap, in pairs of opposite offsets from the device: ln d, ln kappa,
-    ln r and gamma (on level ground it stays 0) are spread evenly. P of the balls is fitted by a quadratic in the
-    offsets, of which value and slopes at the centre are told: the plain mean of the balls would be off by P's
-    curvature. What does not move the ball (electrical constants, the unit of length) is differentiated at its motion.
+    ln r and gamma (on level ground it stays 0) are spread evenly, of walls that differ those of each. P of the balls is
+    fitted by a quadratic in the offsets, of which value and slopes at the centre are told: the plain mean of the balls
+    would be off by P's curvature. What does not move the ball (electrical constants, the unit of length) is
+    differentiated at its motion.
     Errors are those of the fit with the scatter as it is found, pair by pair. Numbers are the same in every call: from
     one device to the next there is no new noise but what chaos makes of the change.
 
@@ -177,15 +180,19 @@ def average(
     width = checks.real("spread", spread, f"a number in (0, {_WIDEST}]", lambda x: 0 < x <= _WIDEST)
     device = jax.tree.map(lambda x: jnp.asarray(x, float), device)
     at = lax.stop_gradient(_inputs(device))
-    flown = _fly(at, _design(balls, checks.seed(seed)), periods, width)
-    return _concluded(device, at, flown, balls >= _BALLS_A_TERM * 15)
+    size = len(jax.tree.leaves(at.pair))
+    flown = _fly(at, _design(balls, size, checks.seed(seed)), periods, width)
+    return _concluded(device, at, flown, balls >= _BALLS_A_TERM * (size + 1) * (size + 2) // 2)
 
 
 def _check(device: Any) -> None:
     """Raise ValueError unless this is one device; what is traced passes unseen."""
     for name, value in vars(check_device(device)).items():
-        if value is not None and np.ndim(value):
-            raise ValueError(f"device.{name} must be one number; got shape {np.shape(value)}; map devices by jax.vmap")
+        for argument, one in named(name, value).items():
+            if one is not None and np.ndim(one):
+                raise ValueError(
+                    f"device.{argument} must be one number; got shape {np.shape(one)}; map devices by jax.vmap"
+                )
 
 
 def _inputs(device: Harvester) -> _Inputs:
@@ -203,15 +210,15 @@ class _Design(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def _design(balls: int, seed: int | None) -> _Design:
-    """Place so many balls: on lattices, or drawn at random by a seed."""
+def _design(balls: int, size: int, seed: int | None) -> _Design:
+    """Place so many balls in so many variables: on lattices, or drawn at random by a seed."""
     half = balls // 2
     if seed is None:
-        start, some = lattice(half, 2).T, lattice(half, 4).T
+        start, some = lattice(half, 2).T, lattice(half, size).T
     else:
-        start, some = np.split(np.random.default_rng(seed).random((half, 6)), [2], axis=1)
+        start, some = np.split(np.random.default_rng(seed).random((half, 2 + size)), [2], axis=1)
     some = 2 * some - 1
-    return _Design(np.stack([some, -some], axis=1).reshape(balls, 4), np.repeat(2 * start - 1, 2, axis=0))
+    return _Design(np.stack([some, -some], axis=1).reshape(balls, size), np.repeat(2 * start - 1, 2, axis=0))
 
 
 def _fly(at: _Inputs, design: _Design, periods: int, width: float) -> _FlownBalls:
@@ -226,28 +233,39 @@ def _fly(at: _Inputs, design: _Design, periods: int, width: float) -> _FlownBall
 
 
 @jitted
-def _spread(at: _Inputs, width: Float[Array, ""], offsets: Float[Array, "ball 4"]):
+def _spread(at: _Inputs, width: Float[Array, ""], offsets: Float[Array, "ball variable"]):
     """Spread balls: offsets and pairs; units of length, electrical constants and the steps between them [variant]."""
-    pair, moved = at.pair, width * offsets
-    d, kappa = pair.d * jnp.exp(moved[:, 0]), present(pair.kappa) * jnp.exp(moved[:, 1])
-    r = jnp.minimum(pair.r * jnp.exp(moved[:, 2]), 1.0)
-    gamma = pair.gamma + jnp.where(pair.gamma == 0, 0.0, moved[:, 3])
-    x = jnp.stack([moved[:, 0], moved[:, 1], jnp.log(r / pair.r), gamma - pair.gamma], axis=1) / width
-    now = jnp.stack([at.length, *(getattr(at.device, name) for name in _ELECTRICAL)])
+    offs = dict(zip(quantities(at.pair), (width * offsets).T, strict=True))
+    moved = {name: _moved(name, value, offs[name]) for name, value in quantities(at.pair).items()}
+    x = jnp.stack([off for _, off in moved.values()], axis=1) / width
+    now = jnp.stack([at.length, *jax.tree.leaves([getattr(at.device, name) for name in _ELECTRICAL])])
     size = jnp.where(now == 0, 1.0, jnp.abs(now))
-    # C_T may be 0, beside a capacitance that is not.
-    size = size.at[1 + _ELECTRICAL.index("C_T")].add(capacitance(at.device, jnp.zeros(())))
+    # C_T, the first of them, may be 0, beside a capacitance that is not.
+    size = size.at[1].add(capacitance(at.device.at(1), jnp.zeros(())))
     after = now + _STEP * size
     # Each variant but the first has one of them moved.
     table = jnp.where(jnp.eye(now.size, now.size + 1, 1, dtype=bool), after[:, None], now[:, None])
     m_b = jnp.broadcast_to(at.device.m_b, table.shape[1:])
     # Not by `replace`, which would check fields that are not there.
     device = eqx.tree_at(_electrical_and_mass, at.device, [*table[1:], m_b])
-    return x, ImpactPair(d, kappa, r, gamma), table[0], device, after - now
+    pair = pair_of({name: value for name, (value, _) in moved.items()}, "soft")
+    return x, pair, table[0], device, after - now
+
+
+def _moved(name: str, value: Values, off: Values) -> tuple[Values, Values]:
+    """Move a quantity of the pair, by a factor of e^off or, gamma, by off; give it and how far it could be moved."""
+    if name == "gamma":
+        there = value + jnp.where(value == 0, 0.0, off)
+        return there, there - value
+    there = value * jnp.exp(off)
+    if not name.startswith("r"):
+        return there, off
+    there = jnp.minimum(there, 1.0)
+    return there, jnp.log(there / value)
 
 
 def _electrical_and_mass(device: Harvester) -> list[Any]:
-    return [getattr(device, name) for name in (*_ELECTRICAL, "m_b")]
+    return jax.tree.leaves([getattr(device, name) for name in (*_ELECTRICAL, "m_b")])
 
 
 @jitted
@@ -265,58 +283,20 @@ def _gathered(width, x, ended: Summary, steps, count) -> _FlownBalls:
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
-class _Fit(NamedTuple):
-    """A least-squares fit.
-
-    Attributes:
-        found: Coefficients.
-        added: What the scatter of each pair of balls has added to them, one degree of freedom less for each term.
-        rest: The scatter.
-        left: Degrees of freedom that are left.
-    """
-
-    found: Float[Array, "term column"]
-    added: Float[Array, "pair term column"]
-    rest: Float[Array, "ball column"]
-    left: Float[Array, ""]
-
-    def errors(self) -> Float[Array, "term column"]:
-        """Compute standard errors, with the scatter as it is, pair by pair."""
-        return jnp.sqrt((self.added**2).sum(axis=0))
-
-
-def _fit(x: Float[Array, "ball 4"], y: Float[Array, "ball column"], some: Bool[Array, "ball"], second: bool) -> _Fit:
-    """Fit columns by polynomials of the offsets, over some of the balls."""
-    terms = [jnp.ones_like(x[:, 0]), *x.T]
-    if second:
-        terms += [x[:, i] * x[:, j] for i in range(4) for j in range(i, 4)]
-    matrix = jnp.where(some[:, None], jnp.stack(terms, axis=1), 0.0)
-    # What does not vary (gamma on level ground) has coefficients of 0, without rounding.
-    varies = (matrix != 0).any(axis=0)
-    solve = jnp.linalg.pinv(matrix.T @ matrix, rtol=1e-12, hermitian=True) @ matrix.T
-    solve = jnp.where(varies[:, None], solve, 0.0)
-    count = some.sum(dtype=x.dtype)
-    left = jnp.where(count > len(terms), count - len(terms), jnp.nan)
-    # Too few balls fix nothing.
-    found = solve @ y + 0 * left
-    rest = jnp.where(some[:, None], y - matrix @ found, 0.0)
-    added = (solve.T[:, :, None] * rest[:, None, :]).reshape(-1, 2, *found.shape).sum(axis=1)
-    return _Fit(found, added * jnp.sqrt(count / left), rest, left)
-
-
 @partial(jitted, static=("second",))
 def _concluded(device: Harvester, at: _Inputs, flown: _FlownBalls, second: bool) -> Average:
     """Make the record of an ensemble."""
-    fit = _fit(flown.x, jnp.column_stack([flown.P, flown.fixed]), flown.real, second)
+    fit = local_fit(flown.x, jnp.column_stack([flown.P, flown.fixed]), flown.real, second)
     value = fit.found[0, 0]
 
     def slopes(coefficients: Float[Array, "term column"]) -> _Inputs:
         """Turn coefficients of the fit into derivatives of P."""
-        pair = coefficients[1:5, 0] / flown.width / jnp.stack([at.pair.d, present(at.pair.kappa), at.pair.r, 1.0])
+        unit = {name: 1.0 if name == "gamma" else value for name, value in quantities(at.pair).items()}
+        each = coefficients[1 : 1 + len(unit), 0] / flown.width / jnp.stack(list(unit.values()))
         blank = jax.tree.map(jnp.zeros_like, at.device)
-        constants = [coefficients[0, 2 + i] for i in range(len(_ELECTRICAL))]
+        constants = list(coefficients[0, 2:])
         electric = eqx.tree_at(_electrical_and_mass, blank, [*constants, blank.m_b])
-        return _Inputs(ImpactPair(*pair), coefficients[0, 1], electric)
+        return _Inputs(pair_of(dict(zip(unit, each, strict=True)), "soft"), coefficients[0, 1], electric)
 
     def size(added: Any) -> Any:
         return jax.tree.map(lambda x: jnp.sqrt((x * x).sum(axis=0)), added)
@@ -340,15 +320,16 @@ def _concluded(device: Harvester, at: _Inputs, flown: _FlownBalls, second: bool)
     )
 
 
-def _verdict(flown: _FlownBalls, fit: _Fit, second: bool) -> Int[Array, ""]:
+def _verdict(flown: _FlownBalls, fit: LocalFit, second: bool) -> Int[Array, ""]:
     """Judge whether the averages of all balls lie on one smooth surface."""
     value, periodic = fit.found[0, 0], _share(flown)
     within = (flown.P_stderr**2).sum() / flown.real.sum(dtype=value.dtype)
     between = (fit.rest[:, 0] ** 2).sum() / fit.left
     inner = jnp.abs(flown.x).max(axis=1) < _INNER
-    halves = [_fit(flown.x, flown.P[:, None], flown.real & half, second) for half in (inner, ~inner)]
-    difference = jnp.abs(halves[0].found[1:5, 0] - halves[1].found[1:5, 0])
-    error = jnp.hypot(*(half.errors()[1:5, 0] for half in halves))
+    halves = [local_fit(flown.x, flown.P[:, None], flown.real & half, second) for half in (inner, ~inner)]
+    slopes = slice(1, 1 + flown.x.shape[1])
+    difference = jnp.abs(halves[0].found[slopes, 0] - halves[1].found[slopes, 0])
+    error = jnp.hypot(*(half.errors()[slopes, 0] for half in halves))
     bent = (difference > _DIFFERENT * error) & (difference > _BENT * flown.width * value)
     doubts = {
         Smoothness.FAILED: flown.failed,

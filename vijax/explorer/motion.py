@@ -107,11 +107,11 @@ def _settled(cell: ExploredCell) -> tuple[float, float]:
     """Fly the ball until it has settled: by a diagram of one point, in a third of the time that a trajectory takes."""
     # Any axis would do, as it has one value.
     found = orbit_diagram(
-        values=[cell.arguments["r"]],
+        values=[cell.arguments[cell.r]],
         direction="up",
         periods=SETTLE,
         recorded_periods=1,
-        **cell.off("r"),
+        **cell.off(cell.r),
     )
     return float(found["u_strobe"].values[0, -1]), float(found["v_strobe"].values[0, -1])
 

@@ -226,6 +226,11 @@ class ExploredCell:
     arguments: dict[str, Any]
     settings: dict[str, Any]
 
+    @property
+    def r(self) -> str:
+        """Name an axis that every cell has: r, or where the walls differ that of the left one."""
+        return "r" if "r" in self.arguments else "r_left"
+
     def off(self, along: str) -> dict[str, Any]:
         """Give the arguments of `orbit_diagram` along an axis through the cell, but for what is on that axis."""
         others = {name: value for name, value in self.arguments.items() if name != along}

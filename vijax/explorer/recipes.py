@@ -118,7 +118,7 @@ def _number(value: Any) -> str:
 def of_motion(cell: ExploredCell, found: CellMotion) -> Recipe:
     """Say how a motion, its label, P and multipliers are had."""
     pair = cell.pair
-    r = "r" if "r" in cell.arguments else "r_left"
+    r = cell.r
     point = f"along={r!r}, values=[{cell.arguments[r]!r}], direction='up', periods={motion.SETTLE}, recorded_periods=1"
     lines = [
         "import vijax",

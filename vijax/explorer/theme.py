@@ -2,7 +2,7 @@
 
 import html
 
-from vijax.model.quantities import AXES
+from vijax.model.quantities import AXES, of_both_walls
 
 COLOURS = {
     "wall": "#b0b0b0",
@@ -32,8 +32,9 @@ _GREEK = {
 
 
 def symbol(name: str) -> str:
-    """Write the symbol of an axis."""
-    return _GREEK.get(name, name)
+    """Write the symbol of an axis; of one wall's with the name of the wall."""
+    whole = of_both_walls(name) or name
+    return _GREEK.get(whole, whole) + name.removeprefix(whole).replace("_", " ")
 
 
 def written(name: str) -> str:
