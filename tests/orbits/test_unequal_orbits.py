@@ -14,6 +14,8 @@ from vijax import Sides
 from vijax.model.records import Status
 from vijax.orbits import limits, parameter, symmetry
 from vijax.orbits.curve_plane import check_plane
+from vijax.orbits.curve_starts import curve_start
+from vijax.orbits.events import Point
 
 DEVICE = vijax.Harvester(V=Sides(1500.0, 2000.0))
 # d, kappa and r of the left wall and of the right one, gamma: of 1:1 orbits that attract.
@@ -141,6 +143,20 @@ def test_a_curve_in_the_plane_of_one_wall_passes_the_folds_of_branches_across_it
     dataset = vijax.curve_dataset([curve])
     assert {"kappa_right", "r_left", "r_right"} < set(dataset.coords)
     assert dataset.attrs["wall"] == "soft"
+
+
+@pytest.mark.parametrize("along", ["gamma", "kappa_left"])
+def test_where_the_symmetry_of_walls_goes_a_pitchfork_begins_no_curve(along):
+    """It is where folds meet; an orbit closed half way is followed in full."""
+    begun = vijax.find_orbits(vijax.impact_pair(0.24, None if along == "gamma" else 40.0, 0.5), "LR", guesses=64)
+    half = symmetry.halved(begun[symmetry.symmetric(begun)][:1])
+    kind, place = "pitchfork", (0.24, 0.0)
+    told = curve_start(Point(kind, 0.24, half), place, 1e-4, ("d", along))
+    assert "two folds meet in a pitchfork" in told
+    assert curve_start(Point(kind, 0.24, half), place, 1e-4, ("d", "r")).orbit.sequence.mirrored.all()
+    whole = curve_start(Point("fold", 0.24, half), place, 1e-4, ("d", along)).orbit
+    assert not np.asarray(whole.sequence.mirrored).any()
+    assert int(np.asarray(whole.count)[0]) == 2
 
 
 def test_limits_are_those_of_the_wall_that_is_met(orbits):

@@ -141,6 +141,7 @@ BAD = [
     ({"r_left": 1.5}, r"r_left must lie in \(0, 1\]; got 1.5"),
     ({"kappa_left": 3.0, "wall": "rigid"}, "kappa_left must be left out of rigid walls"),
     ({"wall": "rigid", "device": vijax.Harvester(V=Sides(1.0, 2.0))}, "device.V must be one number for rigid walls"),
+    ({"kappa_left": 3.0, "wall": "rigid_left"}, 'kappa_left must be left out with wall="rigid_left"'),
     ({"wall": "rigid_right", "u0": 0.15}, "u0 must lie in the gap of a rigid wall"),
     ({"wall": "rigid_right", "method": "ode"}, 'wall must be "soft" for method="ode"'),
     ({"r_left": 0.5, "method": "ode", "membrane": vijax.HuntCrossley(0.5)}, "r_left must be left out with a membrane"),

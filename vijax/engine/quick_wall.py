@@ -1,4 +1,4 @@
-"""TwoWalls as the quick step needs them: constants of a cell that no impact changes, with bounds of its certificates.
+"""Walls as the quick step needs them: constants of a cell that no impact changes, with bounds of its certificates.
 
 `RigidWall` or `SoftWall`: which of them a program has is known when it is traced.
 """

@@ -1,5 +1,6 @@
 """Where curves begin: at what branches met, brought into the one form in which each kind of bifurcation is followed."""
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ from vijax.model.records import Status
 from vijax.orbits import grazing, symmetry
 from vijax.orbits.curve_equations import Touch
 from vijax.orbits.events import Point
+from vijax.orbits.parameter import skews
 from vijax.orbits.periodic import Orbit, check_orbit, guessed, proven
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks
@@ -49,15 +51,22 @@ def check_points(points: Any) -> list[Point]:
     return listed
 
 
-def curve_start(point: Point, place: tuple[float, float], asymmetry: float) -> CurveStart | str:
+def curve_start(
+    point: Point, place: tuple[float, float], asymmetry: float, plane: Iterable[str] = ()
+) -> CurveStart | str:
     """Make a start of what a branch met, or say why no curve can be followed from there.
 
     Args:
         point: What was met.
         place: Both parameters of the plane there.
         asymmetry: How far from its mirror image an orbit at a pitchfork may be.
+        plane: Both parameters, where some may take the symmetry of the walls away.
     """
     kind, orbit = point.kind, point.orbit
+    if any(map(skews, plane)):
+        if kind == "pitchfork":
+            return "two folds meet in a pitchfork where the symmetry of the walls goes, and begin the curves"
+        orbit = symmetry.unfolded(orbit)
     if kind == "grazing exit":
         return "the graze of an exit is that of an impact, or of a contact, which begin curves"
     if kind in ("grazing flight", "grazing contact"):

@@ -116,7 +116,7 @@ def follow_curves(
         if point.kind in LIMITS:
             start = limit_start(point, place, tuple(plane), device, settings.asymmetry)
         else:
-            start = curve_start(point, place, settings.asymmetry)
+            start = curve_start(point, place, settings.asymmetry, plane)
         if isinstance(start, str):
             refused.append(start)
         else:

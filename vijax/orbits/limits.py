@@ -99,7 +99,9 @@ def limit_start(
     if int(orbit.status[0]) != Status.OK:
         return "no ball flies its orbit"
     mirrored = bool(orbit.sequence.mirrored[0])
-    if not mirrored and not any(map(skews, plane)) and bool(symmetry.symmetric(orbit, asymmetry)[0]):
+    if any(map(skews, plane)):
+        orbit = symmetry.unfolded(orbit)
+    elif not mirrored and bool(symmetry.symmetric(orbit, asymmetry)[0]):
         # Both of an impact and its mirror image are at the limit: half way there is one.
         orbit = symmetry.halved(orbit, asymmetry)
     for name, value in zip(plane, place, strict=True):

@@ -137,11 +137,16 @@ def _met(
     paths = jax.tree.map(lambda leaf: leaf[twice], arcs)
     walked = walk(paths, both, max_points, settings)
     still = plane.axes[1 - way][cells[twice, 1 - way]]
-    return _starts(paths, walked, still, way, settings)
+    return _starts(paths, walked, still, way, plane.along, settings)
 
 
 def _starts(
-    paths: Arc, walked: list[Walked], still: np.ndarray, way: int, settings: ContinuationSettings
+    paths: Arc,
+    walked: list[Walked],
+    still: np.ndarray,
+    way: int,
+    plane: tuple[str, str],
+    settings: ContinuationSettings,
 ) -> list[CurveStart]:
     """Locate what paths met, and make starts of it.
 
@@ -150,6 +155,7 @@ def _starts(
         walked: What each passed.
         still: The plane's other parameter of each.
         way: Which of the two they were followed along.
+        plane: Both parameters.
         settings: Of events.
     """
     lane = np.repeat(np.arange(len(walked)), [len(one.y) - 1 for one in walked])
@@ -175,7 +181,7 @@ def _starts(
             kind = "pitchfork"
         value = float(x[row])
         place = (value, float(other[row])) if way == 0 else (float(other[row]), value)
-        begun = curve_start(Point(kind, value, orbit[row : row + 1]), place, settings.asymmetry)
+        begun = curve_start(Point(kind, value, orbit[row : row + 1]), place, settings.asymmetry, plane)
         if not isinstance(begun, str):
             found.append(begun)
     return found

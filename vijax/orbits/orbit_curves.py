@@ -67,7 +67,7 @@ def curves_about(
         starts = [
             limit_start(point, place, tuple(plane), device, settings.asymmetry)
             if point.kind in LIMITS
-            else curve_start(point, place, settings.asymmetry)
+            else curve_start(point, place, settings.asymmetry, plane)
             for point, place in zip(met, places, strict=True)
         ]
         return branch, [start for start in starts if isinstance(start, CurveStart)]

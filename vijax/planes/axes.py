@@ -333,6 +333,8 @@ def _of_walls(
     """Give kappa and r: of both walls, or of each where anything may differ."""
     if wall == "rigid":
         _check_rigid(values, device)
+    if wall in RIGID_ON:
+        _check_rigid_side(values, wall)
     unequal = device.unequal or wall in RIGID_ON or any(map(of_both_walls, values))
     table = {}
     for side, end in ((-1, "_left"), (1, "_right")) if unequal else ((1, ""),):
@@ -351,6 +353,17 @@ def _of_walls(
         table["kappa" + end] = xr.Variable((), np.inf) if end and wall == f"rigid{end}" else kappa
         table["r" + end] = constant("r", own.r) if r is None else r
     return dict(sorted(table.items()))
+
+
+def _check_rigid_side(values: "dict[str, xr.Variable]", wall: str) -> None:
+    """Raise ValueError where a rigid wall beside a soft one is given a membrane, which it has not."""
+    side = wall.removeprefix("rigid_")
+    for name in values:
+        if name.endswith(f"_{side}") and of_both_walls(name) in synonyms("kappa"):
+            raise ValueError(
+                f'{name} must be left out with wall="{wall}", whose {side} wall has no membrane; '
+                f"got {checks.shown(values[name].values)}"
+            )
 
 
 def _check_rigid(values: "dict[str, xr.Variable]", device: Harvester) -> None:
