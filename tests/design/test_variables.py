@@ -1,14 +1,18 @@
 """Tuned quantities reach the device by whatever name; names and bounds that cannot be are refused."""
 
+import dataclasses
 import math
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
 from vijax.design import variables
+from vijax.design.averages import averages
 from vijax.model import quantities
 from vijax.model.device import Harvester
+from vijax.model.sides import Sides
 
 DEVICE = Harvester(A=3.0, omega=10 * math.pi, s=0.006)
 
@@ -69,3 +73,28 @@ def test_names_that_cannot_be_are_told(names, words):
 def test_bounds_that_cannot_be_are_told(names, bounds, words):
     with pytest.raises(ValueError, match=words):
         variables.limits(names, bounds, DEVICE)
+
+
+def test_constants_of_one_wall_or_of_both_scatter():
+    device = dataclasses.replace(DEVICE, omega0=Sides(50.0, 70.0))
+    off = variables.scattered(device, ("omega0", "V_left", "A"), (1.1, 0.9, 1.2))
+    assert (off.omega0.left, off.omega0.right) == (pytest.approx(55.0), pytest.approx(77.0))
+    assert (off.V.left, off.V.right, off.A) == (pytest.approx(1800.0), 2000.0, pytest.approx(3.6))
+
+
+def test_the_room_that_balls_leave_is_that_of_the_nearer_limit():
+    device = Harvester(R0=Sides(np.full(2, 0.006), np.full(2, 0.008)), A=np.full(2, 1.0), omega=np.full(2, np.pi))
+    blank = np.zeros(2)
+    ended = SimpleNamespace(
+        P=np.ones((2, 1)),
+        energy_ratio=np.full((2, 1), 0.1),
+        deepest=np.array([0.004, 0.006]),
+        deepest_left=np.array([0.004, 0.001]),
+        deepest_right=np.array([0.002, 0.006]),
+        handover=SimpleNamespace(u=blank, v=blank, t=blank),
+        **dict.fromkeys(("fastest", "lyapunov", "period", "impacts_left", "impacts_right", "status"), blank),
+        periods_run=blank,
+    )
+    found = averages(device, ended)
+    np.testing.assert_allclose(found.room, [6 / 4, 8 / 6], rtol=1e-12)
+    np.testing.assert_allclose(found.margins()[:, 0], np.log([6 / 4, 8 / 6]), rtol=1e-12)

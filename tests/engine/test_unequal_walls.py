@@ -153,3 +153,14 @@ def test_walls_that_are_exchanged_mirror_the_motion():
     for name, sign in (("v_in", -1), ("v_out", -1), ("duration", 1), ("depth", 1), ("work", 1)):
         a, b = (np.asarray(getattr(x, name))[:count] for x in (one, other))
         np.testing.assert_allclose(a, sign * b, rtol=1e-11, err_msg=name)
+
+
+def test_a_start_on_a_wall_that_moves_into_it_is_an_impact_where_the_wall_is_rigid():
+    """A soft wall holds such a ball, in a contact that had no onset."""
+    for kappa in (None, Sides(20.0, None)):
+        rigid = vijax.trajectory(vijax.impact_pair(0.25, kappa, 0.5), 0.125, 0.25, 2).impacts
+        assert int(rigid.side[0]) == 1
+        assert float(rigid.t[0]) == pytest.approx(0, abs=1e-15)
+        assert float(rigid.v_out[0]) == -0.125
+    soft = vijax.trajectory(vijax.impact_pair(0.15, Sides(20.0, None), 0.5), -0.075, -0.25, 12).impacts
+    assert 2 * int(soft.n[0]) + float(soft.t[0]) > 0.01

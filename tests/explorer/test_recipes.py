@@ -208,3 +208,27 @@ def test_a_cell_of_walls_that_differ_is_had_again_by_wall(heard):
         "0.6",
         ("V_left=1500.0", "V_right=1700.0"),
     )
+
+
+FORMS = [
+    ({"d": [0.2, 0.25], "kappa": 40.0, "r_left": [0.4, 0.5]}, {"kappa": 40.0, "r_left": 0.5, "r_right": 0.5}),
+    ({"d": [0.2, 0.25], "r": 0.4, "kappa_left": [30.0, 40.0]}, {"r": 0.4, "kappa_left": 40.0, "kappa_right": 400.0}),
+    ({"d": [0.2, 0.25], "wall": "rigid_right", "kappa": 40.0, "r_left": [0.4, 0.5]}, {"kappa": 40.0, "r_right": 0.5}),
+    ({"d": [0.2, 0.25], "wall": "rigid", "r_left": [0.4, 0.5]}, {"kappa": 400.0, "r_left": 0.5, "r_right": 0.5}),
+    ({"omega": [5.0, 6.0], "wall": "rigid", "r_left": [0.4, 0.5]}, {"s": 0.3, "omega0": 400.0, "r_left": 0.5}),
+    ({"omega": [5.0, 6.0], "wall": "rigid_right", "r_left": [0.4, 0.5]}, {"s": 0.3, "omega0_left": 400.0}),
+]
+
+
+@pytest.mark.parametrize(("axes", "wanted"), FORMS, ids=[" ".join(axes) for axes, _ in FORMS])
+def test_a_cell_is_opened_however_its_walls_were_given(axes, wanted):
+    with no_cell_runs():
+        made = vijax.sweep(**axes)
+    own = cell(explored(made), (1, 1), {})
+    assert {name: pytest.approx(value) for name, value in wanted.items()} == {
+        name: own.arguments[name] for name in wanted
+    }
+    assert own.pair.walls == axes.get("wall", "soft")
+    here = made.isel({name: 1 for name, values in axes.items() if isinstance(values, list)})
+    assert float(own.pair.d) == pytest.approx(float(here.d))
+    assert float(own.device.s) == pytest.approx(float(here.d) * float(own.device.length_unit))

@@ -95,6 +95,9 @@ def test_a_device_gives_each_wall_its_own():
         np.testing.assert_allclose(harvested_energy(device.at(side), depth), wanted, rtol=1e-15)
     back = with_pair(vijax.Harvester(A=2.0), pair)
     np.testing.assert_allclose([back.omega0.left, back.omega0.right], [300.0, 500.0], rtol=1e-14)
+    beside = with_pair(vijax.Harvester(A=2.0), vijax.impact_pair(0.2, Sides(None, 30.0), 0.5))
+    np.testing.assert_allclose([beside.omega0.left, beside.omega0.right], [400.0, 30.0], rtol=1e-14)
+    assert float(beside.s) == pytest.approx(0.2 * 2.0, rel=1e-14)
     rims = vijax.Harvester(R0=Sides(0.0063, 0.007))
     assert rims.depth_limit == Sides(0.0063, 0.007)
     assert not admissible(rims.at(-1), 0.0, 1.0, jnp.asarray(0.0065))
@@ -115,6 +118,15 @@ def test_constants_of_one_wall_have_names_of_their_own():
     assert told_device(told).V == device.V
 
 
+def test_membranes_are_alike_where_they_yield_alike():
+    """Whatever the motion is: stiffness and restitution say nothing of that."""
+    assert vijax.Harvester().alike
+    assert vijax.Harvester(omega0=Sides(1.0, 2.0), r=Sides(0.1, 0.2)).alike
+    assert vijax.Harvester(V=Sides(2.0, 2.0)).alike
+    for name in ("V", "w0", "eps_M"):
+        assert not vijax.Harvester(**{name: Sides(1.0, 2.0)}).alike
+
+
 @pytest.mark.parametrize("wall", ["soft", "rigid_left"])
 def test_a_table_is_realised_by_the_device_that_has_it(wall):
     table = {"d": 0.2, "kappa_left": 20.0, "kappa_right": 40.0, "r_left": 0.5, "r_right": 0.6, "gamma": 0.0}
@@ -122,6 +134,12 @@ def test_a_table_is_realised_by_the_device_that_has_it(wall):
     assert pair.walls == wall
     assert float(pair.r.right) == 0.6
     assert float(device.omega0.right) == pytest.approx(40 * 6 / np.pi)
+
+
+def test_rigid_walls_are_lent_one_membrane():
+    table = {"d": 0.2, "kappa_left": 20.0, "kappa_right": 20.0, "r_left": 0.5, "r_right": 0.6, "gamma": 0.0}
+    pair, device = realised(vijax.Harvester(), table | {"A": 2.0, "omega": np.pi}, "rigid")
+    assert (pair.walls, float(device.omega0)) == ("rigid", pytest.approx(20.0))
 
 
 BAD = [
@@ -134,8 +152,10 @@ BAD = [
     (lambda: harvested_energy(vijax.Harvester(V=Sides(1.0, 2.0)), 1e-4), "device must be that of one wall"),
     (lambda: vijax.impact_pair(0.2, Sides(12.0, None), 0.5).mu, "kappa must be a number"),
     (lambda: pairs.membrane_pair(vijax.impact_pair(0.2, Sides(12.0, 13.0), 0.5)), "pair must have equal walls"),
-    (lambda: with_pair(vijax.Harvester(), vijax.impact_pair(0.2, Sides(12.0, None), 0.5)), "one rigid and one soft"),
-    (lambda: with_constants(vijax.Harvester(), A_left=2.0), "A_left must be a constant of the device"),
+    (lambda: with_constants(vijax.Harvester(), A_left=2.0), "A_left must be a constant of .* ends in _left or _right"),
+    (lambda: with_constants(vijax.Harvester(), V_left=1.0, V=2.0), "V_left and V give the same constant; give one for"),
+    (lambda: with_constants(vijax.Harvester(), V=2.0, V_left=1.0), "V and V_left give the same constant"),
+    (lambda: with_constants(vijax.Harvester(), omega0_left=3.0, k=5.0), "omega0_left and omega0 give the same"),
     (lambda: vijax.trajectory(vijax.impact_pair(0.2, Sides(None, 12.0), 0.5), -0.15, 0.0, 1), "u0 must lie within"),
 ]
 

@@ -169,6 +169,31 @@ def test_limits_are_those_of_the_wall_that_is_met(orbits):
     np.testing.assert_allclose(load[real], (depth / np.where(side > 0, 0.02, 0.005))[real], rtol=1e-14)
 
 
+def test_an_orbit_closed_half_way_yields_at_both_membranes():
+    """Walls that move the ball alike may yield apart: what is not listed of the orbit is at the other wall."""
+    pair = vijax.impact_pair(0.25, 30.0, 0.5)
+    whole = vijax.find_orbits(pair, "LR", guesses=64)
+    whole = whole[symmetry.symmetric(whole)][:1]
+    half = symmetry.halved(whole)
+    depth = float(np.asarray(whole.depth)[0, 0])
+    device = vijax.Harvester(V=Sides(2000.0, 500.0), R0=Sides(2 * depth, 0.9 * depth), r_b=0.5 * depth)
+    wanted = float(vijax.orbit_power(whole, device)[0])
+    assert float(vijax.orbit_power(half, device)[0]) == pytest.approx(wanted, rel=1e-12)
+    state = vijax.steady(device, half[0], pair=pair)
+    assert float(state.P) == pytest.approx(wanted, rel=1e-12)
+    for kind, load in limits.loads(half, device).items():
+        assert load.max() == pytest.approx(limits.loads(whole, device)[kind].max(), rel=1e-9), kind
+
+
+def test_walls_of_one_stiffness_move_together_where_something_else_differs():
+    orbit = vijax.find_orbits(vijax.impact_pair(0.3, 50.0, Sides(0.4, 0.5)), "LR", guesses=64)
+    index = int(np.abs(np.asarray(orbit.multipliers)).max(axis=1).argmin())
+    (branch,) = vijax.follow_orbits(orbit[index : index + 1], "kappa", (45.0, 50.0), direction="down")
+    last = branch.orbit[-1].pair
+    assert float(last.kappa.left) == float(last.kappa.right) == pytest.approx(45.0)
+    assert (float(last.r.left), float(last.r.right)) == (0.4, 0.5)
+
+
 MIXED = vijax.impact_pair(0.3, Sides(30.0, None), Sides(0.5, 0.7))
 
 
@@ -186,6 +211,8 @@ def test_an_orbit_between_a_rigid_wall_and_a_membrane_is_steady_and_has_derivati
     assert float(state.P) == pytest.approx(float(vijax.orbit_power(some, device)[int(size.argmin())]), rel=1e-12)
     grad = jax.grad(lambda pair: P(pair).P)(MIXED)
     assert grad.kappa.right is None
+    second = jax.grad(jax.grad(lambda kappa: P(vijax.impact_pair(0.3, Sides(kappa, None), MIXED.r)).P))(30.0)
+    assert np.isfinite(second)
     h = 1e-4
 
     def moved(**by):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import vijax
+from tests.helpers import no_cell_runs
 from vijax import Sides
 from vijax.model.device import told_device
 from vijax.model.pair import pair_of
+from vijax.orbits.map_borders import device_of
 from vijax.planes import sweep as sweeps
 from vijax.planes.axes import cells
 
@@ -101,12 +103,12 @@ def test_exchanged_walls_give_the_same_with_sides_exchanged():
 
 def test_other_methods_meet_the_same_walls():
     told = {"d": 0.25, "kappa_left": 30.0, "kappa_right": 60.0, "r_left": 0.4, "r_right": 0.6}
-    exact, ode, rk4 = (
-        vijax.sweep(**told, **more) for more in ({}, {"method": "ode"}, {"method": "rk4", "steps": 20000})
-    )
-    assert float(ode["P"]) == pytest.approx(float(exact["P"]), rel=1e-6)
-    assert float(rk4["P"]) == pytest.approx(float(exact["P"]), rel=2e-3)
-    assert float(ode["restitution_left"]) == pytest.approx(float(exact["restitution_left"]), rel=1e-6)
+    told |= {"until": "window", "periods": 10, "transient": 40}
+    exact = vijax.sweep(**told)
+    for method, near in (({"method": "ode"}, 1e-6), ({"method": "rk4", "steps": 500}, 0.08)):
+        found = vijax.sweep(**told, **method)
+        for name in ("P", "restitution_left", "restitution_right"):
+            assert float(found[name]) == pytest.approx(float(exact[name]), rel=near), (method, name)
 
 
 def test_a_diagram_along_one_wall_has_the_cells_of_the_map(found):
@@ -115,7 +117,16 @@ def test_a_diagram_along_one_wall_has_the_cells_of_the_map(found):
     alike = (diagram["impacts_left"] == cells_there["impacts_left"]) & (diagram["period"] == cells_there["period"])
     assert alike.sum() >= 2
     np.testing.assert_allclose(diagram["P"].values[alike], cells_there["P"].values[alike], rtol=1e-10)
-    assert np.isfinite(diagram["E"].isel(impact=0)).all()
+    right = vijax.orbit_diagram(
+        along="kappa_left",
+        values=KAPPA,
+        d=0.25,
+        kappa_right=40.0,
+        periods=200,
+        device=vijax.Harvester(V=Sides(0.0, 2000.0)),
+    )
+    there = np.isfinite(right["E"].values)
+    np.testing.assert_array_equal(right["E"].values[there] > 0, right["side"].values[there] > 0)
 
 
 def test_what_is_not_given_of_a_wall_is_the_device_s():
@@ -152,6 +163,31 @@ BAD = [
 def test_what_cannot_be_is_told_before_anything_runs(given, words):
     with pytest.raises(ValueError, match=words):
         vijax.sweep(**({"d": 0.2} | given))
+
+
+def test_mirror_images_that_yield_apart_are_two_attractors():
+    """Of walls that are alike but for what their membranes yield."""
+    told = {"d": 0.14, "kappa": 60.0, "starts": 8}
+    equal, apart = vijax.sweep(**told), vijax.sweep(**told, device=vijax.Harvester(V=Sides(2000.0, 0.0)))
+    assert int(apart["attractors"]) > int(equal["attractors"])
+    assert float(apart["P_least"]) < 0.7 * float(apart["P_greatest"])
+    with pytest.raises(ValueError, match="merge_mirrors must be left out"):
+        vijax.basin_fractions(d=0.2, merge_mirrors=True, starts=2, device=vijax.Harvester(V=Sides(2000.0, 0.0)))
+
+
+def test_a_comparison_is_of_one_membrane():
+    with pytest.raises(ValueError, match="kappa_left must be left out of a comparison"):
+        vijax.compare(d=0.2, kappa_left=30.0)
+
+
+def test_curves_know_the_device_of_a_map_whose_walls_share_an_axis():
+    """What is given for both stands in what each has."""
+    with no_cell_runs():
+        found = vijax.sweep(d=D, kappa=KAPPA, r_left=0.4, device=vijax.Harvester(V=Sides(1000.0, 2000.0)))
+    device = device_of(found)
+    assert (float(device.omega0.left), float(device.omega0.right)) == (KAPPA[0], KAPPA[0])
+    assert (float(device.r.left), float(device.r.right)) == (0.4, 0.5)
+    assert Sides(1000.0, 2000.0) == device.V
 
 
 def test_mirror_images_are_merged_only_where_walls_are_alike():

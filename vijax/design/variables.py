@@ -147,8 +147,9 @@ def _default(name: str, device: Harvester) -> tuple[float, float]:
     kappa = np.array([_LEAST_KAPPA, _MOST_KAPPA])
     omega0 = kappa * float(device.omega) / math.pi
     if isinstance(now := value_of(device, name), Sides):
-        told = " and ".join(f"{name}_{side}" for side in SIDES)
-        raise ValueError(f"tune must name {told}, each or both, where walls differ; got {name}")
+        own = [f"{name}_{side}" for side in SIDES if f"{name}_{side}" in NAMES]
+        told = f"{' and '.join(own)}, each or both, where walls differ" if own else "what both walls have alike"
+        raise ValueError(f"tune must name {told}; got {name}")
     known: dict[str, Any] = {
         "kappa": kappa,
         "omega0": omega0,

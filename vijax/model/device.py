@@ -106,6 +106,13 @@ class Harvester(eqx.Module):
         """Say whether the two walls may differ in anything."""
         return any(isinstance(getattr(self, name), Sides) for name in WALLS_OWN)
 
+    @property
+    def alike(self) -> bool:
+        """Say whether both membranes yield alike where they are entered alike, whatever the motion is."""
+        own = [getattr(self, name) for name in WALLS_OWN if name not in ("omega0", "r")]
+        differ = [one for one in own if isinstance(one, Sides)]
+        return all(is_concrete(one.left, one.right) and np.array_equal(one.left, one.right) for one in differ)
+
     def at(self, side: Any) -> "Harvester":
         """Give the device whose walls are both as the one on a side is, +1 right or -1 left: itself if they are equal.
 
@@ -183,7 +190,7 @@ def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
     """Give a device the given nondimensional form, by its s, omega0, r and beta; the inverse of `Harvester.pair`.
 
     Args:
-        device: Gives A, omega, g and everything electrical; and omega0 where the wall of `pair` is rigid.
+        device: Gives A, omega, g and everything electrical; and omega0 where a wall of `pair` is rigid.
         pair: A pair that an inclination can give: |gamma| <= g/A.
 
     Raises:
@@ -196,9 +203,9 @@ def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
             f"gamma must lie in [-g/A, g/A] for an inclination to give it; got {checks.first(sine, np.abs(sine) <= 1)} "
             f"for gamma A/g; lower A or raise g"
         )
-    if pair.hard_wall:
-        raise ValueError("pair must have two walls of one kind for a device; got one rigid and one soft")
-    omega0 = device.omega0 if pair.kappa is None else each(lambda kappa: kappa * device.omega / math.pi, pair.kappa)
+    omega0 = each(
+        lambda kappa, own: own if kappa is None else kappa * device.omega / math.pi, pair.kappa, device.omega0
+    )
     return dataclasses.replace(device, s=pair.d * device.length_unit, omega0=omega0, r=pair.r, beta=jnp.arcsin(sine))
 
 
@@ -215,7 +222,10 @@ def with_constants(device: Harvester, **constants: Own) -> Harvester:
     walls = [f"{name}_{side}" for name in ("k", *WALLS_OWN) for side in SIDES]
     for name in constants:
         if name not in (*known, *walls):
-            raise ValueError(f"{name} must be a constant of the device; got {name!r}; known are {', '.join(known)}")
+            raise ValueError(
+                f"{name} must be a constant of the device; got {name!r}; known are {', '.join(known)}; what one wall "
+                f"has of k, {', '.join(WALLS_OWN)} ends in _left or _right"
+            )
     m_b = constants.get("m_b", device.m_b)
     given: dict[str, Any] = {}
     for name, value in constants.items():
@@ -226,10 +236,19 @@ def with_constants(device: Harvester, **constants: Own) -> Harvester:
                 check("k", one, argument)
             check("m_b", m_b)
             name, value = name.replace("k", "omega0", 1), each(lambda k: jnp.sqrt(k / m_b), value)
-        if name in given:
-            raise ValueError("k and omega0 must not both be given, as k = m_b omega0^2; got both; leave one out")
+        _check_rivals(name, given)
         given[name] = value
     return changed(device, given)
+
+
+def _check_rivals(name: str, given: Mapping[str, Any]) -> None:
+    """Raise ValueError where a constant is given twice: by k and omega0, or for both walls and for one of them."""
+    if name in given:
+        raise ValueError("k and omega0 must not both be given, as k = m_b omega0^2; got both; leave one out")
+    of_walls = [f"{name}_{side}" for side in SIDES]
+    rivals = [other for other in given if other in of_walls or name in [f"{other}_{side}" for side in SIDES]]
+    if rivals:
+        raise ValueError(f"{rivals[0]} and {name} give the same constant; give one for both walls, or one for each")
 
 
 def realised(device: Harvester, table: Mapping[Any, Any], wall: Walls) -> tuple[ImpactPair, Harvester]:
@@ -241,10 +260,14 @@ def realised(device: Harvester, table: Mapping[Any, Any], wall: Walls) -> tuple[
         wall: What the walls are.
     """
     pair = impact_pair(**vars(pair_of(table, wall)))
+    if wall == "rigid" and "kappa_left" in table:
+        # Both are of the one membrane that rigid walls are lent.
+        table = {name: value for name, value in table.items() if name != "kappa_right"}
+        table["kappa"] = table.pop("kappa_left")
     natural = {name.replace("kappa", "omega0"): value for name, value in table.items() if name.startswith("kappa")}
     held = {name: value * table["omega"] / math.pi for name, value in natural.items() if math.isfinite(value)}
     moved = with_constants(device, A=table["A"], omega=table["omega"], **held)
-    return pair, moved if pair.hard_wall else with_pair(moved, pair)
+    return pair, with_pair(moved, pair)
 
 
 def changed(device: Harvester, constants: Mapping[str, Any], *, checked: bool = True) -> Harvester:

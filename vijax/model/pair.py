@@ -218,7 +218,7 @@ def check_start(pair: ImpactPair, name: str, u: Any) -> None:
 
 @door
 def impact_pair(
-    d: Given, kappa: Given | Sides[Given | None] | None, r: Given | Sides[Given] | None, gamma: Given = 0.0
+    d: Given, kappa: Given | Sides[Given | None] | None, r: Given | Sides[Given], gamma: Given = 0.0
 ) -> ImpactPair:
     """Make a checked `ImpactPair`, its fields broadcast to one shape.
 

@@ -157,8 +157,14 @@ class CurvePath(eqx.Module):
         # When a contact is deepest is found by a search, and moves with the knots by its own equation.
         frozen = jax.tree.map(lax.stop_gradient, (pair, self.sequence, knots))
         depth, energy, work = steady.yields(device, pair, self.sequence, knots, grazing.between(*frozen).deepest)
-        limit = at(device.depth_limit, self.sequence.side)
-        return depth / limit if self.condition == "depth" else energy / work
+        # An orbit closed half way is as deep at the other wall, too.
+        side, mirrored = self.sequence.side, self.sequence.mirrored
+        limit = jnp.minimum(*(at(device.depth_limit, wall) for wall in (side, jnp.where(mirrored, -side, side))))
+        if self.condition == "depth":
+            return depth / limit
+        if device.unequal:
+            energy = jnp.maximum(energy, steady.image_energy(device, self.sequence, depth, energy))
+        return energy / work
 
     def equations(self, y) -> PathEquations:
         """Compute the gap and the condition, and their derivatives in all unknowns."""

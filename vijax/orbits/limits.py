@@ -1,5 +1,6 @@
 """Where orbits meet the limits of a device: an impact as deep, or one that harvests as much, as is admissible."""
 
+from functools import reduce
 from typing import Any
 
 import jax
@@ -32,13 +33,15 @@ def loads(orbit: Orbit, device: Harvester) -> dict[str, np.ndarray]:
         device: Its constants are numbers, or [orbit, 1].
     """
     depth, work = np.asarray(orbit.depth), np.asarray(orbit.work)
-    side = np.asarray(orbit.sequence.side)
+    side, mirrored = np.asarray(orbit.sequence.side), np.asarray(orbit.sequence.mirrored)
+    # An orbit closed half way is as deep at the other wall, too.
+    walls = [side, np.where(mirrored[:, None], -side, side)] if device.unequal else [side]
     metres = depth * np.asarray(at(depth_unit(device, orbit.pair), side))
-    energy, given = tiles.arrays(
-        (np.asarray(harvested_energy(device.at(side), metres)), work * np.asarray(device.m_b * device.speed_unit**2))
-    )
+    most = reduce(np.maximum, [np.asarray(harvested_energy(device.at(wall), metres)) for wall in walls])
+    least = reduce(np.minimum, [np.asarray(at(device.depth_limit, wall)) for wall in walls])
+    energy, given = tiles.arrays((most, work * np.asarray(device.m_b * device.speed_unit**2)))
     found = {
-        LIMITS[0]: metres / np.asarray(at(device.depth_limit, side)),
+        LIMITS[0]: metres / least,
         LIMITS[1]: np.asarray(energy_ratio(energy, given)),
     }
     real = np.asarray(orbit.sequence.real)

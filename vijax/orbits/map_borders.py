@@ -58,7 +58,13 @@ class LabelledPlane:
 
 def device_of(dataset: "xr.Dataset") -> Harvester:
     """Read the device of a map, as far as the map says; along its axes it is that of the first cell."""
-    walls = [name for name in dataset.coords if (of_both_walls(str(name)) or name) in ("kappa", "r")]
+    names = map(str, dataset.coords)
+    # Where walls may differ what was given for both stands in what each has.
+    walls = [
+        name
+        for name in names
+        if (of_both_walls(name) or name) in ("kappa", "r") and f"{name}_left" not in dataset.coords
+    ]
     first = {str(name): float(dataset[name].values.flat[0]) for name in (*_MOVED, *walls) if name in dataset.coords}
     device = replace(told_device(dataset.attrs), **{name: first.pop(name) for name in _MOVED if name in first})
     natural = device.omega / math.pi

@@ -99,6 +99,10 @@ def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
     side = orbit.sequence.side
     depth = orbit.depth * at(depth_unit(device, orbit.pair), side)
     energy = own.asarray(harvested_energy(device.at(side), depth))
+    if device.unequal:
+        # An orbit closed half way is as often at either wall.
+        image = own.asarray(harvested_energy(device.at(-side), depth))
+        energy = own.where(orbit.sequence.mirrored[:, None], 0.5 * (energy + image), energy)
     # The span of an orbit is in half forcing periods, for their length is the unit of time.
     return tiles.arrays(own.where(orbit.sequence.real, energy, 0.0).sum(axis=1) / orbit.sequence.span)
 

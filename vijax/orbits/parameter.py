@@ -62,6 +62,11 @@ def _of(pair: ImpactPair, name: str) -> Any:
     return getattr(apart(getattr(pair, whole)), name.removeprefix(f"{whole}_")) if whole else getattr(pair, name)
 
 
+def _shared(value: Any) -> Any:
+    """Take what both walls have alike."""
+    return value.left if isinstance(value, Sides) else value
+
+
 def _with(pair: ImpactPair, **values: Any) -> ImpactPair:
     """Change fields of a pair, or what one wall has of them."""
     fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
@@ -93,7 +98,7 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
     end = along.removeprefix(whole)
 
     def omega0() -> np.ndarray:
-        return _of(of, f"kappa{end}") * by.omega / math.pi
+        return _shared(_of(of, f"kappa{end}")) * by.omega / math.pi
 
     known: dict[str, Callable[[], Any]] = {
         "omega": lambda: math.pi * np.sqrt(of.d * by.A / by.s),
@@ -103,7 +108,7 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
         "A": lambda: by.s * (by.omega / math.pi) ** 2 / of.d,
         "beta": lambda: np.arcsin(of.gamma * by.A / by.g),
     }
-    return known[whole]() if whole in known else _of(of, along)
+    return known[whole]() if whole in known else _shared(_of(of, along))
 
 
 @door
@@ -140,7 +145,8 @@ def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tu
     hint = f"a rigid wall has no {' or '.join(of_both)}" if stiff else ""
     checks.choice("along", along, [name for name in MOVED if name not in stiff], hint)
     (first, *more) = MOVED[along]
-    if not more and isinstance(getattr(pair, first, None), Sides):
+    both = getattr(pair, first, None)
+    if not more and isinstance(both, Sides) and not np.array_equal(both.left, both.right):
         of_walls = " or ".join(f"{along}_{side}" for side in SIDES)
         raise ValueError(f"along must be {of_walls}, of one wall, where walls differ; got {along!r}")
     bounds = checks.bounds("within", units.plain(along, within))

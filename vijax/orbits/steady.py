@@ -199,7 +199,8 @@ def _response(device: Harvester, pair: ImpactPair, sequence: Sequence, found: Fo
     knots = shared_slopes(_follows(pair, sequence, knots))
     valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
     depth, harvested, work = (valid * x for x in yields(device, pair, sequence, knots, deepest))
-    P = jnp.where(sequence.real, harvested, 0.0).sum() / sequence.span
+    mean = 0.5 * (harvested + image_energy(device, sequence, depth, harvested)) if device.unequal else harvested
+    P = jnp.where(sequence.real, mean, 0.0).sum() / sequence.span
     left, right = ((sequence.side == wall).sum(dtype=jnp.int32) for wall in (-1, 1))
     # Closed half way, the mirror image of the orbit is the rest of it.
     left, right = (jnp.where(sequence.mirrored, left + right, side) for side in (left, right))
@@ -252,6 +253,15 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
     depth = jnp.where(real, depth, 0.0) * device.length_unit
     work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
     return depth, energy.harvested_energy(device.at(side), depth), work
+
+
+def image_energy(device: Harvester, sequence: Sequence, depth, harvested) -> Float[Array, "impact"]:
+    """Compute what the mirror image of each impact of an orbit closed half way harvests, at the other wall.
+
+    Of orbits closed in full, which have no images, it is what the impact itself does.
+    """
+    there = energy.harvested_energy(device.at(-sequence.side), depth)
+    return jnp.where(sequence.mirrored, there, harvested)
 
 
 def _depths(pair: ImpactPair, side, knots: Knots, deepest) -> Float[Array, "impact"]:

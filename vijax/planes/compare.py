@@ -15,7 +15,7 @@ from vijax.model.choices import Precision, Until, Walls
 from vijax.model.device import Harvester
 from vijax.model.label import ordered
 from vijax.model.pair import symmetric
-from vijax.model.quantities import synonyms
+from vijax.model.quantities import of_both_walls, synonyms
 from vijax.model.records import SETTLED, Status
 from vijax.planes import sweep
 from vijax.planes.axes import Axes
@@ -126,6 +126,9 @@ def plan(
     """
     if tolerance is not None:
         tolerance = _checked(tolerance)
+    for name in axes:
+        if axes[name] is not None and of_both_walls(name) in synonyms("kappa"):
+            raise ValueError(f"{name} must be left out of a comparison, whose rigid walls are lent one membrane")
     settings.only("a comparison", "periods", "until", "transient", "dtype")
     soft, rigid = (sweep.plan(axes, COMPARED, device, replace(settings, wall=wall)) for wall in _WALLS)
     return Comparison(soft, rigid, tolerance)

@@ -325,7 +325,7 @@ def _refined(planned: SweepPlan, tell: Callable[[int, int], None]) -> "xr.Datase
     of = planned.cells
     varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
     mesh = refinement.Mesh(tuple(of.given[dim].values for dim in varied), planned.refine)
-    level_ground = of.pair(np.arange(of.count), planned.settings.wall).symmetric
+    level_ground = of.pair(np.arange(of.count), planned.settings.wall).symmetric & planned.device.alike
     asked = replace(planned, outputs=tuple(dict.fromkeys((*planned.outputs, *refinement.NEEDS))))
     found: Fields = {}
     computed = np.zeros(of.count, bool)
