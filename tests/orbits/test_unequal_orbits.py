@@ -13,7 +13,7 @@ import vijax
 from benchmarks.yardstick import DIGITS, mp_contact, mp_flight, newton
 from vijax import Sides
 from vijax.model.records import Status
-from vijax.orbits import limits, parameter, shooting, symmetry
+from vijax.orbits import limits, multipliers, parameter, shooting, symmetry
 from vijax.orbits.curve_plane import check_plane
 from vijax.orbits.curve_starts import curve_start
 from vijax.orbits.events import Point
@@ -158,6 +158,20 @@ def test_where_the_symmetry_of_walls_goes_a_pitchfork_begins_no_curve(along):
     whole = curve_start(Point("fold", 0.24, half), place, 1e-4, ("d", along)).orbit
     assert not np.asarray(whole.sequence.mirrored).any()
     assert int(np.asarray(whole.count)[0]) == 2
+
+
+@pytest.mark.parametrize("kappa", [None, Sides(50.0, 30.0)], ids=["rigid", "soft"])
+def test_conditions_of_multipliers_are_those_of_the_map_once_around(kappa):
+    pair = vijax.impact_pair(0.3, kappa, Sides(0.4, 0.5))
+    one = vijax.find_orbits(pair, "LR", guesses=64)[0]
+    knots = jnp.nan_to_num(one.knots)
+    both = multipliers.multiplier_conditions(pair, one.sequence, knots)
+    around = np.asarray(multipliers.monodromy(pair, one.sequence, knots))
+    trace, product = np.trace(around), np.linalg.det(around)
+    speed = np.asarray(one.knots)[np.asarray(one.sequence.real), 1]
+    weight = np.prod(speed / (speed + 0.1)) if kappa is None else 1.0
+    np.testing.assert_allclose(both.plus, weight * (1 - trace + product), rtol=1e-9)
+    np.testing.assert_allclose(both.minus, weight * (1 + trace + product), rtol=1e-9)
 
 
 def test_limits_are_those_of_the_wall_that_is_met(orbits):
