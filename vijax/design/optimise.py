@@ -97,7 +97,7 @@ def optimise(
 
     Args:
         device: Where quantities that are not tuned are taken from; Tables I and II unless given.
-        tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's.
+        tune: Constants of the device, or k, kappa, d, gamma; omega0 is the membrane's, omega0_left that of one.
         bounds: Of tuned quantities, (low, high) by name. Unless given: kappa 2 to 400, omega0 and k as that gives them,
             r 0.05 to 0.95, inclinations +-0.1 rad, all else half to twice what the device has.
         objective: "P" [J per half period], "power" [W], "speed" [m/s]; over the tolerances, "mean" or "worst" of P on

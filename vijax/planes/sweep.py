@@ -68,7 +68,8 @@ def sweep(
 
     Dimensionless axes are d, kappa, r, gamma and the start u0, v0; physical ones omega [rad/s], s [m], omega0 [rad/s]
     or k [N/m], A [m/s^2], beta [rad]. d and s are one quantity, so are kappa, omega0 and k, gamma and beta: give one
-    of each. Whatever no axis gives is the device's (s, omega0, r, A, omega, beta): d follows omega unless d is given.
+    of each. Walls that differ have axes of their own: kappa_left, kappa_right, r_left, r_right, and so of omega0 and k.
+    Whatever no axis gives is the device's (s, omega0, r, A, omega, beta): d follows omega unless d is given.
     The start is u0 = min(0.05853, 0.49 d), v0 = -0.47898 unless given.
     Cells that share (d, kappa, r, gamma, u0, v0) are simulated once however many omega or A there are, and with rigid
     walls however many kappa: it then enters energies alone.
@@ -79,7 +80,7 @@ def sweep(
             `transient` periods and measures over the next `periods`.
         transient: Forcing periods to drop before a window. The search for an attractor begins at once and takes none;
             where it finds nothing, averages leave out the first quarter of `periods`.
-        wall: "soft" or "rigid".
+        wall: "soft" or "rigid"; "rigid_left" or "rigid_right" where one wall is rigid, which harvests nothing.
         method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
             paper's fixed steps without event location.
         solver: Of "ode": Tsit5 unless given; Bosh3, Dopri5, Dopri8, Kvaerno3, Kvaerno4 or Kvaerno5.
