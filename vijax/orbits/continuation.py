@@ -72,8 +72,8 @@ def follow(
     Args:
         orbit: Where to start, each a branch of its own; all at once.
         along: "d", "kappa", "r", "gamma", or a quantity of the device, which moves several of them together: "omega",
-            "omega0" [rad/s], "s" [m], "A" [m/s^2], "beta" [rad] or "k" [N/m]; of one wall "kappa_left", "r_right" and so
-            on, also of omega0 and k.
+            "omega0" [rad/s], "s" [m], "A" [m/s^2], "beta" [rad] or "k" [N/m]; of one wall "kappa_left", "r_right" and
+            so on, also of omega0 and k.
         within: Bounds of the parameter, as numbers or quantities of pint; the starts lie between.
         direction: "up" or "down" in the parameter at first, or "both".
         device: For a quantity of the device: its other constants, which stay, say at which value of it the orbit is.

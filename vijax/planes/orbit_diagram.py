@@ -94,7 +94,7 @@ def orbit_diagram(
         direction: "down", "up" or "both".
         periods: Forcing periods of every point.
         recorded_periods: How many of these, at the end, are recorded.
-        wall: "soft" or "rigid".
+        wall: "soft", "rigid", "rigid_left" or "rigid_right".
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
         progress: Called with (points done, points in all) from the calling thread, first with 0 done.

@@ -39,7 +39,7 @@ class SweepSettings:
             `transient` periods and measures over the next `periods`.
         transient: Forcing periods to drop before a window, 0. The search for an attractor begins at once and takes
             none; where it finds nothing, averages leave out the first quarter of `periods`.
-        wall: "soft" or "rigid".
+        wall: "soft", "rigid", "rigid_left" or "rigid_right".
         method: "exact", the event-driven engine; "ode", an adaptive solver of diffrax with located events; "rk4", the
             paper's fixed steps without event location.
         solver: Of "ode", one of `SolverName`; Tsit5 if None.
