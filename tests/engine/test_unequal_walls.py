@@ -11,10 +11,12 @@ import pytest
 import vijax
 from benchmarks.yardstick import DATA, DIGITS, HORIZON, Row, mp_march
 from vijax import Sides
+from vijax.batch import chain
 from vijax.engine import exact, quick, quick_wall, sampled
 from vijax.engine.ground import ground_of
 from vijax.engine.impact import Ball
 from vijax.model.records import State
+from vijax.orbits import motion
 
 CASES = json.loads((DATA / "unequal_walls.json").read_text())
 LANES = 256
@@ -164,3 +166,32 @@ def test_a_start_on_a_wall_that_moves_into_it_is_an_impact_where_the_wall_is_rig
         assert float(rigid.v_out[0]) == -0.125
     soft = vijax.trajectory(vijax.impact_pair(0.15, Sides(20.0, None), 0.5), -0.075, -0.25, 12).impacts
     assert 2 * int(soft.n[0]) + float(soft.t[0]) > 0.01
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_between_its_events_a_motion_is_that_of_the_wall_that_is_met(side):
+    """Inside a wall at phase 0, and along the curve that is drawn of a contact."""
+    pair = vijax.impact_pair(0.25, Sides(8.0, 20.0), Sides(0.5, 0.7))
+    for name in ("u", "v"):
+        mine, alike = (
+            float(getattr(vijax.trajectory(one, side * 0.13, 0.0, 1, t0=1.98).states, name)[0])
+            for one in (pair, pair.at(side))
+        )
+        assert abs(mine) > 0
+        assert mine == pytest.approx(alike, rel=1e-13), name
+    impact = np.array([0.3]), np.array([float(side)]), np.array([side * 0.5]), np.array([-side * 0.3]), np.array([0.1])
+    mine, alike = (motion.curve(one, *impact) for one in (pair, pair.at(side)))
+    np.testing.assert_allclose(mine.u, alike.u, rtol=1e-13)
+    np.testing.assert_allclose(mine.v, alike.v, rtol=1e-13, atol=1e-15)
+
+
+def test_a_ball_that_gravity_holds_rests_on_the_wall_below():
+    pair = vijax.impact_pair([0.25, 0.25], Sides(8.0, 20.0), Sides(0.5, 0.7), [1.5, -1.5])
+    mine = chain.resting(pair, jnp.zeros(2))
+    for row, side in enumerate((-1, 1)):
+        alike = chain.resting(pair.at(side), jnp.zeros(2))
+        assert float(mine.u[row]) == pytest.approx(float(alike.u[row]), rel=1e-14)
+        assert side * float(mine.u[row]) > 0.125
+    hard = chain.resting(vijax.impact_pair([0.25, 0.25], Sides(8.0, None), 0.5, [1.5, -1.5]), jnp.zeros(2))
+    assert float(hard.u[0]) == float(mine.u[0])
+    assert float(hard.u[1]) == 0.125
