@@ -8,9 +8,9 @@ import pytest
 import vijax
 from vijax import Sides
 from vijax.model import pair as pairs
-from vijax.model.device import changed, constant_of, depth_unit, realised, told_device, with_constants, with_pair
+from vijax.model.device import changed, depth_unit, realised, told_device, with_constants, with_pair
 from vijax.model.energy import admissible, harvested_energy
-from vijax.model.sides import apart, at, each, named
+from vijax.model.sides import apart, at, each, field_of, named
 
 
 def test_each_wall_has_its_own_and_both_what_they_share():
@@ -111,8 +111,8 @@ def test_constants_of_one_wall_have_names_of_their_own():
     assert float(device.omega0.left) == 300.0
     assert float(device.omega0.right) == pytest.approx(500.0)
     assert Sides(2000.0, 1000.0) == device.V
-    assert float(constant_of(device, "k_left")) == pytest.approx(315.0)
-    assert constant_of(device, "A") == 1.0
+    assert float(field_of(device, "k_left")) == pytest.approx(315.0)
+    assert field_of(device, "A") == 1.0
     assert changed(device, {"r": 0.3}).r == 0.3
     told = {f"harvester_{name}": value for name, value in named("V", device.V).items()}
     assert told_device(told).V == device.V

@@ -131,7 +131,7 @@ class Tally(eqx.Module):
     fastest: Lane
     momentum: Lane | None  # sum of v_in, signed
     deepest: Lane | None
-    deepest_sides: Sides | None  # of each wall, where these may differ
+    deepest_sides: Sides | None  # the same of each wall, kept only where the two may differ
     harvest: Harvest | None
     stuck: Mask | None
 

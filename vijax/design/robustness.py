@@ -114,7 +114,7 @@ def _attractors(device: Harvester, starts: int, seed: int | None) -> tuple[Neigh
 
 
 def _edge(optimum: Optimum, way: Direction, reach: float) -> Edge:
-    omega0: Any = optimum.device.omega0  # of both walls
+    omega0: Any = optimum.device.omega0  # One number: where walls differ nobody asks for an edge.
     # Of all that the motion depends on, omega0 changes kappa alone.
     kappa = float(omega0) * math.pi / float(optimum.device.omega)
     within = ((1 - reach) * kappa, (1 + reach) * kappa)

@@ -10,9 +10,10 @@ import numpy as np
 
 from vijax.design.optimum import Optimum
 from vijax.design.tolerance import Tolerance, check_tolerances
-from vijax.model.device import constant_of, with_constants
-from vijax.model.quantities import QUANTITIES, of_both_walls
+from vijax.model.device import with_constants
+from vijax.model.quantities import QUANTITIES, whole
 from vijax.model.records import Status
+from vijax.model.sides import field_of
 from vijax.orbits import curve_lanes, periodic
 from vijax.orbits.curves import BifurcationCurve
 from vijax.orbits.limits import LIMITS
@@ -79,7 +80,7 @@ def tolerance_plane(optimum: Optimum, tolerances: Sequence[Tolerance]) -> Tolera
     """
     checks.instance("optimum", optimum, Optimum, "vijax.optimise(...).best, an orbit")
     one, other = check_pair(tolerances)
-    here = float(constant_of(optimum.device, one.name)), float(constant_of(optimum.device, other.name))
+    here = float(field_of(optimum.device, one.name)), float(field_of(optimum.device, other.name))
     within = {t.name: _about(t, x) for t, x in zip((one, other), here, strict=True)}
     found = curves_about(optimum.orbit, within, device=optimum.device)
     spread = one.spread, other.spread
@@ -102,7 +103,7 @@ def check_pair(tolerances: Sequence[Tolerance]) -> tuple[Tolerance, Tolerance]:
 def _about(of: Tolerance, x: float) -> tuple[float, float]:
     """Give the bounds of the plane about a value."""
     reach = min(max(_TIMES * of.spread, _REACH), _MOST)
-    return x * (1 - reach), min(x * (1 + reach), 1.0) if (of_both_walls(of.name) or of.name) == "r" else x * (1 + reach)
+    return x * (1 - reach), min(x * (1 + reach), 1.0) if whole(of.name) == "r" else x * (1 + reach)
 
 
 def _nearest(found: list[BifurcationCurve], optimum: Optimum, spread: tuple[float, float]) -> NearestPoint | None:
@@ -127,7 +128,7 @@ class _Piece(NamedTuple):
 
 def _pieces(curve: BifurcationCurve, optimum: Optimum, spread: tuple[float, float]) -> Iterator[_Piece]:
     """Find the nearest point of every piece of a curve on which stable orbits border."""
-    here = np.array([float(constant_of(optimum.device, name)) for name in curve.along])
+    here = np.array([float(field_of(optimum.device, name)) for name in curve.along])
     unit = here * spread
     place = (curve.values - here) / unit
     begin, step = place[:-1], np.diff(place, axis=0)
@@ -146,16 +147,16 @@ def _pieces(curve: BifurcationCurve, optimum: Optimum, spread: tuple[float, floa
 def _meets(optimum: Optimum, piece: _Piece) -> bool:
     """Say whether the optimum's orbit, as its device moves straight to a point of a curve, becomes that curve's."""
     along, orbit = piece.curve.along, optimum.orbit
-    here = [float(constant_of(optimum.device, name)) for name in along]
+    here = [float(field_of(optimum.device, name)) for name in along]
     for share in _SHARES:
         moved = {name: a + share * (b - a) for name, a, b in zip(along, here, piece.point.values, strict=True)}
         pair = jax.tree.map(lambda x: jnp.asarray(x, float)[None], with_constants(optimum.device, **moved).pair())
         orbit = periodic.solve(pair, orbit.sequence, jnp.nan_to_num(orbit.knots))
         if int(orbit.status[0]) == Status.NO_ORBIT:
             return False
-    own = curve_lanes.traits(orbit, images=True)
+    mine = curve_lanes.traits(orbit, images=True)
     theirs = curve_lanes.traits(piece.curve.orbit[piece.place : piece.place + 2])
-    return bool(min(np.abs(one - other).max() for one in own for other in theirs) < _ALIKE)
+    return bool(min(np.abs(one - other).max() for one in mine for other in theirs) < _ALIKE)
 
 
 def _closest(begin: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, float, int]:

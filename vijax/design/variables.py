@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vijax.model import units
-from vijax.model.device import CONSTANTS, Harvester, changed, constant_of
+from vijax.model.device import CONSTANTS, Harvester, changed
 from vijax.model.pair import ImpactPair
-from vijax.model.quantities import PARAMETERS, SIDES, check, of_both_walls
-from vijax.model.sides import Sides, apart, each
+from vijax.model.quantities import PARAMETERS, SIDES, check, of_both_walls, whole
+from vijax.model.sides import Sides, each, field_of
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.programs import jitted
@@ -75,31 +75,28 @@ def cells(devices: Harvester, z: Float[Array, "cell variable"], names: tuple[str
 
 def _decided(device: Harvester, name: str, x: Any) -> Harvester:
     """Make the device in which a quantity that is no constant has the given value."""
-    whole = of_both_walls(name) or name
     value = {
         "k": lambda: jnp.sqrt(x / device.m_b),
         "kappa": lambda: x * device.omega / math.pi,
         "d": lambda: x * device.length_unit,
         "gamma": lambda: jnp.arcsin(x * device.A / device.g),
-    }[whole]()
+    }[whole(name)]()
     return changed(device, {_ALIASES[name]: value})
 
 
 def scattered(device: Harvester, names: tuple[str, ...], factors: Any) -> Harvester:
     """Make the device in which some constants are off by factors; those of both walls, or of one."""
     for name, factor in zip(names, factors, strict=True):
-        off = each(partial(operator.mul, factor), constant_of(device, name))
+        off = each(partial(operator.mul, factor), field_of(device, name))
         device = changed(device, {name: off}, checked=False)
     return device
 
 
 def value_of(device: Harvester, name: str) -> Any:
     """Find the quantity's value in a device."""
-    whole = of_both_walls(name) or name
-    if name not in _ALIASES or whole == "k":
-        return constant_of(device, name)
-    field = getattr(device.pair(), whole)
-    return field if whole == name else getattr(apart(field), name.removeprefix(f"{whole}_"))
+    if name not in _ALIASES or whole(name) == "k":
+        return field_of(device, name)
+    return field_of(device.pair(), name)
 
 
 def check_names(names: tuple[str, ...]) -> None:
@@ -158,5 +155,5 @@ def _default(name: str, device: Harvester) -> tuple[float, float]:
         "beta": (-_TILT, _TILT),
         "gamma": np.array([-1, 1]) * math.sin(_TILT) * float(device.g) / float(device.A),
     }
-    low, high = known.get(of_both_walls(name) or name, (0.5 * float(now), 2 * float(now)))
+    low, high = known.get(whole(name), (0.5 * float(now), 2 * float(now)))
     return float(low), float(high)

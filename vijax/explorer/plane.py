@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vijax.model.device import Harvester, constant_of, realised, told_device
+from vijax.model.device import Harvester, realised, told_device
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import AXES, START, START_REACH, of_both_walls, synonyms
+from vijax.model.sides import field_of
 from vijax.planes.axes import cells
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots.cells import edges
@@ -190,26 +191,26 @@ def _fixed(dataset: "xr.Dataset", along: list[str]) -> dict[str, float]:
     wall = dataset.attrs.get("wall", SweepSettings.wall)
     there = [name for name in _PAIR if name in dataset.coords]
     # Of walls that differ a map has what each has, besides what was given for both.
-    own = [name for name in there if f"{name}_left" not in dataset.coords]
+    table_names = [name for name in there if f"{name}_left" not in dataset.coords]
 
     # Read where it is needed: no inclination gives some gamma of a plane.
     def device() -> Harvester:
-        table = {name: first(name) for name in (*own, "A", "omega")}
+        table = {name: first(name) for name in (*table_names, "A", "omega")}
         return realised(told_device(dataset.attrs), table, wall)[1]
 
     found: dict[str, float] = {}
     taken = {f"{one}{end}" for name in along for one in synonyms(name) for end in ("", "_left", "_right")}
     for name in there:
-        whole = of_both_walls(name)
+        both = of_both_walls(name)
         # Of rigid walls kappa is that of the one membrane which they are lent; that of one beside a soft one is none.
-        lent = whole == "kappa" and wall == "rigid"
-        if name in taken or (whole in there and not lent) or not math.isfinite(first(name)):
+        lent = both == "kappa" and wall == "rigid"
+        if name in taken or (both in there and not lent) or not math.isfinite(first(name)):
             continue
         if dataset[name].ndim == 0 or name.startswith("r"):
-            found[whole if lent else name] = first(name)
+            found[both if lent else name] = first(name)
         else:
-            constant = {"d": "s", "gamma": "beta"}.get(name, (whole if lent else name).replace("kappa", "omega0"))
-            found[constant] = float(constant_of(device(), constant))
+            constant = {"d": "s", "gamma": "beta"}.get(name, (both if lent else name).replace("kappa", "omega0"))
+            found[constant] = float(field_of(device(), constant))
     found |= {name: first(name) for name in ("omega", "A") if name not in along}
     starts = {name: dataset[name] for name in ("u0", "v0") if name not in along and dataset[name].ndim == 0}
     usual = {"u0": min(START[0], START_REACH * found["d"]) if "d" in found else None, "v0": START[1]}

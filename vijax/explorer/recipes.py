@@ -12,8 +12,8 @@ from vijax.explorer.motion import CellMotion
 from vijax.explorer.plane import Axis, ExploredCell, ExploredPlane
 from vijax.explorer.source import Source
 from vijax.explorer.view import View
-from vijax.model.device import CONSTANTS, WALLS_OWN, Harvester
-from vijax.model.quantities import AXES, SIDES
+from vijax.model.device import CONSTANTS, Harvester
+from vijax.model.quantities import AXES, SIDES, parted
 from vijax.model.sides import Sides, named
 from vijax.planes.sweep_settings import SPEED
 
@@ -69,12 +69,12 @@ def _device(constants: Mapping[str, float]) -> str:
     """Write the call that makes the device of Tables I and II with other constants."""
     given: dict[str, str] = {}
     for name, value in constants.items():
-        whole, _, side = name.rpartition("_")
-        if side not in SIDES or whole not in WALLS_OWN:
+        field, side = parted(name)
+        if not side:
             given[name] = repr(value)
-        elif whole not in given:
-            both = (constants.get(f"{whole}_{one}", getattr(_DEVICE, whole)) for one in SIDES)
-            given[whole] = f"vijax.Sides({', '.join(map(repr, both))})"
+        elif field not in given:
+            both = (constants.get(f"{field}_{one}", getattr(_DEVICE, field)) for one in SIDES)
+            given[field] = f"vijax.Sides({', '.join(map(repr, both))})"
     return f"vijax.Harvester({', '.join(f'{name}={text}' for name, text in given.items())})"
 
 

@@ -2,7 +2,7 @@
 
 import html
 
-from vijax.model.quantities import AXES, of_both_walls
+from vijax.model.quantities import AXES, parted
 
 COLOURS = {
     "wall": "#b0b0b0",
@@ -33,8 +33,8 @@ _GREEK = {
 
 def symbol(name: str) -> str:
     """Write the symbol of an axis; of one wall's with the name of the wall."""
-    whole = of_both_walls(name) or name
-    return _GREEK.get(whole, whole) + name.removeprefix(whole).replace("_", " ")
+    quantity, side = parted(name)
+    return " ".join(filter(None, (_GREEK.get(quantity, quantity), side)))
 
 
 def written(name: str) -> str:

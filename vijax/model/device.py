@@ -14,8 +14,8 @@ import numpy as np
 from vijax.model import units
 from vijax.model.choices import Walls
 from vijax.model.pair import WALLS, ImpactPair, Real, check_pair, impact_pair, pair_of
-from vijax.model.quantities import SIDES, check
-from vijax.model.sides import Sides, apart, at, each, named
+from vijax.model.quantities import SIDES, check, whole
+from vijax.model.sides import Sides, apart, at, each, named, with_own
 from vijax.runtime import checks
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
@@ -174,9 +174,9 @@ def told_device(attributes: Mapping[Any, Any]) -> Harvester:
     """Read the device that a map's attributes tell; what they do not tell, as its axes, is that of Tables I and II."""
     told: dict[str, Any] = {}
     for name in (*CONSTANTS, "penetration_limit"):
-        whole, sides = f"harvester_{name}", [f"harvester_{name}_{side}" for side in SIDES]
-        if whole in attributes:
-            told[name] = float(attributes[whole])
+        both, sides = f"harvester_{name}", [f"harvester_{name}_{side}" for side in SIDES]
+        if both in attributes:
+            told[name] = float(attributes[both])
         elif sides[0] in attributes:
             told[name] = Sides(*(float(attributes[one]) for one in sides))
     # The limit is told as a number even where it is the radius of the membrane, as a device says by None.
@@ -229,9 +229,8 @@ def with_constants(device: Harvester, **constants: Own) -> Harvester:
     m_b = constants.get("m_b", device.m_b)
     given: dict[str, Any] = {}
     for name, value in constants.items():
-        whole = name if name in known else name.rpartition("_")[0]
-        value = each(partial(units.plain, whole), value)
-        if whole == "k":
+        value = each(partial(units.plain, whole(name)), value)
+        if whole(name) == "k":
             for argument, one in named(name, value).items():
                 check("k", one, argument)
             check("m_b", m_b)
@@ -276,14 +275,7 @@ def changed(device: Harvester, constants: Mapping[str, Any], *, checked: bool = 
     Args:
         checked: Whether to look whether they may be, for which arrays of many devices take long.
     """
-    fields: dict[str, Any] = {}
-    for name, value in constants.items():
-        whole, _, side = name.rpartition("_")
-        if side not in SIDES or whole not in WALLS_OWN:
-            fields[name] = value
-            continue
-        both = apart(fields.get(whole, getattr(device, whole)))
-        fields[whole] = Sides(value, both.right) if side == SIDES[0] else Sides(both.left, value)
+    fields = with_own(device, constants)
     if checked:
         return dataclasses.replace(device, **fields)
     return eqx.tree_at(
@@ -292,14 +284,6 @@ def changed(device: Harvester, constants: Mapping[str, Any], *, checked: bool = 
         list(fields.values()),
         is_leaf=lambda leaf: leaf is None,
     )
-
-
-def constant_of(device: Harvester, name: str) -> Any:
-    """Find a constant of a device or its k, or under a name such as omega0_left what one wall has of it."""
-    whole, _, side = name.rpartition("_")
-    if side not in SIDES or whole not in ("k", *WALLS_OWN):
-        return getattr(device, name)
-    return getattr(apart(getattr(device, whole)), side)
 
 
 @door

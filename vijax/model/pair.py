@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from vijax.model import units
 from vijax.model.choices import Walls
-from vijax.model.quantities import SIDES, check
+from vijax.model.quantities import SIDES, check, whole
 from vijax.model.restitution import damped_frequency, damping_ratio, restitution
 from vijax.model.sides import Sides, apart, at, each, named
 from vijax.model.units import Given
@@ -235,9 +235,9 @@ def impact_pair(
     """
     given = {"d": d, **named("kappa", kappa), **named("r", r), "gamma": gamma}
     given = {name: value for name, value in given.items() if value is not None or not name.startswith("kappa")}
-    given = {name: units.plain(_quantity(name), value) for name, value in given.items()}
+    given = {name: units.plain(whole(name), value) for name, value in given.items()}
     for name, value in given.items():
-        check(_quantity(name), value, name)
+        check(whole(name), value, name)
     arrays = [np.asarray(value) if isinstance(value, list | tuple) else value for value in given.values()]
     dtype = jnp.result_type(float, *arrays)  # float64, or float32 where all arrays are
     # By NumPy where it can: JAX would compile a program for every shape.
@@ -247,11 +247,6 @@ def impact_pair(
     fields = {name: own.broadcast_to(array, shape) for name, array in zip(given, arrays, strict=True)}
     pair = ImpactPair(fields["d"], _joined("kappa", fields), _joined("r", fields), fields["gamma"])
     return jax.device_put(pair) if own is np else pair
-
-
-def _quantity(argument: str) -> str:
-    """Name the quantity that an argument of one wall or of both is of."""
-    return argument.partition("_")[0]
 
 
 def pair_of(table: Mapping[Any, Any], wall: Walls) -> ImpactPair:

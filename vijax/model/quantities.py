@@ -212,10 +212,20 @@ def synonyms(name: str) -> tuple[str, ...]:
     return tuple(one for one, axis in AXES.items() if axis.constant == AXES[name].constant)
 
 
+def parted(name: str) -> tuple[str, str]:
+    """Part the name of what one wall has: ("kappa", "left"); ("d", "") of what both walls share."""
+    whole, _, side = name.rpartition("_")
+    return (whole, side) if side in SIDES else (name, "")
+
+
+def whole(name: str) -> str:
+    """Name a quantity without the wall that it is of: kappa for kappa_left and for kappa."""
+    return parted(name)[0]
+
+
 def of_both_walls(name: str) -> str:
     """Name the axis that gives both walls what this one gives one of them; "" for an axis of the whole."""
-    whole, _, side = name.rpartition("_")
-    return whole if side in SIDES and whole in _OF_ONE_WALL else ""
+    return whole(name) if parted(name)[1] else ""
 
 
 def check(name: str, value: Any, argument: str | None = None) -> None:

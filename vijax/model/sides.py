@@ -1,13 +1,13 @@
 """Two walls that differ: `Sides` holds what each of them has; `at` takes that of the wall where the ball is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vijax.model.quantities import SIDES
+from vijax.model.quantities import SIDES, parted
 
 T = TypeVar("T")
 
@@ -52,6 +52,26 @@ def each(function: Callable[..., Any], *values: Any) -> Any:
         return function(*values)
     left, right = ([getattr(apart(value), name) for value in values] for name in SIDES)
     return Sides(function(*left), function(*right))
+
+
+def field_of(record: Any, name: str) -> Any:
+    """Take a field of a record or, under a name such as kappa_left, what one wall has of it."""
+    field, side = parted(name)
+    value = getattr(record, field)
+    return getattr(apart(value), side) if side else value
+
+
+def with_own(record: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Give the fields of a record that change where such values are put in: whole, or of one wall."""
+    fields: dict[str, Any] = {}
+    for name, value in values.items():
+        field, side = parted(name)
+        if not side:
+            fields[field] = value
+            continue
+        both = apart(fields.get(field, getattr(record, field)))
+        fields[field] = Sides(value, both.right) if side == SIDES[0] else Sides(both.left, value)
+    return fields
 
 
 def named(name: str, value: Any) -> dict[str, Any]:

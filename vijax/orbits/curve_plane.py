@@ -6,9 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from vijax.model.device import Harvester, constant_of
+from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import of_both_walls, synonyms
+from vijax.model.sides import field_of
 from vijax.orbits.events import Point
 from vijax.orbits.parameter import check_along, moved_together, of_pair, value_at
 from vijax.runtime import checks
@@ -56,7 +57,7 @@ def place_of(point: Point, along: str, plane: Plane, device: Harvester) -> tuple
         elif of_pair(name):
             value = float(np.asarray(value_at(pair, name, device))[0])
         elif along in plane:
-            value = float(constant_of(device, name))
+            value = float(field_of(device, name))
         else:
             raise ValueError(f"along must be in the plane of {' and '.join(plane)}; got branches along {along}")
         if not low <= value <= high:

@@ -11,7 +11,7 @@ from vijax.model.choices import Walls
 from vijax.model.device import Harvester, told_device, with_constants
 from vijax.model.label import label
 from vijax.model.pair import ImpactPair, pair_of, symmetric
-from vijax.model.quantities import PARAMETERS, of_both_walls
+from vijax.model.quantities import PARAMETERS, whole
 from vijax.orbits.curve_plane import check_plane
 from vijax.runtime import checks
 
@@ -60,11 +60,7 @@ def device_of(dataset: "xr.Dataset") -> Harvester:
     """Read the device of a map, as far as the map says; along its axes it is that of the first cell."""
     names = map(str, dataset.coords)
     # Where walls may differ what was given for both stands in what each has.
-    walls = [
-        name
-        for name in names
-        if (of_both_walls(name) or name) in ("kappa", "r") and f"{name}_left" not in dataset.coords
-    ]
+    walls = [name for name in names if whole(name) in ("kappa", "r") and f"{name}_left" not in dataset.coords]
     first = {str(name): float(dataset[name].values.flat[0]) for name in (*_MOVED, *walls) if name in dataset.coords}
     device = replace(told_device(dataset.attrs), **{name: first.pop(name) for name in _MOVED if name in first})
     natural = device.omega / math.pi
@@ -129,7 +125,7 @@ def _cells(dataset: "xr.Dataset", like: "xr.DataArray | None" = None) -> dict[st
     """Give what the pairs of the cells of a map are made of, and u0 and v0."""
     cells: dict[str, Any] = {}
     for name in map(str, dataset.coords):
-        if (of_both_walls(name) or name) in ("d", "kappa", "r", "gamma", "u0", "v0"):
+        if whole(name) in ("d", "kappa", "r", "gamma", "u0", "v0"):
             values = dataset[name]
             cells[name] = (values if like is None else values.broadcast_like(like).transpose(*like.dims)).values
     return cells

@@ -16,8 +16,8 @@ import numpy as np
 from vijax.model import units
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.model.quantities import SIDES, check, of_both_walls
-from vijax.model.sides import Sides, apart, each
+from vijax.model.quantities import SIDES, check, of_both_walls, whole
+from vijax.model.sides import Sides, each, field_of, with_own
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import Values
 from vijax.runtime.context import door
@@ -50,16 +50,10 @@ def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Valu
         return _with(pair, **{along: x})
     fields: dict[str, Any] = {}
     for name, power in _POWERS[along].items():
-        value, factor = _of(pair, name), (x / start) ** power
+        value, factor = field_of(pair, name), (x / start) ** power
         # Rigid walls have no kappa.
         fields[name] = None if value is None else each(partial(operator.mul, factor), value)
     return _with(pair, **fields)
-
-
-def _of(pair: ImpactPair, name: str) -> Any:
-    """Take a field of a pair, or what one wall has of it."""
-    whole = of_both_walls(name)
-    return getattr(apart(getattr(pair, whole)), name.removeprefix(f"{whole}_")) if whole else getattr(pair, name)
 
 
 def _shared(value: Any) -> Any:
@@ -69,16 +63,7 @@ def _shared(value: Any) -> Any:
 
 def _with(pair: ImpactPair, **values: Any) -> ImpactPair:
     """Change fields of a pair, or what one wall has of them."""
-    fields = {name: getattr(pair, name) for name in ("d", "kappa", "r", "gamma")}
-    for name, value in values.items():
-        whole = of_both_walls(name)
-        if not whole:
-            fields[name] = value
-        elif name.endswith("left"):
-            fields[whole] = Sides(value, apart(fields[whole]).right)
-        else:
-            fields[whole] = Sides(apart(fields[whole]).left, value)
-    return ImpactPair(**fields)
+    return replace(pair, **with_own(pair, values))
 
 
 def moved_together(
@@ -94,11 +79,10 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
     """Find the parameter's value where a device, by that parameter, has a pair."""
     of, by = jax.tree.map(np.asarray, (pair, device))
 
-    whole = of_both_walls(along) or along
-    end = along.removeprefix(whole)
+    end = along.removeprefix(whole(along))
 
     def omega0() -> np.ndarray:
-        return _shared(_of(of, f"kappa{end}")) * by.omega / math.pi
+        return _shared(field_of(of, f"kappa{end}")) * by.omega / math.pi
 
     known: dict[str, Callable[[], Any]] = {
         "omega": lambda: math.pi * np.sqrt(of.d * by.A / by.s),
@@ -108,7 +92,7 @@ def value_at(pair: ImpactPair, along: str, device: Harvester) -> np.ndarray:
         "A": lambda: by.s * (by.omega / math.pi) ** 2 / of.d,
         "beta": lambda: np.arcsin(of.gamma * by.A / by.g),
     }
-    return known[whole]() if whole in known else _shared(_of(of, along))
+    return known[whole(along)]() if whole(along) in known else _shared(field_of(of, along))
 
 
 @door
@@ -140,7 +124,7 @@ def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tu
     """Take the bounds of a parameter; raise ValueError unless branches of such a pair can be followed between them."""
     if pair.hard_wall:
         raise ValueError("orbit must be between two walls of one kind to be followed; got one rigid and one soft")
-    stiff = [name for name, (first, *_) in MOVED.items() if (of_both_walls(first) or first) == "kappa" and pair.rigid]
+    stiff = [name for name, (first, *_) in MOVED.items() if whole(first) == "kappa" and pair.rigid]
     of_both = [name for name in stiff if not of_both_walls(name)]
     hint = f"a rigid wall has no {' or '.join(of_both)}" if stiff else ""
     checks.choice("along", along, [name for name in MOVED if name not in stiff], hint)

@@ -16,7 +16,7 @@ from vijax.model import units
 from vijax.model.choices import Walls
 from vijax.model.device import WALLS_OWN, Harvester
 from vijax.model.pair import RIGID_ON, ImpactPair, pair_of
-from vijax.model.quantities import AXES, SIDES, START, START_REACH, check, of_both_walls, synonyms
+from vijax.model.quantities import AXES, SIDES, START, START_REACH, check, of_both_walls, synonyms, whole
 from vijax.model.sides import Sides
 from vijax.model.units import Given
 from vijax.runtime import checks
@@ -192,7 +192,7 @@ class Cells:
     @property
     def pair_names(self) -> tuple[str, ...]:
         """Name the quantities of the pair."""
-        return tuple(name for name in self.quantities if (of_both_walls(name) or name) in ("d", "kappa", "r", "gamma"))
+        return tuple(name for name in self.quantities if whole(name) in ("d", "kappa", "r", "gamma"))
 
     @property
     def unequal(self) -> bool:
@@ -259,11 +259,11 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
         if len(rivals) > 1:
             raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
     for name in given:
-        whole = of_both_walls(name)
-        for rival in synonyms(whole) if whole else ():
+        both = of_both_walls(name)
+        for rival in synonyms(both) if both else ():
             if rival in given:
                 raise ValueError(f"{rival} and {name} give the same quantity; give one for both walls, or one for each")
-        if (whole or name) == "r" and not restitution:
+        if whole(name) == "r" and not restitution:
             raise ValueError(
                 f"{name} must be left out with a membrane that has no restitution; got {checks.shown(given[name])}"
             )
@@ -273,10 +273,10 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
     _check_sizes(sizes)
     quantities = _quantities(values, device, wall, xr)
     if not restitution:
-        quantities |= {name: xr.Variable((), np.nan) for name in quantities if (of_both_walls(name) or name) == "r"}
+        quantities |= {name: xr.Variable((), np.nan) for name in quantities if whole(name) == "r"}
     if wall != "soft":
         _check_start(quantities["d"], quantities["u0"], wall)
-    stiff = [name for name in quantities if (of_both_walls(name) or name) == "kappa"]
+    stiff = [name for name in quantities if whole(name) == "kappa"]
     energies = {"omega", "A", *(stiff if wall == "rigid" else ())}
     motion = [quantity for name, quantity in quantities.items() if name not in energies]
     dynamic = tuple(dim for dim in sizes if any(dim in quantity.dims for quantity in motion))
