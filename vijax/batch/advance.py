@@ -99,7 +99,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
         matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
     after = out.state
     # A flight that drifts comes to a wall after the horizon.
-    late = out.quiet & ~neutral(pair, ball)
+    late = out.quiet & ~neutral(pair, flow.mean_velocity(ball.v, ball.t))
     impact = LaneImpact(
         onset_t=out.impact.t,
         onset_n=jnp.where(late, jnp.inf, ball.n + out.impact.n.astype(ball.n.dtype)),
@@ -117,10 +117,9 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
     return Answer(event, (held != 0) & ~out.permanent, jnp.ones_like(out.quiet))
 
 
-def neutral(pair: ImpactPair, ball: Ball) -> Mask:
+def neutral(pair: ImpactPair, mean_velocity: Lane) -> Mask:
     """Say whether a flight that nothing stops stays within the gap for as good as ever."""
-    drift = ball.v - jnp.sin(flow.PI * ball.t) / flow.PI
-    return jnp.abs(drift) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
+    return jnp.abs(mean_velocity) + jnp.abs(pair.gamma) < pair.d / _FOR_EVER
 
 
 def settle(plan: Plan, settings: Settings, cell: Cell, answer: Answer, served: Mask) -> Cell:

@@ -91,7 +91,7 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     c = cell.candidate
     start = stopped & c.found & ~lost
     judged = stopped & c.tracing & (c.left <= 0) & ~lost
-    newton = correction(cell)
+    newton = correction(cell, settings.method)
     verdict = judge(settings, cell, newton, judged)
     cell = _begin_round(plan, settings, cell, newton, verdict, start)
     cell = _back_to_search(plan, cell, verdict.bad, 10 * grain(settings))

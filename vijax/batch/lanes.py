@@ -60,6 +60,7 @@ class Program(NamedTuple):
         stopped, done: Carry -> which lanes are; a stopped lane waits for review.
         unload: Carry -> rows of the result table.
         service: For the rare lane that declines a step.
+        steps: How many are taken between two rounds.
         arithmetic: Whether all of it may be put in kernels, see `xla.kernel`.
     """
 
@@ -70,6 +71,7 @@ class Program(NamedTuple):
     done: Callable[[Carry], Bool[Array, "lane"]]
     unload: Callable[[Carry], Float[Array, "row out"]]
     service: Service | None = None
+    steps: int = STEPS
     arithmetic: bool = True
 
     def kernel(self, work: Callable[P, T]) -> Callable[P, T]:
@@ -129,7 +131,7 @@ def _round(program: Program, width: int, at: _AtWork) -> Carry:
 
 
 def _steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
-    """Take up to `STEPS` steps; fewer once half the lanes that set out wait for something else."""
+    """Take up to so many steps; fewer once half the lanes that set out wait for something else."""
 
     def some_steps(at: _AtWork) -> _AtWork:
         at_first = _able(program, at)
@@ -137,7 +139,7 @@ def _steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
         def goes_on(at: _AtWork) -> Bool[Array, ""]:
             return 2 * _able(program, at) > at_first
 
-        return repeat(lambda at: at._replace(carry=program.step(at.carry)), STEPS, goes_on, at)
+        return repeat(lambda at: at._replace(carry=program.step(at.carry)), program.steps, goes_on, at)
 
     return in_blocks(some_steps, _AtWork(cell, carry)).carry
 

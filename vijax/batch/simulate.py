@@ -108,6 +108,7 @@ def program(plan: Plan, settings: Settings) -> lanes.Program:
         return cells._replace(
             step=partial(solver_steps.step, method),
             review=partial(solver_steps.review_steps, method, plan, settings),
+            steps=solver_steps.STEPS,
             arithmetic=method.arithmetic,
         )
     return cells._replace(

@@ -18,13 +18,16 @@ from vijax.model.records import State, Status
 from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share
 
+# Steps between two rounds: an impact takes a dozen and more, and a lane waits for the next round with the second alone.
+STEPS = 32
+
 
 def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane) -> Course:
     """Set lanes off at the start of a run or of a round."""
     whole = ball.n.astype(jnp.int32)
     state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
     carry = jax.vmap(partial(method.start, deep=plan.deep, tangent=plan.tangent))(pair, state)
-    wall = jax.vmap(method.law.walls)(pair)
+    wall = jax.vmap(method.walls)(pair)
     _, outcome, _ = jax.eval_shape(jax.vmap(method.step), pair, wall, carry)
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outcome)
     return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
@@ -55,7 +58,7 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
     late = carry.n.astype(cell.count.dtype) - jnp.maximum(end, cell.ball.n)
     idle = cell.running & ~course.waits
     out = idle & (carry.mode == 0) & (late >= (QUIET if cell.candidate is not None else 0))
-    quiet = out & neutral(cell.pair, cell.ball)
+    quiet = out & neutral(cell.pair, method.mean_velocity(cell.ball.v, cell.ball.t))
     permanent = idle & (carry.mode != 0) & (late >= QUIET)
     lane_impact = LaneImpact(
         onset_t=impact.t,
@@ -79,6 +82,9 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
         cell = replace(cell, running=cell.running & ~spent, status=status)
     stopped = ~cell.running
     cell = review(plan, settings, cell)
-    again = set_off(method, plan, cell.pair, cell.ball, jnp.zeros_like(cell.count))
     course = replace(course, waits=jnp.zeros_like(waits))
-    return replace(cell, course=choose(stopped & cell.running, again, course))
+    if cell.candidate is not None:
+        # A search sets its lanes off again, for another round; a window has one way alone.
+        again = set_off(method, plan, cell.pair, cell.ball, jnp.zeros_like(cell.count))
+        course = choose(stopped & cell.running, again, course)
+    return replace(cell, course=course)

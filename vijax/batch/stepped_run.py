@@ -13,7 +13,7 @@ from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory, begin
 from vijax.engine.method import HELD, Method, repeated
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, Status
-from vijax.runtime.arrays import AnyArray
+from vijax.runtime.arrays import AnyArray, choose
 from vijax.runtime.programs import jitted
 
 
@@ -57,7 +57,7 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, r
     """Step all lanes together, each until its last period is over and its last contact has ended."""
     periods, max_impacts, chunks = asked
     begun = jax.vmap(begin)(pair, u0, v0, t0)
-    wall = jax.vmap(method.law.walls)(pair)
+    wall = jax.vmap(method.walls)(pair)
     carry = jax.vmap(partial(method.start, deep=True, tangent=False))(pair, begun)
     start = _recording(room, carry, u0)
 
@@ -75,7 +75,7 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, r
         strobe = going & (carry.n > r.carry.n) & (carry.n <= periods)
         ball = jax.vmap(method.ball)(pair, carry)
         return _Recording(
-            carry=jax.tree.map(lambda new, old: jnp.where(going, new, old), carry, r.carry),
+            carry=choose(going, carry, r.carry),
             impacts=_write(r.impacts, impact, r.filled, real),
             filled=r.filled + real.astype(jnp.int32),
             states=_write(r.states, ball, carry.n - 1, strobe),

@@ -13,10 +13,10 @@ import jax
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vijax.model.membrane import Linear, MembraneLaw, Wall
+from vijax.model import flow
+from vijax.model.membrane import Linear, MembraneLaw
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
-from vijax.model.sides import Sides
 from vijax.runtime.arrays import Flag, Scalar
 
 # A method that chooses its steps and takes more of them per impact and period is stopped.
@@ -100,6 +100,14 @@ class Method(eqx.Module, Generic[C]):
 
     law: MembraneLaw = eqx.field(default_factory=Linear, kw_only=True)
 
+    def walls(self, pair: ImpactPair) -> Any:
+        """Give what `step` is told of the walls of a cell; once, where it would compute it every time.
+
+        Args:
+            pair: One cell (scalars).
+        """
+        return self.law.walls(pair)
+
     @abstractmethod
     def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> C:
         """Make the carry of a start, in flight or inside a wall (then a contact without onset, which is no impact).
@@ -112,14 +120,12 @@ class Method(eqx.Module, Generic[C]):
         """
 
     @abstractmethod
-    def step(
-        self, pair: ImpactPair, walls: Wall | Sides, carry: C, *, recorded: bool = False
-    ) -> tuple[C, ImpactOutcome, Flag]:
+    def step(self, pair: ImpactPair, walls: Any, carry: C, *, recorded: bool = False) -> tuple[C, ImpactOutcome, Flag]:
         """Try one step.
 
         Args:
             pair: One cell (scalars).
-            walls: Its membrane, (w, w') -> acceleration; one for each wall where they differ.
+            walls: What `walls` says of it: its membrane, (w, w') -> acceleration; one for each wall where they differ.
             carry: From `start` or an earlier step.
             recorded: For trajectories: a step ends at phase 0, and can be differentiated in reverse.
 
@@ -130,6 +136,20 @@ class Method(eqx.Module, Generic[C]):
     @abstractmethod
     def ball(self, pair: ImpactPair, carry: C) -> State:
         """Say where the ball of a carry is."""
+
+    def drift(self, gamma: Any, v: Any, t: Any, s: Any) -> tuple[Any, Any]:
+        """Compute how far a ball of velocity v at phase t flies in a time s that meets no wall, and its velocity then.
+
+        Of any shape. Where attractors are looked for it closes a round that ends a little before its phase, or after.
+        """
+        return flow.drift(gamma, v, t, s)
+
+    def mean_velocity(self, v: Any, t: Any) -> Any:
+        """Compute the velocity of a flight on level ground over a whole period, from that at phase t; any shape.
+
+        Infinite under a forcing that does not repeat: it leaves no ball alone for ever.
+        """
+        return flow.mean_velocity(v, t)
 
     @property
     def arithmetic(self) -> bool:

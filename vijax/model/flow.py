@@ -141,6 +141,16 @@ def flight(force: Force, v0: Values, s: Values) -> tuple[Values, Values]:
     return rise, v0 - force.g * s + (force.c * sin_s - force.q * versine) / PI
 
 
+def drift(gamma: Values, v: Values, t: Values, s: Values) -> tuple[Values, Values]:
+    """Compute how far a ball of velocity v at phase t flies in a time s that meets no wall, and its velocity then."""
+    return flight(flight_force(gamma, t), v, s)
+
+
+def mean_velocity(v: Values, t: Values) -> Values:
+    """Compute the velocity of a flight on level ground over a whole period, from that at phase t."""
+    return v - jnp.sin(PI * t) / PI
+
+
 def acceleration(gamma: Values, t: Values) -> Values:
     """Compute the acceleration in flight, cos(pi t) - gamma."""
     return half_turn(t)[1] - gamma
