@@ -51,15 +51,18 @@ def rk4_impacts_per_period(d, kappa, r: float, u0: float, v0: float, periods: in
     return rk4(d, kappa, r, u0, v0, periods, steps)[0]
 
 
-def rk4(d, kappa, r: float, u0, v0, periods: int, steps: int, gamma: float = 0.0) -> tuple[np.ndarray, ...]:
+def rk4(
+    d, kappa, r: float, u0, v0, periods: int, steps: int, gamma: float = 0.0, shaken=lambda t: np.cos(np.pi * t)
+) -> tuple[np.ndarray, ...]:
     """Count impacts per period, and find final displacement and final velocity, each [N].
 
-    Args of `rk4_impacts_per_period`, but that u0 and v0 may differ from cell to cell, and that gamma is free.
+    Args of `rk4_impacts_per_period`, but that u0 and v0 may differ from cell to cell, that gamma is free, and that
+    `shaken` may be any forcing which repeats every period, as a function of times in [0, 2].
     """
     d, kappa, u0, v0 = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (d, kappa, u0, v0)))
     padding = -d.size % BLOCK
     d_padded, kappa_padded, u, v = (np.pad(x, (0, padding), mode="edge") for x in (d, kappa, u0, v0))
-    forcing = np.cos(np.pi * np.arange(2 * steps + 1) / steps) - gamma  # at the ends and middles of one period's steps
+    forcing = shaken(np.arange(2 * steps + 1) / steps) - gamma  # at the ends and middles of one period's steps
     impacts = np.empty(d_padded.size)
     _march(d_padded / 2, kappa_padded**2, _damping(r) * kappa_padded, periods, steps, forcing, impacts, u, v)
     return impacts[: d.size] / periods, u[: d.size], v[: d.size]

@@ -6,12 +6,14 @@ user needs stands here; what each function takes and returns its docstring says.
 Devices and pairs: `Harvester` (SI units) gives an `ImpactPair` (nondimensional), as `impact_pair` does from numbers;
 `Sides` holds what two walls that differ have;
 `HuntCrossley` is another membrane, `MembraneLaw` makes one of your own, `harvested_energy` is the energy of one impact.
+An `Excitation` takes the place of the sine: `Harmonics`, a measured `Record`, a `Waveform`, `Noise`, or a sum of them.
 `State`, `Impact` and `Status` are what records are made of.
 
 Planes of parameters, as `xarray.Dataset`: `sweep` maps power, kind of motion and all that tells whether to believe it;
 `compare` maps what a rigid wall gets wrong, of which `cheapest_model` and `rigid_from` make a verdict; `basins` and
 `basin_fractions` say which attractors coexist; `orbit_diagram` follows attractors along an axis; `lyapunov` and
-`survival` say how chaotic, and for how long. `save` and `load` keep them in stores.
+`survival` say how chaotic, and for how long; `response` measures a device under noise. `save` and `load` keep them in
+stores.
 
 One motion: `trajectory` returns a `Trajectory`, impact by impact, differentiable.
 

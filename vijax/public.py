@@ -19,6 +19,7 @@ from vijax.design.tolerance_plane import tolerance_plane as design_plane
 from vijax.explorer.door import explore
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
+from vijax.model.excitation import Excitation, Harmonics, Noise, Record, Waveform
 from vijax.model.membrane import HuntCrossley, MembraneLaw
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Impact, State, Status
@@ -46,6 +47,7 @@ from vijax.planes.basins import basin_fractions, basins
 from vijax.planes.chaos import lyapunov, survival
 from vijax.planes.compare import cheapest_model, compare, rigid_from
 from vijax.planes.orbit_diagram import orbit_diagram
+from vijax.planes.response import response
 from vijax.planes.store import load, save
 from vijax.planes.sweep import sweep
 
@@ -60,14 +62,18 @@ __all__ = [
     "ContinuationSettings",
     "Design",
     "DesignSettings",
+    "Excitation",
+    "Harmonics",
     "Harvester",
     "HuntCrossley",
     "Impact",
     "ImpactPair",
     "MapCurves",
     "MembraneLaw",
+    "Noise",
     "Optimum",
     "Orbit",
+    "Record",
     "Sides",
     "Smoothness",
     "State",
@@ -77,6 +83,7 @@ __all__ = [
     "Tolerance",
     "TolerancePlane",
     "Trajectory",
+    "Waveform",
     "average",
     "basin_fractions",
     "basins",
@@ -108,6 +115,7 @@ __all__ = [
     "orbit_power",
     "orbits_from_states",
     "plots",
+    "response",
     "rigid_from",
     "save",
     "steady",

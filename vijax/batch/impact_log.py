@@ -23,7 +23,7 @@ from vijax.runtime.programs import jitted
 _TILE, _STROBES, _STEPS = 256, 4096, 16
 
 
-class Record(NamedTuple):
+class ImpactLog(NamedTuple):
     """What happened to every ball, in order.
 
     Attributes:
@@ -49,7 +49,7 @@ class _Step(NamedTuple):
     out: exact.Outcome
 
 
-def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) -> Record:
+def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) -> ImpactLog:
     """Fly balls to the end of some periods: many by the quick step, and what it declines by the careful one.
 
     Args:
@@ -86,7 +86,7 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     order = np.argsort(ball, kind="stable")
     ball = ball[order]
     flown = jax.tree.map(lambda *x: np.concatenate(x)[order], *parts) if parts else None
-    return Record(*_impacts(ball, flown, count, periods), *_strobes(pair, ball, flown, count, periods))
+    return ImpactLog(*_impacts(ball, flown, count, periods), *_strobes(pair, ball, flown, count, periods))
 
 
 class _Underway(NamedTuple):

@@ -16,6 +16,7 @@ from vijax.batch.stepped_run import stepped_run
 from vijax.engine.method import Method
 from vijax.engine.method_choice import choose
 from vijax.model.choices import MethodName, SolverName
+from vijax.model.excitation import Excitation, check_excitation
 from vijax.model.membrane import MembraneLaw
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
@@ -30,10 +31,12 @@ def _precision(pair: ImpactPair) -> str:
     return str(jnp.result_type(float, pair.d))
 
 
-def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any]) -> Method | None:
+def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any], excitation: Excitation | None) -> Method | None:
     """Take the method as it is, or as `choose` makes it of a name, if the pair suits its membrane."""
     if not isinstance(method, Method):
-        method = choose(method, options, wall=pair.walls, dtype=_precision(pair))
+        method = choose(method, options, wall=pair.walls, dtype=_precision(pair), excitation=excitation)
+    elif excitation is not None:
+        raise ValueError(f"excitation must be left out with a method of your own; got {checks.shown(excitation)}")
     lossy = method is None or method.law.restitution
     if (pair.r is None) == lossy:
         raise ValueError(
@@ -71,6 +74,7 @@ def trajectory(
     atol: float | None = None,
     membrane: MembraneLaw | None = None,
     steps: int | None = None,
+    excitation: Excitation | None = None,
 ) -> Trajectory:
     """Follow one start, or an array of starts, for a number of forcing periods.
 
@@ -83,6 +87,8 @@ def trajectory(
         method: "exact", "ode" or "rk4", as in `sweep`; or a `vijax.engine.method.Method`.
         solver, rtol, atol, membrane, steps: As in `sweep`. The pair's r is None with a membrane
             that takes none, as `HuntCrossley`.
+        excitation: What shakes the capsule, as in `sweep`, in the units of the pair: `record.waveform(device)` for a
+            `Record`. The sine unless given.
 
     Returns:
         The `Trajectory`. Differentiable in pair and start, forward and reverse, by a scan of bounded length. The exact
@@ -93,8 +99,8 @@ def trajectory(
         ValueError: Which argument, what must hold, what came.
     """
     options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "steps": steps}
-    told = _told(check_pair(pair), method, options)
     periods = checks.whole("periods", periods, 1)
+    told = _told(check_pair(pair), method, options, check_excitation(excitation, periods))
     room = _most(periods) if max_impacts is None else checks.whole("max_impacts", max_impacts, 1)
     _check_starts(pair, periods, {"u0": u0, "v0": v0, "t0": t0})
     count = math.prod(checks.shapes(u0=u0, v0=v0, t0=t0, pair=pair.d))

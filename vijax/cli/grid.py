@@ -7,6 +7,7 @@ import click
 from vijax.cli import process
 from vijax.cli import sweep as page
 from vijax.cli.compare import difference_map, tolerance_option
+from vijax.cli.excitation import take_excitation
 from vijax.cli.kinds import Choice
 from vijax.cli.page import Page, Sections
 from vijax.planes.sweep_settings import SweepSettings
@@ -44,6 +45,10 @@ def _leave_out(given: dict[str, Any]) -> None:
             raise ValueError(f"{name} must not be chosen with compare, which is exact; got {value!r}")
     if given.pop("curves"):
         raise ValueError("curves must be left out with compare, whose maps have no labels; got them")
+    if take_excitation(given) is not None:
+        raise ValueError(
+            "harmonics, record and noise must be left out with compare, whose forcing is the sine; got one"
+        )
     crew = [given.pop(name) for name in ("workers", "scheduler")]
     if crew != [None, None]:
         raise ValueError(f"workers must be left out with compare, which runs in one process; got {crew[0] or crew[1]}")

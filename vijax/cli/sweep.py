@@ -10,6 +10,7 @@ import click
 from vijax.cli import options, process
 from vijax.cli.arguments import device, take_axes
 from vijax.cli.closing import finish, statuses, tally
+from vijax.cli.excitation import excitation_options, take_excitation
 from vijax.cli.kinds import Choice, Real, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
@@ -144,8 +145,9 @@ def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: d
     from vijax.planes.sweep_settings import SweepSettings
 
     membrane = _membrane(*(given.pop(name) for name in ("membrane", "chi", "exponent")))
-    refine, starts = given.pop("refine"), given.pop("starts")
-    return plan(axes, outputs, device, SweepSettings(**given, membrane=membrane), refine, starts)
+    refine, starts, excitation = given.pop("refine"), given.pop("starts"), take_excitation(given)
+    settings = SweepSettings(**given, membrane=membrane, excitation=excitation)
+    return plan(axes, outputs, device, settings, refine, starts)
 
 
 def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
@@ -323,6 +325,7 @@ def sections() -> Sections:
     return {
         "Plane": plane_options(),
         "Run": [*run_options(), _starts_option(), options.wall_option()],
+        "Excitation": excitation_options(),
         "Method": [*_method_options(), options.dtype_option()],
         "Variables": _output_options(),
         "Files": options.file_options(),
@@ -346,6 +349,7 @@ EXAMPLES = (
     "--show max_penetration --plot depth.png",
     "--show label --curves --plot curves.png",
     "--starts 64 --plot expected.png",
+    "--noise 0.05,32 --until window --periods 200 --plot noisy.png",
     "--d 0.05:0.3:1024 --kappa 3:400:1024:log --refine 3 --out fine.zarr --plot fine.png",
     "--d 0.2,0.3 --kappa 40:400:8:log --method ode --membrane hunt-crossley --chi 0.8 --out hertz.zarr",
 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from vijax.engine.method import Method
 from vijax.model.choices import MethodName, SolverName
+from vijax.model.excitation import Excitation
 from vijax.model.membrane import Linear, check_law
 from vijax.runtime import checks
 from vijax.runtime.pages import see
@@ -26,14 +27,24 @@ _STEPS, _FEWEST_STEPS, _MOST_STEPS = 1000, 8, 10**6
 _FINEST = 8  # roundings: no error estimate is worth anything below
 
 
-def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype: str = "float64") -> Method | None:
+def choose(
+    method: str,
+    options: Mapping[str, Any],
+    *,
+    wall: str = "soft",
+    dtype: str = "float64",
+    excitation: Excitation | None = None,
+) -> Method | None:
     """Make the method of a name, with what it is told; None for the exact one, which is told nothing.
+
+    Any excitation but the sine has a method of its own, as exact as that of the sine.
 
     Args:
         method: "exact", "ode" or "rk4".
         options: Of solver, rtol, atol, membrane and steps those given; None counts as not given.
         wall: "soft" or "rigid".
         dtype: "float64" or "float32": the defaults of the tolerances, and the least that they may be.
+        excitation: The sine unless given; no `Record`, which knows no units of a pair.
 
     Raises:
         ValueError: Which argument, what must hold, what came.
@@ -48,6 +59,8 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
         if method not in takers and name != "membrane":
             theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
             raise ValueError(see("methods", f"{name} must be left out unless method is {theirs}; got {got}"))
+    if excitation is not None and not excitation.sine:
+        return _driven(method, wall, excitation)
     if method == "exact":
         return None
     if wall != "soft":
@@ -70,8 +83,22 @@ def choose(method: str, options: Mapping[str, Any], *, wall: str = "soft", dtype
     return Ode(solver, rtol, atol, law=law)
 
 
-def record(method: Method | None) -> dict[str, Any]:
+def _driven(method: str, wall: str, excitation: Excitation) -> Method:
+    """Make the method of an excitation that is not the sine."""
+    if method != "exact":
+        raise ValueError(see("excitation", f'method must be "exact" with an excitation; got {checks.shown(method)}'))
+    if wall != "soft":
+        raise ValueError(see("excitation", f'wall must be "soft" with an excitation; got {wall!r}'))
+    from vijax.engine.driven import Driven
+    from vijax.engine.forcing import forcing
+
+    return Driven(forcing(excitation))
+
+
+def record(method: Method | None, excitation: Excitation | None = None) -> dict[str, Any]:
     """Name what a method was told, for the attributes of a map."""
+    if excitation is not None and not excitation.sine:
+        return {"excitation": str(excitation)}
     if method is None:
         return {}
     told = {field.name: getattr(method, field.name) for field in dataclasses.fields(method) if field.name != "law"}

@@ -117,7 +117,7 @@ def plan_basins(
     if u0 is None:
         gap = cells(others, one_device(device), "soft").quantities["d"].values.max()
         u0 = gap * _middles(max(np.size(v0), 2))
-    return _plan({"u0": u0, "v0": v0} | others, device, settings, merge_mirrors)
+    return plan_starts({"u0": u0, "v0": v0} | others, device, settings, merge_mirrors)
 
 
 @door
@@ -180,15 +180,23 @@ def plan_fractions(
             raise TypeError(f"{name} must be left out where starts are drawn; got {checks.shown(axes[name])}")
     speed, seed = checks.positive("speed", speed), checks.seed(seed)
     starts = checks.whole("starts", starts, 1, MOST_STARTS)
-    planned = _plan(axes, device, settings, merge_mirrors)
+    planned = plan_starts(axes, device, settings, merge_mirrors)
     check_starts(planned, starts)
     place = spread(starts, seed)
     return started(planned, place[0] * planned.cells.quantities["d"], 2 * speed * place[1])
 
 
-def _plan(axes: Mapping[str, Any], device: Harvester | None, settings: SweepSettings, merge_mirrors: bool) -> SweepPlan:
+def plan_starts(
+    axes: Mapping[str, Any], device: Harvester | None, settings: SweepSettings, merge_mirrors: bool = False
+) -> SweepPlan:
+    """Plan a sweep with all outputs that `matched` wants.
+
+    Args:
+        axes, device, merge_mirrors: As in `plan_basins`.
+        settings: Of these periods, wall and excitation are read.
+    """
     checks.flag("merge_mirrors", merge_mirrors)
-    settings.only("basins", "periods", "wall")
+    settings.only("basins", "periods", "wall", "excitation")
     planned = sweep.plan(axes, _OUTPUTS, device, settings)
     gamma = planned.cells.quantities["gamma"].values
     if merge_mirrors and gamma.any():

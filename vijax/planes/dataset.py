@@ -199,7 +199,7 @@ def asked(planned: SweepPlan) -> dict[str, Any]:
     constants = [name for name in CONSTANTS if name not in AXES]
     return {
         **planned.settings.told,
-        **record(planned.method),
+        **record(planned.method, planned.settings.excitation),
         "outputs": " ".join(planned.outputs),
         **({} if planned.starts == 1 else {"starts": planned.starts}),
         **{

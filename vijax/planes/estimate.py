@@ -23,6 +23,8 @@ _HOUR, _GIGABYTES = 3600.0, 10e9
 # Seconds of a cell and a period where no pace was kept, by two slow cores; of rk4 at 1000 steps. With smaller ones a
 # run that takes the night begins unasked.
 _SLOW = {"exact level": 2e-7, "exact inclined": 5e-7, "ode": 2e-5, "rk4": 2e-6}
+# The same where the excitation is not the sine, of 64 samples a period.
+_DRIVEN = 4e-6
 _RECORDED = 1e-5  # The same where the impacts of cells are recorded.
 # Seconds that a run lasts for its pace to be kept: a shorter one says little of a long one.
 _LEAST_TIMED = 2.0
@@ -109,11 +111,14 @@ def _kind(planned: SweepPlan) -> str:
     """Name the kind of a run: those of one kind keep one pace."""
     settings = planned.settings
     devices = f"{len(places())} {places()[0].device_kind}"
-    return f"{settings.method} {settings.until} {settings.dtype} {_level(planned)} {devices}"
+    driven = "" if settings.excitation is None else "driven "
+    return f"{driven}{settings.method} {settings.until} {settings.dtype} {_level(planned)} {devices}"
 
 
 def _slow(planned: SweepPlan) -> float:
     method = planned.settings.method
+    if planned.settings.excitation is not None:
+        return _DRIVEN
     return _SLOW[f"exact {_level(planned)}" if method == "exact" else method]
 
 

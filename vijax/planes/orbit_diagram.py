@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.batch import simulate
-from vijax.batch.impact_log import Record, record
+from vijax.batch.impact_log import ImpactLog, record
 from vijax.model import energy
 from vijax.model.choices import Direction, Precision, Walls
 from vijax.model.device import Harvester, one_device
@@ -354,7 +354,7 @@ def _follow(planned: SweepPlan, table: dict[str, np.ndarray], lanes: int, period
     return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
 
 
-def _fly(planned: SweepPlan, table: dict[str, np.ndarray], summary: Any, recorded_periods: int) -> Record:
+def _fly(planned: SweepPlan, table: dict[str, np.ndarray], summary: Any, recorded_periods: int) -> ImpactLog:
     """Fly the kept periods of every point again, from where they begin."""
     pair = arrays(pair_of({name: table[name].ravel() for name in planned.cells.pair_names}, planned.settings.wall))
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
-from vijax.model.device import Harvester, one_device
+from vijax.model.device import Harvester, one_device, with_constants
+from vijax.model.excitation import Excitation, Record
 from vijax.model.membrane import MembraneLaw
 from vijax.planes import cluster, dispatch, estimate, store_filling, tile_size, tiled_store
 from vijax.planes import refine as refinement
-from vijax.planes.axes import Axes, Cells, cells
+from vijax.planes.axes import Axes, Cells, cells, check_axis
 from vijax.planes.dataset import DEFAULT, SweepPlan, label, warn_if_held
 from vijax.planes.dispatch import Fields
 from vijax.planes.outputs import ON_REQUEST, table
@@ -50,6 +51,7 @@ def sweep(
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
     dtype: Precision = SweepSettings.dtype,
+    excitation: Excitation | None = None,
     refine: int | None = None,
     starts: int = 1,
     progress: Callable[[int, int], None] | None = None,
@@ -92,6 +94,9 @@ def sweep(
             unless given. What is not wanted is not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
+        excitation: What shakes the capsule: `Harmonics`, a `Record`, a `Waveform`, `Noise`, or a sum of them; the sine
+            unless given. All but harmonics repeat no motion: they take until="window". Under a record A and omega are
+            units alone, one number each.
         refine: Levels of refinement: every 2^refine-th cell along each axis is computed, then only those at borders
             between kinds of motion or where P is not interpolated to 1 %, and the others are filled.
             `computed` says which are which.
@@ -143,6 +148,7 @@ def sweep(
         membrane=membrane,
         steps=steps,
         dtype=dtype,
+        excitation=excitation,
     )
     return run(plan(axes, outputs, device, settings, refine, starts), progress, out, overwrite, workers)
 
@@ -167,13 +173,13 @@ def plan(
         ValueError, TypeError: Which argument, what must hold, what came.
     """
     tile_size.largest()  # what is wrong with the environment is said before anything runs
-    method = settings.integrator()
     starts = checks.whole("starts", starts, 1, MOST_STARTS)
     if outputs is None:
         outputs = (name for name in table(starts) if name not in ON_REQUEST)
     wanted = checks.words("outputs", outputs, table(starts))
     device = one_device(device)
     given = {name: values for name, values in axes.items() if values is not None}
+    method = settings.integrator(_in_units(device, given, settings))
     if starts > 1:
         _check_spread(given, settings, refine)
     lossy = method is None or method.law.restitution
@@ -191,6 +197,22 @@ def plan(
         refine=0 if refine is None else _levels(refine, laid_out, settings.until),
         starts=starts,
     )
+
+
+def _in_units(device: Harvester, given: Mapping[str, Any], settings: SweepSettings) -> Harvester:
+    """Give the device in whose units a record is told: those of every cell.
+
+    Raises:
+        ValueError: Several A or omega, which would be several units.
+    """
+    if settings.excitation is None or not settings.excitation.of(Record):
+        return device
+    units = {name: check_axis(name, given[name], name) for name in ("A", "omega") if name in given}
+    for name, values in units.items():
+        if values.size != 1:
+            must = f"{name} must be one number with a record, which is told in units of it; got {values.size}"
+            raise ValueError(see("excitation", must))
+    return with_constants(device, **{name: float(values.flat[0]) for name, values in units.items()})
 
 
 def _check_spread(given: Mapping[str, Any], settings: SweepSettings, refine: int | None) -> None:

@@ -10,6 +10,8 @@ from vijax.model.choices import Direction, MethodName, Precision, SolverName, Un
 
 if TYPE_CHECKING:
     from vijax.engine.method import Method
+    from vijax.model.device import Harvester
+    from vijax.model.excitation import Excitation
     from vijax.model.membrane import MembraneLaw
 
 # Starts in every cell unless told otherwise: shares of random ones have a standard error of 0.0625 at most.
@@ -23,6 +25,8 @@ SPEED = 0.6
 
 # Settings that methods are told, each its own ones.
 _OPTIONS = ("solver", "rtol", "atol", "membrane", "steps")
+# What `engine.method_choice.record` tells of a run.
+_TOLD_ELSEWHERE = (*_OPTIONS, "excitation")
 # Settings that an orbit diagram reads, in the order of its attributes.
 _OF_DIAGRAMS = ("direction", "periods", "recorded_periods", "wall", "dtype")
 
@@ -48,6 +52,7 @@ class SweepSettings:
         membrane: Of "ode" and "rk4": a `HuntCrossley`, or a law of your own; the linear one if None.
         steps: Of "rk4": steps per forcing period; 1000 if None.
         dtype: "float64", or "float32" with tolerances to match.
+        excitation: What shakes the capsule, `Harmonics`, a `Record`, `Noise` or a sum; the sine if None.
 
     Raises:
         ValueError: Which setting, what must hold, what came.
@@ -64,8 +69,10 @@ class SweepSettings:
     membrane: "MembraneLaw | None" = None
     steps: int | None = None
     dtype: Precision = "float64"
+    excitation: "Excitation | None" = None
 
     def __post_init__(self) -> None:
+        from vijax.model.excitation import Record, instance
         from vijax.runtime import checks
 
         for name, allowed in choices(type(self)).items():
@@ -77,7 +84,8 @@ class SweepSettings:
                 f"transient must be 0 with until='attractor', whose search begins at once; got {self.transient}; "
                 "until='window' drops a transient"
             )
-        self.integrator()
+        if self.excitation is None or not instance(self.excitation).of(Record):
+            self.integrator()  # else when the device is known, in whose units the record is told
 
     def _count(self, name: str, least: int) -> None:
         """Put a number of periods in place of what was given for it, as a frozen record lets only itself do."""
@@ -89,17 +97,25 @@ class SweepSettings:
         most = min(checks.MOST, 1 << int(np.finfo(self.dtype).nmant))
         object.__setattr__(self, name, checks.whole(name, getattr(self, name), least, most))
 
-    def integrator(self) -> "Method | None":
-        """Give the method with what it is told; None for the exact one."""
+    def integrator(self, device: "Harvester | None" = None) -> "Method | None":
+        """Give the method with what it is told; None for the exact one.
+
+        Args:
+            device: In whose units a record is told; Tables I and II unless given.
+        """
         from vijax.engine.method_choice import choose
+        from vijax.model.device import Harvester
+        from vijax.model.excitation import check_excitation
 
         told = {name: getattr(self, name) for name in _OPTIONS}
-        return choose(self.method, told, wall=self.wall, dtype=self.dtype)
+        excitation = self.excitation and self.excitation.scaled(device or Harvester())
+        check_excitation(excitation, self.periods + self.transient, repeats=self.until == "attractor")
+        return choose(self.method, told, wall=self.wall, dtype=self.dtype, excitation=excitation)
 
     @property
     def told(self) -> dict[str, Any]:
         """Name the settings, as attributes of a dataset; `engine.method_choice.record` has what a method is told."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _OPTIONS}
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _TOLD_ELSEWHERE}
 
     def only(self, of: str, *names: str) -> None:
         """Raise ValueError if a setting besides these differs from its default: `of` would not read it."""

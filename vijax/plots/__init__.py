@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from vijax.plots.motions import energies, trajectory
     from vijax.plots.number_maps import difference_map, power_map, variable_map
     from vijax.plots.orbit_diagrams import orbit_diagram
+    from vijax.plots.responses import response
 else:
     # What stands where; a room is loaded, and matplotlib with it, when something of it is first asked for.
     _ROOMS = {
@@ -26,6 +27,7 @@ else:
         **dict.fromkeys(("difference_map", "power_map", "variable_map"), "number_maps"),
         **dict.fromkeys(("energies", "trajectory"), "motions"),
         "orbit_diagram": "orbit_diagrams",
+        "response": "responses",
     }
 
     def __getattr__(name: str) -> Any:
@@ -45,6 +47,7 @@ __all__ = [
     "label_map",
     "orbit_diagram",
     "power_map",
+    "response",
     "save",
     "trajectory",
     "variable_map",

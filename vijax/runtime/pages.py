@@ -2,7 +2,9 @@
 
 from typing import Literal
 
-PageName = Literal["attractors", "design", "limits", "maps", "methods", "model", "programs", "status", "studies"]
+PageName = Literal[
+    "attractors", "design", "excitation", "limits", "maps", "methods", "model", "programs", "status", "studies"
+]
 """The last word of a page's address. A test sees that each is a page, and that a message names it."""
 
 

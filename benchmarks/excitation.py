@@ -1,0 +1,117 @@
+"""What do excitations that are not the sine cost, how exact are they, and what does noise do to a map?
+
+    python benchmarks/excitation.py               # every part
+    python benchmarks/excitation.py --only cost   # or order, noise
+
+One line a figure.
+
+- cost: us a cell and period, on all cores, of a record of 64 samples a period looped, of the sine with noise of as many
+  values, and of two harmonics; beside the sine, and numba's RK4 of 1,024 steps on the same record.
+- order: how the speeds of eight impacts under a sampled sine come to those of the sine.
+- noise: of the level plane at 64 starts, how much of P noise leaves, and what part of the cells harvests more.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import vijax
+from benchmarks.accelerator import plane
+from benchmarks.orbits import say
+from vijax import Harmonics, Noise, Waveform
+
+SAMPLES, PERIODS, _PAIRS = 64, 100, 7
+_LEVELS = (0.01, 0.03, 0.1)
+
+
+def sampled_sine(samples: int) -> Waveform:
+    """Make one period of the sine as a record."""
+    return Waveform(np.cos(2 * np.pi * np.arange(samples) / samples), samples)
+
+
+def cost() -> None:
+    """Time runs of the default plane in turn."""
+    from benchmarks import peers
+
+    axes = plane(128)
+    d, kappa = (x.ravel() for x in np.meshgrid(axes["d"], axes["kappa"], indexing="ij"))
+    rough = Waveform(np.random.default_rng(1).normal(size=SAMPLES) / np.sqrt(2), SAMPLES)
+    told: dict[str, Any] = {"until": "window", "periods": PERIODS}
+
+    def ours(excitation: Any, outputs: list[str]) -> Callable[[], Any]:
+        return lambda: vijax.sweep(**axes, **told, excitation=excitation, outputs=outputs)
+
+    def numba() -> Any:
+        def shaken(t: np.ndarray) -> np.ndarray:
+            return np.interp(t * SAMPLES / 2, np.arange(SAMPLES + 1), np.append(rough.values, rough.values[0]))
+
+        return peers.rk4(d, kappa, 0.5, 0.05, -0.4, PERIODS, 1024, shaken=shaken)
+
+    counts, energy = ["impacts_per_period"], ["P", "admissible"]
+    noisy = Harmonics() + Noise(0.05, SAMPLES / 2)
+    ways = {
+        "sine, counts": ours(None, counts),
+        "record, counts": ours(rough, counts),
+        "record, P": ours(rough, energy),
+        "sine and noise, counts": ours(noisy, counts),
+        "two harmonics, counts": ours(Harmonics([1.0, 0.3]), counts),
+        "numba RK4, 1,024 steps, counts": numba,
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for turn in range(_PAIRS + 1):
+        for name, way in ways.items():
+            begun = time.perf_counter()
+            way()
+            if turn:
+                seconds[name].append(time.perf_counter() - begun)
+    for name, some in seconds.items():
+        peer = statistics.median(b / a for a, b in zip(some, seconds["numba RK4, 1,024 steps, counts"], strict=True))
+        us = statistics.median(some) / (d.size * PERIODS) * 1e6
+        say(f"{name}: us a cell and period, times as fast as numba", f"{us:.3f}, {peer:.2f}")
+
+
+def order() -> None:
+    """Halve the spaces of a sampled sine, and look at the speeds of impacts."""
+    pair = vijax.impact_pair(0.2, np.array([8.0, 60.0, 400.0]), 0.3)
+    exact = vijax.trajectory(pair, 0.05, -0.4, 6).impacts.v_in
+    counts = 2 ** np.arange(6, 11)
+    found = [vijax.trajectory(pair, 0.05, -0.4, 6, excitation=sampled_sine(int(n))).impacts.v_in for n in counts]
+    errors = np.array([np.abs(v - exact)[:, :8].max(axis=1) for v in found])
+    for n, row in zip(counts, errors, strict=True):
+        say(f"{n} samples a period: error of speeds at kappa 8, 60, 400", ", ".join(f"{x:.1e}" for x in row))
+    slopes = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    say("order at kappa 8, 60, 400", ", ".join(f"{x:.3f}" for x in slopes))
+
+
+def noise() -> None:
+    """Compare P of the level plane with and without noise."""
+    axes: dict[str, Any] = {"d": np.linspace(0.06, 0.3, 24), "kappa": np.geomspace(5, 400, 24), "r": 0.5}
+    starts = np.linspace(-0.4, 0.4, 8)
+    told: dict[str, Any] = {"until": "window", "periods": 300, "transient": 100, "v0": starts, "outputs": ["P"]}
+    quiet = vijax.sweep(**axes, **told)["P"].mean("v0")
+    for level in _LEVELS:
+        noisy = vijax.sweep(**axes, **told, excitation=Harmonics() + Noise(level, 32))["P"].mean("v0")
+        ratio = (noisy / quiet).where(quiet > 1e-9).values
+        ratio = ratio[np.isfinite(ratio)]
+        parts = ", ".join(f"{np.quantile(ratio, q):.3f}" for q in (0.1, 0.5, 0.9))
+        say(f"level {level}: P over the noiseless one, 10, 50 and 90 % of the cells", parts)
+        say(f"level {level}: cells that harvest more", f"{(ratio > 1).mean():.2f}")
+
+
+PARTS = {"cost": cost, "order": order, "noise": noise}
+
+
+def main() -> None:
+    """Print every figure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=list(PARTS))
+    for name in parser.parse_args().only:
+        PARTS[name]()
+
+
+if __name__ == "__main__":
+    main()

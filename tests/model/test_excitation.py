@@ -1,0 +1,148 @@
+"""Excitations: what they may be, what units they are in, how they add up and name themselves."""
+
+import math
+
+import numpy as np
+import pytest
+
+import vijax
+from vijax import Harmonics, Harvester, Noise, Record, Waveform
+from vijax.engine.forcing import forcing
+from vijax.model.excitation import check_excitation
+
+TIME = np.linspace(0, 4, 401)
+SHAKEN = np.cos(4 * np.pi * TIME)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Harmonics([0.0, 0.0]), "amplitudes must be one number a harmonic, not all 0; got"),
+        (lambda: Harmonics([[1.0]]), "amplitudes must"),
+        (lambda: Harmonics([1.0, math.nan]), "amplitudes must be finite; got nan at index 1"),
+        (lambda: Harmonics([1.0, 0.5], [0.0, 0.1, 0.2]), "phases must be one number, or one a harmonic, 2; got 3"),
+        (lambda: Waveform([1.0], 64), r"values must be a row of at least two numbers; got shape \(1,\)"),
+        (lambda: Waveform([1.0, 2.0], 1.5), "samples must be a number from 2 to 10.6"),
+        (lambda: Waveform([1.0, 2.0], 64, "yes"), "looped must be True or False; got 'yes'"),
+        (lambda: Record(TIME, SHAKEN[:-1]), "acceleration must hold one number a time, 401; got 400"),
+        (lambda: Record(TIME**2, SHAKEN), "time must rise by even steps, to 0.001 of one; got steps from"),
+        (lambda: Record(TIME[::-1], SHAKEN), "time must rise by even steps"),
+        (lambda: Noise(-1.0, 32), "level must be a finite number of at least 0; got -1.0"),
+        (lambda: Noise(0.1, 0.5), "bandwidth must be a number from 1 to 10.5"),
+        (lambda: Noise(0.1, 32, -3), "seed must be a whole number of at least 0; got -3"),
+        (lambda: Noise(0.1, 32) + Noise(0.1, 16), "excitation must hold at most one of noises; got 2"),
+        (lambda: Waveform([1.0, 2.0], 8) + Record(TIME, SHAKEN), "at most one of records and waveforms; got 2"),
+        (lambda: Noise(0.1, 32) + 3, "excitation must be of the kind Excitation; got 3"),
+    ],
+)
+def test_what_cannot_be_is_named(make, says):
+    with pytest.raises(ValueError, match=says):
+        make()
+
+
+def test_a_record_is_told_in_the_units_of_a_device():
+    record = Record(TIME, SHAKEN, looped=True)
+    wave = record.waveform(Harvester(A=2.0, omega=4 * np.pi))
+    assert np.array_equal(wave.values, SHAKEN / 2)
+    assert wave.samples == pytest.approx(50, rel=1e-12)
+    assert wave.looped
+    once = Record(TIME, SHAKEN).waveform(Harvester(omega=4 * np.pi))
+    assert once.periods == pytest.approx(8, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("device", "says"),
+    [
+        (Harvester(omega=np.array([1.0, 2.0])), "omega must be one number with a record; got 2"),
+        (Harvester(omega=600.0), "omega must give the record at least 2 samples a period"),
+    ],
+)
+def test_units_that_cannot_be(device, says):
+    with pytest.raises(ValueError, match=says):
+        Record(TIME, SHAKEN).waveform(device)
+
+
+def test_what_a_run_can_have():
+    record, once = Record(TIME, SHAKEN), Waveform(SHAKEN, 50.0, looped=False)
+    with pytest.raises(ValueError, match=r"excitation must be in the units of the pair; got a Record"):
+        check_excitation(record, 5)
+    with pytest.raises(ValueError, match="periods and transient must end within the record, 8 periods; got 9"):
+        check_excitation(once, 9)
+    with pytest.raises(ValueError, match='until must be "window" with an excitation that does not repeat'):
+        check_excitation(Harmonics() + Noise(0.1, 32), 9, repeats=True)
+    assert check_excitation(once, 8) is once
+    assert check_excitation(Harmonics([1.0, 0.2]) + Noise(0.0, 32), 9, repeats=True).periodic
+
+
+def test_names_tell_excitations_apart():
+    every = [
+        Harmonics(),
+        Harmonics([1.0, 0.1]),
+        Harmonics([1.0, 0.1], 0.2),
+        Waveform(SHAKEN, 50.0),
+        Waveform(SHAKEN, 51.0),
+        Waveform(SHAKEN, 50.0, looped=False),
+        Waveform(SHAKEN * (1 + 1e-15), 50.0),
+        Record(TIME, SHAKEN),
+        Noise(0.1, 32),
+        Noise(0.1, 32, 1),
+        Harmonics() + Noise(0.1, 32),
+    ]
+    assert len({str(one) for one in every}) == len(every)
+    assert str(every[-1]) == "harmonics 1.0 + noise of level 0.1 up to 32.0 times the frequency, seed 0"
+
+
+def test_harmonics_add_up():
+    f = forcing(Harmonics([1.0, 0.0, 0.4]) + Harmonics([-0.5], math.pi / 2))
+    assert f.orders == (1, 3)
+    assert f.periodic
+    np.testing.assert_allclose(f.cosines + 1j * f.sines, [1.0 - 0.5j, 0.4], atol=1e-15)
+    assert not forcing(Harmonics() + Noise(0.1, 4)).periodic
+
+
+@pytest.mark.parametrize(
+    ("bandwidth", "knots", "every", "noise_every"), [(30.0, 72.0, 3, 1), (12.0, 24.0, 1, 1), (5.0, 24.0, 1, 2)]
+)
+def test_records_and_noise_share_knots(bandwidth, knots, every, noise_every):
+    f = forcing(Waveform(SHAKEN, 24.0) + Noise(0.1, bandwidth))
+    assert (f.knots, f.every, f.noise_every) == (knots, every, noise_every)
+    # As level^2 is the variance of a velocity over time, values that are drawn more often are larger.
+    assert f.level**2 * noise_every * 2 / knots == pytest.approx(0.01)
+
+
+# --- the doors --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"method": "ode"}, 'method must be "exact" with an excitation; got'),
+        ({"wall": "rigid"}, 'wall must be "soft" with an excitation; got'),
+        ({"until": "attractor"}, 'until must be "window"'),
+        ({"excitation": "sine"}, "excitation must be of the kind Excitation; got 'sine'"),
+    ],
+)
+def test_a_sweep_refuses_what_cannot_be(given, says):
+    with pytest.raises(ValueError, match=says):
+        vijax.sweep(d=0.2, kappa=30.0, **{"until": "window", "excitation": Noise(0.1, 16)} | given)
+
+
+def test_a_trajectory_refuses_what_cannot_be():
+    pair = vijax.impact_pair(0.2, None, 0.5)
+    with pytest.raises(ValueError, match='wall must be "soft" with an excitation'):
+        vijax.trajectory(pair, 0.0, 0.4, 3, excitation=Harmonics([1.0, 0.2]))
+    with pytest.raises(ValueError, match="excitation must be in the units of the pair"):
+        vijax.trajectory(pair, 0.0, 0.4, 3, excitation=Record(TIME, SHAKEN))
+
+
+def test_power_under_a_record_does_not_hang_on_the_units():
+    """A and omega are units alone: P in watts is the same in others, and an axis of either is refused."""
+    record = Record(TIME, SHAKEN, looped=True)
+    told = {"omega0": [50.0, 200.0], "s": 0.01, "until": "window", "excitation": record, "outputs": ["power", "status"]}
+    start = {"u0": 0.0, "v0": 0.0}
+    one = vijax.sweep(**told, **start, omega=4 * np.pi, A=1.0, periods=80)
+    two = vijax.sweep(**told, **start, device=Harvester(A=2.0, omega=8 * np.pi), periods=160)
+    np.testing.assert_allclose(one["power"], two["power"], rtol=1e-6)
+    assert one.attrs["excitation"] == str(record)
+    with pytest.raises(ValueError, match="omega must be one number with a record, which is told in units of it; got 2"):
+        vijax.sweep(**told, omega=[3.0, 4.0])

@@ -1,0 +1,97 @@
+"""What a device does under noise: errors that hold, distributions that add up, basins that are kept to."""
+
+import numpy as np
+import pytest
+
+import vijax
+from vijax import Harmonics, Harvester, Noise, Waveform, response
+
+DEVICE = Harvester(omega=5 * np.pi, omega0=150.0, s=0.008)  # d 0.2, kappa 30
+MULTISTABLE = Harvester(omega=5 * np.pi, omega0=15.0, s=0.008)
+NOISY = Harmonics() + Noise(0.05, 16)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return response(DEVICE, NOISY, realisations=16, periods=60, transient=20)
+
+
+def test_densities_are_those_of_all_impacts(found):
+    for of, axis in (("speed", "impact_speed"), ("penetration", "penetration")):
+        width = float(found[axis][1] - found[axis][0])
+        assert float(found[f"{of}_density"].sum()) * width == pytest.approx(1)
+        mean = float((found[axis] * found[f"{of}_density"]).sum() * width)
+        quantiles = found[f"{of}_quantile"].values
+        assert (np.diff(quantiles) > 0).all()
+        assert quantiles[0] / 2 < mean < quantiles[2] <= found[f"max_{axis}"]
+        assert (found[f"{of}_density_stderr"].values >= 0).all()
+
+
+def test_power_is_that_of_sweeps_from_the_same_starts(found):
+    """The noise of a start is that of the cell in a map: every realisation is a cell of one."""
+    from vijax.planes.start_places import start_places
+
+    pair = DEVICE.pair()
+    across, fast = start_places(16)
+    told = {"device": DEVICE, "until": "window", "periods": 60, "transient": 20, "excitation": NOISY, "outputs": ["P"]}
+    for i in (0, 7):
+        P = vijax.sweep(**told, u0=across[i] * float(pair.d), v0=1.2 * fast[i])["P"]
+        assert float(P) == pytest.approx(float(found["P_realisation"][i]), rel=1e-9)
+    assert float(found["P"]) == pytest.approx(found["P_realisation"].values.mean())
+
+
+def test_the_error_is_how_far_other_seeds_are(found):
+    others = [
+        response(
+            DEVICE, Harmonics() + Noise(0.05, 16, seed), realisations=16, periods=60, transient=20, attractors=False
+        )
+        for seed in range(1, 7)
+    ]
+    for name in ("P", "impacts_per_period"):
+        spread = np.std([float(one[name]) for one in others], ddof=1)
+        told = np.mean([float(one[f"{name}_stderr"]) for one in others])
+        assert 0.3 < spread / told < 3, name
+    assert "time_share" not in others[0]
+
+
+def test_a_limit_in_the_middle_is_passed_by_half(found):
+    limit = float(found["penetration_quantile"].sel(quantile=0.5))
+    device = vijax.Harvester(omega=5 * np.pi, omega0=150.0, s=0.008, penetration_limit=limit)
+    again = response(device, NOISY, realisations=16, periods=60, transient=20, attractors=False)
+    assert float(again["beyond_limit"]) == pytest.approx(0.5, abs=1e-3)
+    assert 0 < float(again["beyond_limit_stderr"]) < 0.05
+    assert float(found["beyond_limit"]) == 0
+
+
+def test_basins_are_kept_to_without_noise_and_left_with_it():
+    told = {"realisations": 12, "periods": 30, "transient": 60}
+    calm = response(MULTISTABLE, Harmonics() + Noise(1e-9, 8), **told)
+    assert calm.sizes["attractor"] > 1
+    assert not calm["losses"].any()
+    assert np.isinf(calm["time_until_lost"]).all()
+    rough = response(MULTISTABLE, Harmonics() + Noise(0.03, 8), **told)
+    for one in (calm, rough):
+        assert float(one["time_share"].sum()) == pytest.approx(1)
+    assert rough["losses"].sum() > 20
+    kept = rough.isel(attractor=0)
+    assert 1 < float(kept["time_until_lost"]) < 30
+    # What is left is entered again but for the end: losses of all are the changes of basin.
+    assert (np.diff(rough["time_share"]) <= 0).all()
+
+
+def test_records_and_the_sine_have_no_table():
+    rough = Waveform(np.random.default_rng(0).normal(size=128), 32.0)
+    for excitation in (rough, None, Noise(0.5, 16)):
+        one = response(DEVICE, excitation, realisations=4, periods=8, transient=2)
+        assert "time_share" not in one
+        assert float(one["P_stderr"]) >= 0
+    assert one.attrs["excitation"] == "noise of level 0.5 up to 16.0 times the frequency, seed 0"
+
+
+def test_what_cannot_be_is_named():
+    with pytest.raises(ValueError, match="realisations must be a whole number of at least 2; got 1"):
+        response(DEVICE, NOISY, realisations=1)
+    with pytest.raises(ValueError, match="excitation must be of the kind Excitation"):
+        response(DEVICE, 3)
+    with pytest.raises(ValueError, match="periods and transient must end within the record"):
+        response(DEVICE, Waveform([0.0, 1.0], 2.0, looped=False))

@@ -1,0 +1,86 @@
+"""Options of what shakes the capsule, and the excitation that they say."""
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vijax.cli.arguments import about
+from vijax.cli.kinds import Whole
+
+if TYPE_CHECKING:
+    from vijax.model.excitation import Excitation
+
+_NAMES = "harmonics", "phases", "record", "looped", "noise", "seed"
+
+
+def excitation_options() -> list[click.Parameter]:
+    """Make the options of the section."""
+    amplitudes = "amplitudes of the forcing frequency's multiples, in units of A [the sine; none with --record]"
+    file = "measured acceleration: a text file of two columns, time in s and acceleration in m/s^2"
+    noise = "white noise: its level and its highest frequency, in units of the forcing's"
+    return [
+        click.Option(["--harmonics"], metavar="A1,A2,..", help=amplitudes),
+        click.Option(["--phases"], metavar="P1,P2,..", help="of --harmonics: their phases, rad [0]"),
+        click.Option(["--record"], metavar="FILE", help=file),
+        click.Option(["--looped"], is_flag=True, help="of --record: begin it again when it is over"),
+        click.Option(["--noise"], metavar="LEVEL,BAND", help=noise),
+        click.Option(["--seed"], type=Whole(0), help="of --noise: the number of its realisation [0]"),
+    ]
+
+
+def take_excitation(given: dict[str, Any]) -> "Excitation | None":
+    """Take the options of the excitation out of what was given, and make it; None for the sine."""
+    harmonics, phases, record, looped, noise, seed = (given.pop(name) for name in _NAMES)
+    for name, value, of, wanted in (
+        ("phases", phases, "harmonics", harmonics),
+        ("looped", looped or None, "record", record),
+        ("seed", seed, "noise", noise),
+    ):
+        if value is not None and wanted is None:
+            raise ValueError(f"{name} must be left out without --{of}; got {value}")
+    if harmonics is record is noise is None:
+        return None
+    from vijax.model.excitation import Harmonics, Noise
+
+    parts: list[Excitation] = []
+    if record is not None:
+        parts.append(_record(record, looped))
+    if harmonics is not None:
+        with about("harmonics"):
+            parts.append(Harmonics(_numbers(harmonics), 0.0 if phases is None else _numbers(phases)))
+    if noise is not None:
+        with about("noise"):
+            numbers = _numbers(noise)
+            if len(numbers) != 2:
+                raise ValueError(f"it must be two numbers, a level and a highest frequency; got {noise!r}")
+            # Noise shakes besides what else does, and by itself besides the sine.
+            parts += [*([] if parts else [Harmonics()]), Noise(numbers[0], numbers[1], seed or 0)]
+    first, *others = parts
+    return sum(others, first)
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"it must be numbers parted by commas; got {text!r}") from None
+
+
+def _record(path: str, looped: bool) -> "Excitation":
+    import numpy as np
+
+    from vijax.model.excitation import Record
+
+    with about("record"):
+        try:
+            columns = np.loadtxt(path, delimiter="," if _parted_by_commas(path) else None, unpack=True, ndmin=2)
+        except (OSError, UnicodeDecodeError, ValueError) as error:
+            raise ValueError(f"it must be a text file of two columns of numbers; got {path!r}: {error}") from None
+        if len(columns) != 2:
+            raise ValueError(f"it must be a text file of two columns of numbers; got {len(columns)} in {path!r}")
+        return Record(columns[0], columns[1], looped)
+
+
+def _parted_by_commas(path: str) -> bool:
+    with open(path, encoding="utf-8") as file:
+        return "," in next((line for line in file if line.strip() and not line.startswith("#")), "")

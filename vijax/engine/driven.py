@@ -1,0 +1,291 @@
+"""Motion under any excitation: harmonics, samples with straight lines between them, noise; no time step to choose.
+
+Between two knots of the excitation the motion is a Taylor series that is exact to rounding (`taylor`). A step goes as
+far as nothing happens for certain: to the next knot, or half the way where a wall, an exit or the deepest point of a
+contact cannot be excluded. Where exactly one event is certain to lie ahead, further steps close in on it by a
+fourth-order iteration within the bracket, and the last lands on it (`driven_events`). No lane waits for another.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from vijax.engine import taylor
+from vijax.engine.driven_events import NONE, Decision, DrivenCarry, StepEnd, choose, land, look
+from vijax.engine.forcing import REACHED, Forcing
+from vijax.engine.method import HELD, ImpactOutcome, Method, decided
+from vijax.engine.taylor import Push, Rates, Oscillator
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.model.records import Impact, State
+from vijax.model.sides import Sides, at
+from vijax.runtime.arrays import Flag, Scalar, present
+from vijax.runtime.xla import share
+
+# Steps of a contact and of a flight's end, at most, for the room of recorded runs; most take a tenth.
+_PER_IMPACT = 256
+
+
+def _unit(zero: Scalar) -> tuple[Scalar, ...]:
+    """Make the tangent map of no motion, row by row."""
+    return zero + 1, zero, zero, zero + 1
+
+
+class _Clock(NamedTuple):
+    """When it is: knots passed, the time since the last one, periods completed, the phase of this one."""
+
+    k: Scalar
+    s: Scalar
+    n: Int[Array, ""]
+    t: Scalar
+
+
+class Driven(Method[DrivenCarry]):
+    """The method of excitations that are not the sine; of linear membranes.
+
+    Attributes:
+        forcing: The excitation.
+    """
+
+    forcing: Forcing
+
+    @property
+    def arithmetic(self) -> bool:
+        """Say whether a step calls no library: it does not."""
+        return True
+
+    def walls(self, pair: ImpactPair) -> Oscillator | Sides:
+        """Give the membrane of a pair; of each wall where they differ."""
+        return Sides(_spring(pair.at(-1)), _spring(pair.at(1))) if pair.unequal else _spring(pair)
+
+    def taken(self, m: DrivenCarry) -> Int[Array, ""]:
+        """Count the steps so far."""
+        return m.steps
+
+    def most_steps(self, periods: int, max_impacts: int) -> int:
+        """Say after how many steps a recorded run is stopped."""
+        return (int(np.max(np.asarray(self.forcing.knots))) + 16) * (periods + HELD) + _PER_IMPACT * max_impacts
+
+    def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> DrivenCarry:
+        """Make the carry of a start."""
+        zero, whole = jnp.zeros_like(state.u), jnp.zeros_like(state.n)
+        held, side = state.mode != 0, state.mode.astype(zero.dtype)
+        n = state.n.astype(zero.dtype)
+        k = self.forcing.knot_at(n, state.t)
+        x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
+        return DrivenCarry(
+            x=x,
+            z=jnp.where(held, side * state.v, state.v),
+            k=k,
+            s=jnp.maximum(state.t - (k - n * self.forcing.knots) * self.forcing.gap, 0.0),
+            n=state.n,
+            mode=state.mode,
+            trial=zero + jnp.inf,
+            event=zero,
+            bracket=zero,
+            onset_t=state.t,
+            onset_n=state.n,
+            entered=jnp.zeros_like(held),
+            v_in=state.v,
+            depth=jnp.where(held, x, 0.0),
+            work=zero if deep else None,
+            left_t=state.t,
+            left_n=state.n,
+            tangent=_unit(zero) if tangent else None,
+            draws=self.forcing.draws(pair, state, k),
+            steps=whole,
+        )
+
+    def step(
+        self, pair: ImpactPair, walls: Oscillator | Sides, m: DrivenCarry, *, recorded: bool = False
+    ) -> tuple[DrivenCarry, ImpactOutcome, Flag]:
+        """Take one step: to a knot, to where something may happen, towards an event, or onto it."""
+        half, held = 0.5 * pair.d, m.mode != 0
+        side = jnp.where(m.mode < 0, -1.0, 1.0).astype(half.dtype)
+        to_knot, to_period = self.forcing.gap - m.s, self._to_period(m)
+        spring = _spring_of(walls, side, held, self.forcing.reach)
+        push = self.forcing.push(pair.gamma, m.k, m.s, 2 - to_period, m.draws).turned(jnp.where(held, side, 1.0))
+        room = jnp.minimum(to_knot, jnp.minimum(spring.reach, self.forcing.reach))
+        if recorded:
+            # States at phase 0 are asked for: a step ends there.
+            room = jnp.where(to_period < room * (1 - REACHED), to_period, room)
+        # A step that ends at a knot is as long as where it began asks for; a trial is as long as it was decided to be.
+        s, to_knot, to_period = share((jnp.minimum(lax.stop_gradient(m.trial), room), to_knot, to_period))
+        now, later = share(taylor.rates(spring, push, m.x, m.z)), push.later(s)
+        end = share(taylor.rates(spring, later, *taylor.moved(spring, push, m.x, m.z, s)))
+        most = taylor.steepest(spring, self.forcing.bend, now, s)
+        ahead = share(look(held, m.work is not None, half, most, now, end, s))
+        choice = decided(lax.stop_gradient(share(choose(m, half, spring, ahead, end, s))))
+        landing = share(land(choice, half, side, s, end))
+        clock = share(self._clock(m, landing.length, to_knot, to_period, choice.goes))
+        work, tangent = m.work, m.tangent
+        if work is not None:
+            done = _worked(push.derivatives(), later.derivatives(), now, end, s, landing.delay)
+            work = work + jnp.where(choice.goes & held, done, 0.0)
+        if tangent is not None:
+            carried = _spread(spring, push, later, m, s, landing.delay, _kick(walls, side, landing))
+            tangent = tuple(jnp.where(choice.goes, new, old) for new, old in zip(carried, tangent, strict=True))
+        outcome = _outcome(m, half, side, landing.there.z, clock, work, tangent)
+        m = replace(m, work=work, tangent=tangent, draws=self.forcing.drawn(m.draws, m.k, clock.k))
+        return _gone_on(m, choice, landing, clock), outcome, landing.exits & m.entered
+
+    def ball(self, pair: ImpactPair, m: DrivenCarry) -> State:
+        """Say where the ball of a carry is."""
+        held, side = m.mode != 0, m.mode.astype(m.x.dtype)
+        u = jnp.where(held, side * (0.5 * pair.d + m.x), m.x)
+        t = jnp.maximum(2 - self._to_period(m), 0.0)
+        return State(u, jnp.where(held, side * m.z, m.z), t, m.n, m.mode)
+
+    def drift(self, gamma: Any, v: Any, t: Any, s: Any) -> tuple[Any, Any]:
+        """Compute the flight of a ball that meets no wall, of harmonics alone: nothing else has attractors."""
+        rise, faster = flow.flight(flow.Force(0 * s, 0 * s, gamma), v, s)
+        for k, wave in self.forcing.waves(t):
+            force = flow.Force(wave.along[0], wave.across[0], 0 * s)
+            further, more = flow.flight(force, 0 * s, k * s)
+            rise, faster = rise + further / k**2, faster + more / k
+        return rise, faster
+
+    def mean_velocity(self, v: Any, t: Any) -> Any:
+        """Compute the velocity of a flight on level ground over a whole period; infinite unless the forcing repeats."""
+        if not self.forcing.periodic:
+            return jnp.full_like(v, jnp.inf)
+        for k, wave in self.forcing.waves(t):
+            v = v - wave.across[0] / (k * flow.PI)
+        return v
+
+    def _to_period(self, m: DrivenCarry) -> Scalar:
+        """Compute the time to the end of the period; whole knots first, as a sum of steps would lose digits."""
+        return ((m.n + 1).astype(m.s.dtype) * self.forcing.knots - m.k) * self.forcing.gap - m.s
+
+    def _clock(self, m: DrivenCarry, length: Scalar, to_knot: Scalar, to_period: Scalar, goes: Flag) -> _Clock:
+        """Go on by a time, where the ball does."""
+        short = REACHED * self.forcing.gap
+        knot, over = (decided(goes & (to - length <= short)) for to in (to_knot, to_period))
+        left = jnp.where(goes, to_period - length, to_period) + jnp.where(over, 2.0, 0.0)
+        return _Clock(
+            k=m.k + knot.astype(m.k.dtype),
+            s=jnp.where(knot, 0.0, jnp.where(goes, m.s + length, m.s)),
+            n=m.n + over.astype(m.n.dtype),
+            t=jnp.maximum(2 - left, 0.0),
+        )
+
+
+def _gone_on(m: DrivenCarry, choice: Decision, landing: StepEnd, clock: _Clock) -> DrivenCarry:
+    """Make the carry after a step."""
+    crossed, exits, there = landing.crossed, landing.exits, landing.there
+    tangent = m.tangent
+    if tangent is not None:
+        # A ball that leaves begins a new tangent map: that of an impact is from exit to exit.
+        unit = _unit(jnp.zeros_like(m.x))
+        tangent = tuple(jnp.where(exits, one, value) for one, value in zip(unit, tangent, strict=True))
+    return replace(
+        m,
+        x=jnp.where(choice.goes, landing.x, m.x),
+        z=jnp.where(choice.goes, landing.z, m.z),
+        k=clock.k,
+        s=clock.s,
+        n=clock.n,
+        mode=jnp.where(crossed, landing.toward.astype(m.mode.dtype), jnp.where(exits, 0, m.mode)),
+        trial=choice.trial,
+        event=jnp.where(choice.lands, NONE, choice.event),
+        bracket=choice.bracket,
+        onset_t=jnp.where(crossed, clock.t, m.onset_t),
+        onset_n=jnp.where(crossed, clock.n, m.onset_n),
+        entered=(m.entered | crossed) & ~exits,
+        v_in=jnp.where(crossed, there.z, m.v_in),
+        depth=jnp.where(crossed, 0.0, jnp.where(landing.crest, jnp.maximum(m.depth, there.x), m.depth)),
+        work=None if m.work is None else jnp.where(crossed, 0.0, m.work),
+        left_t=jnp.where(exits, clock.t, m.left_t),
+        left_n=jnp.where(exits, clock.n, m.left_n),
+        tangent=tangent,
+        steps=m.steps + 1,
+    )
+
+
+def _spring_of(walls: Oscillator | Sides, side: Scalar, held: Flag, reach: Scalar) -> Oscillator:
+    """Give the membrane that the ball is in, or what stands for one in flight."""
+    zero = jnp.zeros_like(side)
+    flight = Oscillator(zero, zero, zero, zero + reach)
+    return Oscillator(*(jnp.where(held, own, free) for own, free in zip(at(walls, side), flight, strict=True)))
+
+
+def _kick(walls: Oscillator | Sides, side: Scalar, landing: StepEnd) -> Scalar:
+    """Find how much of du becomes du' at an event: the force jumps by the damping, on at the onset, off at the exit."""
+    onset, leaving = at(walls, landing.toward).mu, at(walls, side).mu
+    return jnp.where(landing.crossed, -onset, jnp.where(landing.exits, leaving, 0.0))
+
+
+def _spring(pair: ImpactPair) -> Oscillator:
+    kappa = pair._soft_kappa()
+    return Oscillator(kappa, kappa * kappa, pair.mu, taylor.REACH / kappa)
+
+
+def _worked(
+    push: tuple[Scalar, ...], later: tuple[Scalar, ...], now: Rates, end: Rates, s: Scalar, delay: Scalar
+) -> Scalar:
+    """Integrate the push times the velocity over a step and the delay after it.
+
+    By the two-point formula that takes three derivatives at both ends, off by 4e-8 of the integrand within `REACH`.
+    """
+    begins, ends = _power(push, now), _power(later, end)
+    even = s / 2 * (begins[0] + ends[0]) + s**3 / 84 * (begins[2] + ends[2])
+    odd = 3 * s**2 / 28 * (begins[1] - ends[1]) + s**4 / 1680 * (begins[3] - ends[3])
+    rest = delay * (ends[0] + delay * (ends[1] / 2 + delay * (ends[2] / 6 + delay * ends[3] / 24)))
+    return even + odd + rest
+
+
+def _power(push: tuple[Scalar, ...], of: Rates) -> tuple[Scalar, ...]:
+    """Compute the push times the velocity and its three derivatives."""
+    f0, f1, f2, f3 = push
+    return (
+        f0 * of.z,
+        f1 * of.z + f0 * of.a,
+        f2 * of.z + 2 * f1 * of.a + f0 * of.j,
+        f3 * of.z + 3 * (f2 * of.a + f1 * of.j) + f0 * of.snap,
+    )
+
+
+def _spread(
+    spring: Oscillator, push: Push, later: Push, m: DrivenCarry, s: Scalar, delay: Scalar, kick: Scalar
+) -> tuple[Scalar, ...]:
+    """Take the tangent map over a step, the saltation at its end included."""
+
+    def carried(x, z):
+        end = taylor.rates(spring, later, *taylor.moved(spring, push, x, z, s)).after(delay)
+        return end.x, end.z
+
+    a, b, c, d = present(m.tangent)
+    (_, (p, r)), (_, (q, t)) = (jax.jvp(carried, (m.x, m.z), column) for column in ((a, c), (b, d)))
+    return p, q, r + kick * p, t + kick * q
+
+
+def _outcome(
+    m: DrivenCarry,
+    half: Scalar,
+    side: Scalar,
+    rate: Scalar,
+    clock: _Clock,
+    work: Scalar | None,
+    tangent: tuple[Scalar, ...] | None,
+) -> ImpactOutcome:
+    """Record the impact that ends now with the penetration falling at a rate."""
+    v_out, t, n = side * rate, clock.t, clock.n
+    # What the membrane got is what the ball lost and what the push gave meanwhile.
+    given = jnp.zeros_like(half) if work is None else 0.5 * (m.v_in * m.v_in - v_out * v_out) + work
+    impact = Impact(
+        n=m.onset_n,
+        t=m.onset_t,
+        side=side.astype(m.mode.dtype),
+        v_in=m.v_in,
+        v_out=v_out,
+        depth=m.depth,
+        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
+        work=given,
+    )
+    flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
+    return ImpactOutcome(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), tangent)
