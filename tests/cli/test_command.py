@@ -21,7 +21,7 @@ from vijax.plots import branch_diagrams, orbit_diagrams
 
 ROOT = SCRIPTS.parent
 DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram"} | {
-    name: name for name in ("basins", "branch", "curves", "design", "explore")
+    name: name for name in ("basins", "response", "branch", "curves", "design", "explore")
 }
 PAGES = [*DOORS, "compare"]
 # As many kappa as make the programs of `planes/test_compare`.
@@ -199,7 +199,7 @@ def test_help_needs_no_jax():
         "print(codes, grid.main(['--help']), {'jax', 'numpy', 'xarray', 'matplotlib'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert done.stdout.splitlines()[-1] == "[0, 0, 0, 0, 0, 0, 0, 0, 0] 0 set()"
+    assert done.stdout.splitlines()[-1] == f"{[0] * (1 + len(PAGES))} 0 set()"
 
 
 def test_alone_it_says_what_there_is_and_which_version(capsys):
@@ -266,7 +266,21 @@ def completed(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("vijax ", ["sweep", "compare", "orbit-diagram", "basins", "branch", "curves", "design", "explore", "docs"]),
+        (
+            "vijax ",
+            [
+                "sweep",
+                "compare",
+                "orbit-diagram",
+                "basins",
+                "response",
+                "branch",
+                "curves",
+                "design",
+                "explore",
+                "docs",
+            ],
+        ),
         ("vijax b", ["basins", "branch"]),
         ("vijax sweep --me", ["--method", "--membrane"]),
         ("vijax sweep --wall ", ["soft", "rigid", "rigid_left", "rigid_right"]),

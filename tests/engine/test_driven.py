@@ -11,7 +11,7 @@ import vijax
 from tests.engine.driven_digits import DIGITS, march
 from vijax import Harmonics, Noise, Sides, Waveform, impact_pair, trajectory
 from vijax.engine import taylor
-from vijax.engine.taylor import Push, Oscillator
+from vijax.engine.taylor import Oscillator, Push
 
 SAMPLES = 64
 # d, kappa, r, gamma, u0, v0; of two walls the left one first.
@@ -169,7 +169,13 @@ def test_a_start_in_contact_and_at_any_phase():
         np.testing.assert_allclose(rest.states.u[-1], whole.states.u[-1], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("excitation", [Waveform(ROUGH, SAMPLES), Harmonics([1.0, 0.4])], ids=["record", "harmonics"])
+@pytest.mark.parametrize(
+    "excitation",
+    [
+        pytest.param(Waveform(ROUGH, SAMPLES), id="record"),
+        pytest.param(Harmonics([1.0, 0.4]), id="harmonics", marks=pytest.mark.long),
+    ],
+)
 def test_derivatives(excitation):
     """Of the fourth impact by every parameter, forward and in reverse, against central differences."""
 
@@ -216,6 +222,7 @@ def test_noise_of_level_zero_is_none():
     assert float(np.abs(quiet["P"] / sine["P"] - 1).where(periodic).max()) < 1e-9
 
 
+@pytest.mark.long
 def test_little_noise_changes_little():
     """P of a 1:1 orbit moves by the square of the level, and the window of the smallest one is the noiseless one."""
     told = {"d": 0.2, "kappa": 40.0, "r": 0.5, "until": "window", "periods": 200, "transient": 50, "outputs": ["P"]}

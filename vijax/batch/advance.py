@@ -99,7 +99,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
         matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
     after = out.state
     # A flight that drifts comes to a wall after the horizon.
-    late = out.quiet & ~neutral(pair, flow.mean_velocity(ball.v, ball.t))
+    late = out.quiet & ~neutral(pair, flow.mean_velocity(flow.sine(ball.t), ball.v))
     impact = LaneImpact(
         onset_t=out.impact.t,
         onset_n=jnp.where(late, jnp.inf, ball.n + out.impact.n.astype(ball.n.dtype)),

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from vijax.batch.cell import Cell, Lane, Mask, Relay, Settings
 from vijax.engine.impact import Ball, LaneImpact
+from vijax.engine.method import Method, waves_of
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import START_REACH
@@ -84,9 +85,9 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     last = choose(periodic, old.last, cell.ball)
     aloft = last.n < end
     left = jnp.where(aloft, 2 * (end - last.n) - last.t, 0.0)
-    rise, v = flow.flight(flow.flight_force(pair.gamma, last.t), last.v, left)
+    rise, v = flow.drift(waves_of(settings.method, last.t), pair.gamma, last.v, left)
     ball = Ball(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
-    ball = choose(permanent, resting(pair, end), ball)
+    ball = choose(permanent, resting(pair, end, settings.method), ball)
     first = end - present(settings.recorded_periods)
     mark = choose(periodic, _moved(last, _ahead(last.n, first, present(cell.candidate).period)), old.mark)
     mark = choose(quiet | permanent, Ball(ball.u, ball.v, ball.t, first), mark)
@@ -95,7 +96,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     return Handover(ball.u, ball.v, ball.t, _moved(mark, -first), held)
 
 
-def resting(pair: ImpactPair, end: Lane) -> Ball:
+def resting(pair: ImpactPair, end: Lane, method: Method | None = None) -> Ball:
     """Make a ball that stays for ever on the wall on which it lies, at phase 0, once only its steady motion is left."""
     side, zero = -jnp.sign(pair.gamma), jnp.zeros_like(end)
 
@@ -104,9 +105,7 @@ def resting(pair: ImpactPair, end: Lane) -> Ball:
 
     def soft(wall: ImpactPair) -> tuple:
         def steady(wall, side):
-            force = flow.contact_force(wall.gamma, side, jnp.zeros_like(side))
-            response = flow.steady_response(flow.membrane(wall), force)
-            return response.at(jnp.zeros_like(side)), response.slope().at(jnp.zeros_like(side))
+            return flow.held_response(flow.membrane(wall), waves_of(method, jnp.zeros_like(side)), side, wall.gamma)
 
         return jax.vmap(steady)(wall, side)
 

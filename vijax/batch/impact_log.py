@@ -9,9 +9,11 @@ import numpy as np
 from jax import lax
 
 from vijax.batch.exact_run import balls_at
+from vijax.batch.trajectory import trajectory
 from vijax.engine import exact, quick, quick_wall
 from vijax.engine.ground import Ground, ground_of
 from vijax.engine.impact import Ball
+from vijax.engine.method import Method
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
 from vijax.runtime import tiles
@@ -87,6 +89,31 @@ def record(pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) ->
     ball = ball[order]
     flown = jax.tree.map(lambda *x: np.concatenate(x)[order], *parts) if parts else None
     return ImpactLog(*_impacts(ball, flown, count, periods), *_strobes(pair, ball, flown, count, periods))
+
+
+def record_stepped(method: Method, pair: ImpactPair, starts: State, periods: int, wanted: np.ndarray) -> ImpactLog:
+    """Do what `record` does, by a method that steps and whose forcing repeats every period."""
+    pair, starts = jax.tree.map(np.asarray, (pair, starts))
+    count, early = starts.u.size, max(int(-starts.n.min()), 0)
+    some = jax.tree.map(lambda x: x[wanted], pair)
+    path = None
+    if wanted.any():
+        t = 2.0 * (starts.n[wanted] + early) + starts.t[wanted]
+        flown = trajectory(some, starts.u[wanted], starts.v[wanted], periods + early, t, method=method)
+        path = jax.tree.map(np.asarray, flown)
+    table = {name: np.full((count, 0), np.nan) for name in _KEPT}
+    filled, u, v = np.zeros(count, int), *(np.full((count, periods), np.nan) for _ in range(2))
+    if path is None:
+        return ImpactLog(table, filled, u, v)
+    real = (np.arange(path.impacts.n.shape[1]) < path.filled[:, None]) & (path.impacts.n >= early)
+    order = np.argsort(~real, axis=1, kind="stable")[:, : real.sum(axis=1).max()]
+    filled[wanted] = real.sum(axis=1)
+    for name in table:
+        values = np.where(real, getattr(path.impacts, name) - (early if name == "n" else 0), np.nan)
+        table[name] = np.full((count, order.shape[1]), np.nan)
+        table[name][wanted] = np.take_along_axis(values, order, axis=1)
+    u[wanted], v[wanted] = path.states.u[:, early:], path.states.v[:, early:]
+    return ImpactLog(table, filled, u, v)
 
 
 class _Underway(NamedTuple):

@@ -286,7 +286,7 @@ def attractors(
     cells = rows.pack(Entry(pair, length, speed, starts.u, starts.v, starts.t, own))
     plan = dataclasses.replace(_chained(pair), devices=True)
     number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
-    settings = _chained_settings(pair, Harvester(), periods, recorded_periods)
+    settings = _chained_settings(pair, Harvester(), periods, recorded_periods, None)
     return _run(plan, cells, number, settings)
 
 
@@ -295,14 +295,16 @@ def _chained(pair: ImpactPair) -> Plan:
     return Plan(**walls_of(pair), ground=ground_of(pair.gamma), deep=True, energies=True, chained=True)
 
 
-def _chained_settings(pair: ImpactPair, device: Harvester, periods: int, recorded_periods: int) -> Settings:
+def _chained_settings(
+    pair: ImpactPair, device: Harvester, periods: int, recorded_periods: int, method: Method | None
+) -> Settings:
     dtype = pair.d.dtype
     one = jnp.ones(1, dtype)
     return Settings(
         periods=jnp.asarray(periods, dtype),
         transient=jnp.asarray(jnp.floor(TRANSIENT_SHARE * periods), dtype),
         device=jax.tree.map(lambda x: jnp.asarray(x, dtype), electrical(device)),
-        method=None,
+        method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
         length_variant=one,
         speed_variant=one,
         recorded_periods=jnp.asarray(recorded_periods, dtype),
@@ -364,6 +366,7 @@ def follow(
     *,
     periods: int = 400,
     recorded_periods: int = 25,
+    method: Method | None = None,
     count: int | None = None,
     links: int | None = None,
 ) -> Summary:
@@ -377,6 +380,7 @@ def follow(
         device: Electrical constants, mass and penetration limit.
         periods: Forcing periods of a cell; one whose attractor is certain ends there, as if it had run them all.
         recorded_periods: Periods at the end whose impacts will be wanted.
+        method: As in `summarise`; one whose forcing repeats every period.
         count, links: How many chains and links are real, the rest being padding; all unless given.
 
     Returns:
@@ -385,6 +389,6 @@ def follow(
     cells = rows.pack(Entry(pair, length, speed, growth.u, growth.v, jnp.zeros_like(pair.d)), leading=2)
     chains, most = pair.d.shape
     number, long = (jnp.asarray(x, jnp.int32) for x in (count or chains, links or most))
-    settings, plan = _chained_settings(pair, device, periods, recorded_periods), _chained(pair)
+    settings, plan = _chained_settings(pair, device, periods, recorded_periods, method), _chained(pair)
     table = np.asarray(_compiled_chains(plan)(cells, starts, number, long, settings))
     return rows.unpack(table, shapes(plan, cells.dtype))

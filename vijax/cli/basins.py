@@ -10,6 +10,7 @@ import click
 from vijax.cli import options, process
 from vijax.cli.arguments import device, take_axes
 from vijax.cli.closing import finish, pace, tally
+from vijax.cli.excitation import harmonic_options, take_excitation
 from vijax.cli.kinds import Real, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress
@@ -71,7 +72,8 @@ def _plan(
 ) -> "SweepPlan":
     from vijax.planes.basins import plan_basins, plan_fractions
 
-    settings = SweepSettings(**given)
+    excitation = take_excitation(given)
+    settings = SweepSettings(**given, excitation=excitation)
     if starts is not None:
         speed = SPEED if speed is None else speed
         drawn: dict[str, Any] = {"starts": starts, "speed": speed, "seed": seed}
@@ -146,6 +148,7 @@ def _sections() -> Sections:
             options.setting("periods", long, Whole(1)),
             options.wall_option(),
         ],
+        "Excitation": harmonic_options(),
         "Files": options.file_options(),
         "Large runs": [options.size_option()],
     }

@@ -13,14 +13,21 @@ if TYPE_CHECKING:
 _NAMES = "harmonics", "phases", "record", "looped", "noise", "seed"
 
 
-def excitation_options() -> list[click.Parameter]:
-    """Make the options of the section."""
-    amplitudes = "amplitudes of the forcing frequency's multiples, in units of A [the sine; none with --record]"
-    file = "measured acceleration: a text file of two columns, time in s and acceleration in m/s^2"
-    noise = "white noise: its level and its highest frequency, in units of the forcing's"
+def harmonic_options() -> list[click.Parameter]:
+    """Make the options of an excitation that repeats every period."""
+    amplitudes = "amplitudes of the forcing frequency's multiples, in units of A [the sine]"
     return [
         click.Option(["--harmonics"], metavar="A1,A2,..", help=amplitudes),
         click.Option(["--phases"], metavar="P1,P2,..", help="of --harmonics: their phases, rad [0]"),
+    ]
+
+
+def excitation_options() -> list[click.Parameter]:
+    """Make the options of any excitation."""
+    file = "measured acceleration in place of the sine: a text file of two columns, time in s and acceleration in m/s^2"
+    noise = "white noise besides: its level and its highest frequency, in units of the forcing's"
+    return [
+        *harmonic_options(),
         click.Option(["--record"], metavar="FILE", help=file),
         click.Option(["--looped"], is_flag=True, help="of --record: begin it again when it is over"),
         click.Option(["--noise"], metavar="LEVEL,BAND", help=noise),
@@ -30,7 +37,7 @@ def excitation_options() -> list[click.Parameter]:
 
 def take_excitation(given: dict[str, Any]) -> "Excitation | None":
     """Take the options of the excitation out of what was given, and make it; None for the sine."""
-    harmonics, phases, record, looped, noise, seed = (given.pop(name) for name in _NAMES)
+    harmonics, phases, record, looped, noise, seed = (given.pop(name, None) for name in _NAMES)
     for name, value, of, wanted in (
         ("phases", phases, "harmonics", harmonics),
         ("looped", looped or None, "record", record),
@@ -66,7 +73,7 @@ def _numbers(text: str) -> list[float]:
         raise ValueError(f"it must be numbers parted by commas; got {text!r}") from None
 
 
-def _record(path: str, looped: bool) -> "Excitation":
+def _record(path: str, looped: bool | None) -> "Excitation":
     import numpy as np
 
     from vijax.model.excitation import Record
@@ -78,7 +85,7 @@ def _record(path: str, looped: bool) -> "Excitation":
             raise ValueError(f"it must be a text file of two columns of numbers; got {path!r}: {error}") from None
         if len(columns) != 2:
             raise ValueError(f"it must be a text file of two columns of numbers; got {len(columns)} in {path!r}")
-        return Record(columns[0], columns[1], looped)
+        return Record(columns[0], columns[1], bool(looped))
 
 
 def _parted_by_commas(path: str) -> bool:

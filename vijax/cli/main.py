@@ -17,6 +17,7 @@ _PAGES = {
     "compare": "compare",
     "orbit-diagram": "orbit_diagram",
     "basins": "basins",
+    "response": "response",
     "branch": "branch",
     "curves": "curves",
     "design": "design",

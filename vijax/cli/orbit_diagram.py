@@ -10,6 +10,7 @@ import click
 from vijax.cli import options, process
 from vijax.cli.arguments import about, device, take_axes
 from vijax.cli.closing import finish, pace, statuses
+from vijax.cli.excitation import harmonic_options, take_excitation
 from vijax.cli.kinds import Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress
@@ -79,7 +80,8 @@ def _plan(along: str, axes: dict[str, Any], device: Any, given: dict[str, Any]) 
         values = parse_axis(name, text)
     if not values.ndim:
         raise ValueError(f"along must have several values, as in {_ALONG}; got {along!r}")
-    return plan(name, values, axes, device, DiagramSettings(**given))
+    excitation = take_excitation(given)
+    return plan(name, values, axes, device, DiagramSettings(**given, excitation=excitation))
 
 
 def _run(diagram: "Diagram") -> "xr.Dataset":
@@ -124,6 +126,7 @@ def _sections() -> Sections:
             options.wall_option(),
             options.dtype_option(),
         ],
+        "Excitation": harmonic_options(),
         "Files": [options.quantity_option(POINT_QUANTITIES), *options.file_options()],
         "Large runs": [options.size_option()],
     }

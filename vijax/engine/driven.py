@@ -19,7 +19,7 @@ from vijax.engine import taylor
 from vijax.engine.driven_events import NONE, Decision, DrivenCarry, StepEnd, choose, land, look
 from vijax.engine.forcing import REACHED, Forcing
 from vijax.engine.method import HELD, ImpactOutcome, Method, decided
-from vijax.engine.taylor import Push, Rates, Oscillator
+from vijax.engine.taylor import Oscillator, Push, Rates
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
@@ -141,22 +141,14 @@ class Driven(Method[DrivenCarry]):
         t = jnp.maximum(2 - self._to_period(m), 0.0)
         return State(u, jnp.where(held, side * m.z, m.z), t, m.n, m.mode)
 
-    def drift(self, gamma: Any, v: Any, t: Any, s: Any) -> tuple[Any, Any]:
-        """Compute the flight of a ball that meets no wall, of harmonics alone: nothing else has attractors."""
-        rise, faster = flow.flight(flow.Force(0 * s, 0 * s, gamma), v, s)
-        for k, wave in self.forcing.waves(t):
-            force = flow.Force(wave.along[0], wave.across[0], 0 * s)
-            further, more = flow.flight(force, 0 * s, k * s)
-            rise, faster = rise + further / k**2, faster + more / k
-        return rise, faster
+    def waves(self, t: Any) -> flow.Waves:
+        """Give the harmonics of the forcing from phase t on."""
+        return self.forcing.waves(t)
 
-    def mean_velocity(self, v: Any, t: Any) -> Any:
-        """Compute the velocity of a flight on level ground over a whole period; infinite unless the forcing repeats."""
-        if not self.forcing.periodic:
-            return jnp.full_like(v, jnp.inf)
-        for k, wave in self.forcing.waves(t):
-            v = v - wave.across[0] / (k * flow.PI)
-        return v
+    @property
+    def repeats(self) -> bool:
+        """Say whether the forcing repeats after every period."""
+        return self.forcing.periodic
 
     def _to_period(self, m: DrivenCarry) -> Scalar:
         """Compute the time to the end of the period; whole knots first, as a sum of steps would lose digits."""

@@ -13,7 +13,7 @@ from jaxtyping import Array, Int
 from vijax.engine import taylor
 from vijax.engine.forcing import Draws
 from vijax.engine.roots import converged_step, householder, implicit_root
-from vijax.engine.taylor import Rates, Oscillator
+from vijax.engine.taylor import Oscillator, Rates
 from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from vijax.engine import taylor
 from vijax.engine.taylor import Push
 from vijax.model.excitation import Excitation, Harmonics, Noise, Waveform
-from vijax.model.flow import PI
+from vijax.model.flow import PI, Wave, Waves, half_turn
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
 from vijax.runtime.arrays import AnyArray, Scalar, Values, present
@@ -90,15 +90,17 @@ class Forcing(eqx.Module):
                 rise = (after - before) * (1 / (every * self.gap))
                 gone = since if every == 1 else (k - every * jnp.floor(k / every)) * self.gap + since
                 level, slope = level + before + rise * gone, slope + rise
-        waves = [wave for _, wave in self.waves(phase)]
-        along, across = tuple(wave.along[0] for wave in waves), tuple(wave.across[0] for wave in waves)
+        waves = self.waves(phase)
+        along, across = tuple(wave.c for wave in waves), tuple(wave.q for wave in waves)
         return share(Push(level, slope, along, across, self.orders))
 
-    def waves(self, phase: Values) -> list[tuple[int, Push]]:
-        """List the harmonics from a phase on, each with its order; of any shape."""
-        zero = jnp.zeros_like(phase)
-        each = zip(self.orders, self.cosines, self.sines, strict=True)
-        return [(k, Push(zero, zero, (c + zero,), (q + zero,), (k,)).later(phase)) for k, c, q in each]
+    def waves(self, phase: Values) -> Waves:
+        """List the harmonics from a phase on; of any shape."""
+        found = []
+        for k, c, q in zip(self.orders, self.cosines, self.sines, strict=True):
+            sine, cosine, _, _ = half_turn(k * phase)
+            found.append(Wave(k, c * cosine - q * sine, q * cosine + c * sine))
+        return tuple(found)
 
     def _sampled(self, k: Scalar) -> tuple[Scalar, Scalar] | None:
         """Look up the samples before and after a knot."""

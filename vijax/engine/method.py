@@ -137,19 +137,14 @@ class Method(eqx.Module, Generic[C]):
     def ball(self, pair: ImpactPair, carry: C) -> State:
         """Say where the ball of a carry is."""
 
-    def drift(self, gamma: Any, v: Any, t: Any, s: Any) -> tuple[Any, Any]:
-        """Compute how far a ball of velocity v at phase t flies in a time s that meets no wall, and its velocity then.
+    def waves(self, t: Any) -> flow.Waves:
+        """Give the harmonics of the forcing from phase t on; of any shape."""
+        return flow.sine(t)
 
-        Of any shape. Where attractors are looked for it closes a round that ends a little before its phase, or after.
-        """
-        return flow.drift(gamma, v, t, s)
-
-    def mean_velocity(self, v: Any, t: Any) -> Any:
-        """Compute the velocity of a flight on level ground over a whole period, from that at phase t; any shape.
-
-        Infinite under a forcing that does not repeat: it leaves no ball alone for ever.
-        """
-        return flow.mean_velocity(v, t)
+    @property
+    def repeats(self) -> bool:
+        """Say whether these are all of the forcing, so that it repeats after every period."""
+        return True
 
     @property
     def arithmetic(self) -> bool:
@@ -168,3 +163,8 @@ class Method(eqx.Module, Generic[C]):
     def most_steps(self, periods: int, max_impacts: int) -> int:
         """Say after how many steps a recorded run is stopped."""
         return _PER_IMPACT * (periods + max_impacts)
+
+
+def waves_of(method: Method | None, t: Any) -> flow.Waves:
+    """Give the harmonics of a method's forcing from phase t on; the exact engine, None, knows the sine alone."""
+    return flow.sine(t) if method is None else method.waves(t)

@@ -128,21 +128,22 @@ def steepest(spring: Oscillator, bend: Values, now: Rates, s: Values) -> Values:
 def above(f: tuple[Values, ...], most: Values, s: Values) -> Flags:
     """Say whether f > 0 for certain on (0, s], where f, f', f'', f''' at 0 are given and |f''''| <= `most`.
 
-    By Bernstein coefficients of the polynomial below f; f may begin at 0, as it does when the ball leaves a wall.
+    By Bernstein coefficients of the polynomial below f. It may begin at 0, where the ball leaves a wall, and at
+    rest there: where no coefficient is below 0, the last one decides.
     """
     f0, f1, f2, f3 = f
     second = f0 + s * (f1 / 2 + s * f2 / 12)
     third = f0 + s * (3 * f1 / 4 + s * (f2 / 4 + s * f3 / 24))
     last = f0 + s * (f1 + s * (f2 / 2 + s * (f3 / 6 - s * most / 24)))
-    least = jnp.minimum(jnp.minimum(f0 + s * f1 / 4, second), jnp.minimum(third, last))
-    return (f0 >= 0) & (least > 0)
+    least = jnp.minimum(jnp.minimum(f0, f0 + s * f1 / 4), jnp.minimum(second, third))
+    return (least >= 0) & (last > 0)
 
 
 def falling(f: tuple[Values, Values, Values], most: Values, s: Values) -> Flags:
     """Say whether f < 0 for certain on (0, s], where f, f', f'' at 0 are given and |f'''| <= `most`; 0 at the start."""
     f0, f1, f2 = f
     second, last = f0 + s * (2 * f1 / 3 + s * f2 / 6), f0 + s * (f1 + s * (f2 / 2 + s * most / 6))
-    return (f0 <= 0) & (jnp.maximum(jnp.maximum(f0 + s * f1 / 3, second), last) < 0)
+    return (jnp.maximum(jnp.maximum(f0, f0 + s * f1 / 3), second) <= 0) & (last < 0)
 
 
 def steady_sign(f: tuple[Values, Values], most: Values, s: Values) -> Flags:

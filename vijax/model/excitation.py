@@ -42,6 +42,12 @@ class Excitation(eqx.Module):
         return all(isinstance(part, Harmonics) or (isinstance(part, Noise) and not part.level) for part in self.parts)
 
     @property
+    def mirrored(self) -> bool:
+        """Say whether it is its own opposite half a period later: then mirror images of motions are motions."""
+        odd = [not any(part.amplitudes[1::2]) for part in self.of(Harmonics)]
+        return self.periodic and all(odd)
+
+    @property
     def sine(self) -> bool:
         """Say whether it is the forcing of the paper, cos(pi t)."""
         return False

@@ -13,6 +13,7 @@ import numpy as np
 
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, one_device
+from vijax.model.excitation import Excitation
 from vijax.model.label import label, ordered
 from vijax.model.pair import symmetric
 from vijax.model.units import Given
@@ -53,6 +54,7 @@ def basins(
     merge_mirrors: bool = False,
     periods: int = SweepSettings.periods,
     wall: Walls = SweepSettings.wall,
+    excitation: Excitation | None = None,
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
@@ -75,6 +77,7 @@ def basins(
         v0: Velocities at the start; 256 between -0.6 and 0.6 unless given.
         merge_mirrors: Count mirror images as one attractor; gamma must be 0 everywhere.
         periods, wall, device, progress: As in `sweep`.
+        excitation: `Harmonics`, as attractors want a forcing that repeats every period; the sine unless given.
         axes: Any other axes of `sweep`; every point of arrays among them has a table of its own.
 
     Returns:
@@ -88,7 +91,7 @@ def basins(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
     """
-    settings = SweepSettings(periods=periods, wall=wall)
+    settings = SweepSettings(periods=periods, wall=wall, excitation=excitation)
     planned = plan_basins({**axes, "u0": u0, "v0": v0}, device, settings, merge_mirrors=merge_mirrors)
     return matched(sweep.run(planned, progress), merge_mirrors)
 
@@ -106,7 +109,7 @@ def plan_basins(
     Args:
         axes: Value or values of each axis; None counts as not given.
         device, merge_mirrors: As in `basins`.
-        settings: Of these periods and wall are read.
+        settings: Of these periods, wall and excitation are read.
 
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came.
@@ -129,6 +132,7 @@ def basin_fractions(
     merge_mirrors: bool = False,
     periods: int = SweepSettings.periods,
     wall: Walls = SweepSettings.wall,
+    excitation: Excitation | None = None,
     device: Harvester | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Parameters],
@@ -141,7 +145,7 @@ def basin_fractions(
         starts: How many, in every cell.
         speed: Largest velocity at the start, dimensionless.
         seed: Of starts drawn at random; unless given they lie on a lattice, which is more even.
-        merge_mirrors, periods, wall, device, progress: As in `basins`.
+        merge_mirrors, periods, wall, excitation, device, progress: As in `basins`.
         axes: Any axes of `sweep` but u0 and v0.
 
     Returns:
@@ -150,7 +154,7 @@ def basin_fractions(
     Raises:
         ValueError, TypeError: Which argument, what must hold, what came. Nothing was run then.
     """
-    settings = SweepSettings(periods=periods, wall=wall)
+    settings = SweepSettings(periods=periods, wall=wall, excitation=excitation)
     planned = plan_fractions(axes, device, settings, starts=starts, speed=speed, seed=seed, merge_mirrors=merge_mirrors)
     return matched(sweep.run(planned, progress), merge_mirrors)
 
@@ -202,6 +206,10 @@ def plan_starts(
     if merge_mirrors and gamma.any():
         got = gamma[gamma != 0].flat[0]
         raise ValueError(f"merge_mirrors must be left out unless gamma is 0 everywhere; got gamma = {got:g}")
+    if merge_mirrors and settings.excitation is not None and not settings.excitation.mirrored:
+        raise ValueError(
+            f"merge_mirrors must be left out unless the excitation has odd harmonics alone; got {settings.excitation}"
+        )
     alike = planned.device.alike and symmetric(planned.cells.quantities).values.all()
     if merge_mirrors and not alike:
         raise ValueError("merge_mirrors must be left out unless both walls are alike everywhere; got walls that differ")

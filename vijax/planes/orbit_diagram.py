@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.batch import simulate
-from vijax.batch.impact_log import ImpactLog, record
+from vijax.batch.impact_log import ImpactLog, record, record_stepped
 from vijax.model import energy
 from vijax.model.choices import Direction, Precision, Walls
 from vijax.model.device import Harvester, one_device
+from vijax.model.excitation import Excitation
 from vijax.model.pair import pair_of
 from vijax.model.quantities import MEASURED, PARAMETERS, STARTS
 from vijax.model.records import State, Status
@@ -70,6 +71,7 @@ def orbit_diagram(
     wall: Walls = DiagramSettings.wall,
     device: Harvester | None = None,
     dtype: Precision = DiagramSettings.dtype,
+    excitation: Excitation | None = None,
     progress: Callable[[int, int], None] | None = None,
     **axes: Unpack[Axes],
 ) -> "xr.Dataset":
@@ -97,6 +99,7 @@ def orbit_diagram(
         wall: "soft", "rigid", "rigid_left" or "rigid_right".
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
+        excitation: `Harmonics`, as attractors want a forcing that repeats every period; the sine unless given.
         progress: Called with (points done, points in all) from the calling thread, first with 0 done.
         axes: As in `sweep`: numbers or 1-D arrays. u0 and v0 are the starts of the first points.
 
@@ -115,7 +118,12 @@ def orbit_diagram(
     Source: the procedure of the paper's bifurcation diagrams.
     """
     settings = DiagramSettings(
-        periods=periods, wall=wall, dtype=dtype, direction=direction, recorded_periods=recorded_periods
+        periods=periods,
+        wall=wall,
+        dtype=dtype,
+        excitation=excitation,
+        direction=direction,
+        recorded_periods=recorded_periods,
     )
     return run(plan(along, values, axes, device, settings), progress)
 
@@ -196,7 +204,7 @@ def plan(
     # A start that a rigid gap does not hold is put back into it: to this door all walls are soft.
     laid_out = cells({**given, along: points}, device, "soft")
     outputs = (*_POINTS, *_IMPACTS, *_STROBES)
-    diagram = Diagram(SweepPlan(laid_out, settings, None, outputs, device), along, settings)
+    diagram = Diagram(SweepPlan(laid_out, settings, settings.integrator(device), outputs, device), along, settings)
     names = ["recorded_periods", "values", *(name for name in diagram.dims if name in given)]
     checks.fits(names, diagram.size, f"the impacts of {diagram.count:,} points")
     return diagram
@@ -344,6 +352,7 @@ def _follow(planned: SweepPlan, table: dict[str, np.ndarray], lanes: int, period
             planned.device,
             periods=periods,
             recorded_periods=recorded_periods,
+            method=planned.method,
             count=chains,
             links=links,
         )
@@ -360,7 +369,10 @@ def _fly(planned: SweepPlan, table: dict[str, np.ndarray], summary: Any, recorde
     u, v, t, n, held = (x.ravel() for x in jax.tree.leaves((summary.handover.mark, summary.handover.held)))
     whole_numbers = (x.astype(np.int32) for x in (n, held))
     lost = np.isin(summary.status, (Status.EVENT_BUDGET, Status.NONFINITE)).ravel()
-    return record(pair, State(u, v, t, *whole_numbers), recorded_periods, ~lost)
+    starts, method = State(u, v, t, *whole_numbers), planned.method
+    if method is None:
+        return record(pair, starts, recorded_periods, ~lost)
+    return record_stepped(method, pair, starts, recorded_periods, ~lost)
 
 
 def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":

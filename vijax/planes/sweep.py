@@ -348,7 +348,8 @@ def _refined(planned: SweepPlan, tell: Callable[[int, int], None]) -> "xr.Datase
     of = planned.cells
     varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
     mesh = refinement.Mesh(tuple(of.given[dim].values for dim in varied), planned.refine)
-    level_ground = of.pair(np.arange(of.count), planned.settings.wall).symmetric & planned.device.alike
+    alike = planned.device.alike and (planned.settings.excitation is None or planned.settings.excitation.mirrored)
+    level_ground = of.pair(np.arange(of.count), planned.settings.wall).symmetric & alike
     asked = replace(planned, outputs=tuple(dict.fromkeys((*planned.outputs, *refinement.NEEDS))))
     found: Fields = {}
     computed = np.zeros(of.count, bool)

@@ -28,7 +28,7 @@ _OPTIONS = ("solver", "rtol", "atol", "membrane", "steps")
 # What `engine.method_choice.record` tells of a run.
 _TOLD_ELSEWHERE = (*_OPTIONS, "excitation")
 # Settings that an orbit diagram reads, in the order of its attributes.
-_OF_DIAGRAMS = ("direction", "periods", "recorded_periods", "wall", "dtype")
+_OF_DIAGRAMS = ("direction", "periods", "recorded_periods", "wall", "dtype", "excitation")
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class SweepSettings:
 
 @dataclass(frozen=True)
 class DiagramSettings(SweepSettings):
-    """How the points of an orbit diagram are run: of a sweep's settings periods, wall and dtype, and two more.
+    """How the points of an orbit diagram are run: of a sweep's settings periods, wall, dtype, excitation, and two more.
 
     Attributes:
         direction: Ways along the axis that is swept, "down", "up" or "both"; "down".
@@ -151,7 +151,7 @@ class DiagramSettings(SweepSettings):
     @property
     def told(self) -> dict[str, Any]:
         """Name the settings that a diagram reads, as attributes of a dataset."""
-        return {name: getattr(self, name) for name in _OF_DIAGRAMS}
+        return {name: getattr(self, name) for name in _OF_DIAGRAMS if name not in _TOLD_ELSEWHERE}
 
 
 def choices(settings: type[SweepSettings]) -> dict[str, tuple[str, ...]]:
