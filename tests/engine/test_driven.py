@@ -1,5 +1,7 @@
 """Excitations that are not the sine: 40-digit sequences, DOP853, orders, noise, derivatives, and the exact engine."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -109,7 +111,8 @@ def test_a_sampled_sine_converges_with_order_two():
     exact, errors = trajectory(pair, 0.05, -0.4, 6).impacts, []
     counts = 2 ** np.arange(6, 11)
     for n in counts:
-        sampled = trajectory(pair, 0.05, -0.4, 6, excitation=Waveform(np.cos(2 * np.pi * np.arange(n) / n), n))
+        # All are as long, which makes one program of them.
+        sampled = trajectory(pair, 0.05, -0.4, 6, excitation=Waveform(np.cos(2 * np.pi * np.arange(1024) / n), n))
         errors.append(np.abs(sampled.impacts.v_in - exact.v_in)[:, :8].max(axis=1))
     slopes = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
     assert (np.abs(slopes - 2) < 0.05).all(), slopes
@@ -169,28 +172,37 @@ def test_a_start_in_contact_and_at_any_phase():
         np.testing.assert_allclose(rest.states.u[-1], whole.states.u[-1], rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize(
-    "excitation",
-    [
-        pytest.param(Waveform(ROUGH, SAMPLES), id="record"),
-        pytest.param(Harmonics([1.0, 0.4]), id="harmonics", marks=pytest.mark.long),
-    ],
-)
-def test_derivatives(excitation):
-    """Of the fourth impact by every parameter, forward and in reverse, against central differences."""
+RECORD, WAVES = Waveform(ROUGH, SAMPLES), Harmonics([1.0, 0.4])
 
-    def fourth(p):
-        d, kappa, r, gamma, u, v = p
-        hits = trajectory(impact_pair(d, kappa, r, gamma), u, v, 5, max_impacts=4, excitation=excitation).impacts
-        return jnp.stack([hits.t[3], hits.v_out[3], hits.depth[3], hits.duration[3]])
 
-    at = jnp.array([0.2, 20.0, 0.4, 0.05, 0.02, 0.3])
-    forward, reverse = jax.jacfwd(fourth)(at), jax.jacrev(fourth)(at)
+def fourth(excitation, p):
+    """Of the fourth impact: onset, exit speed, depth and duration."""
+    d, kappa, r, gamma, u, v = p
+    hits = trajectory(impact_pair(d, kappa, r, gamma), u, v, 5, max_impacts=4, excitation=excitation).impacts
+    return jnp.stack([hits.t[3], hits.v_out[3], hits.depth[3], hits.duration[3]])
+
+
+PLACE = jnp.array([0.2, 20.0, 0.4, 0.05, 0.02, 0.3])
+
+
+@pytest.mark.parametrize("excitation", [RECORD, pytest.param(WAVES, marks=pytest.mark.long)], ids=["record", "waves"])
+def test_derivatives_against_differences(excitation):
+    """By every parameter of the pair and the start; all steps are one call."""
+    forward = jax.jacfwd(partial(fourth, excitation))(PLACE)
+    h = 1e-6 * np.asarray(PLACE)
+    beside = np.asarray(PLACE)[:, None] + np.concatenate([np.diag(h), -np.diag(h)], axis=1)
+    d, kappa, r, gamma, u, v = beside
+    hits = trajectory(impact_pair(d, kappa, r, gamma), u, v, 5, max_impacts=4, excitation=excitation).impacts
+    there = np.stack([np.asarray(x)[:, 3] for x in (hits.t, hits.v_out, hits.depth, hits.duration)])
+    change = (there[:, : h.size] - there[:, h.size :]) / (2 * h)
+    np.testing.assert_allclose(forward, change, rtol=2e-6, atol=1e-8)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("excitation", [RECORD, WAVES], ids=["record", "waves"])
+def test_derivatives_in_reverse_are_those_forward(excitation):
+    forward, reverse = (jac(partial(fourth, excitation))(PLACE) for jac in (jax.jacfwd, jax.jacrev))
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
-    for i in range(at.size):
-        h = 1e-6 * float(at[i])
-        change = (fourth(at.at[i].add(h)) - fourth(at.at[i].add(-h))) / (2 * h)
-        np.testing.assert_allclose(forward[:, i], change, rtol=2e-6, atol=1e-8)
 
 
 # --- noise ------------------------------------------------------------------------------------------------------------
@@ -250,14 +262,14 @@ def test_noise_is_that_of_its_cell_in_every_plane():
     assert not np.allclose(starts[0], starts[2], atol=1e-3)
 
 
-def test_noise_shares_knots_with_a_record():
-    """Finer noise on a record, coarser noise on one: of level next to nothing both are the record."""
+@pytest.mark.parametrize("bandwidth", [30.0, *(pytest.param(x, marks=pytest.mark.long) for x in (5.0, 12.0))])
+def test_noise_shares_knots_with_a_record(bandwidth):
+    """Finer noise on a record, as fine or coarser: of level next to nothing it is the record."""
     pair, record = impact_pair(0.2, 30.0, 0.4), Waveform(ROUGH, 24.0)
     plain = trajectory(pair, 0.02, 0.3, 6, excitation=record)
-    for bandwidth in (5.0, 12.0, 30.0):
-        noisy = trajectory(pair, 0.02, 0.3, 6, excitation=record + Noise(1e-13, bandwidth))
-        np.testing.assert_allclose(noisy.impacts.v_in, plain.impacts.v_in, rtol=0, atol=1e-8)
-        assert not np.array_equal(noisy.impacts.v_in, plain.impacts.v_in, equal_nan=True)
+    noisy = trajectory(pair, 0.02, 0.3, 6, excitation=record + Noise(1e-13, bandwidth))
+    np.testing.assert_allclose(noisy.impacts.v_in, plain.impacts.v_in, rtol=0, atol=1e-8)
+    assert not np.array_equal(noisy.impacts.v_in, plain.impacts.v_in, equal_nan=True)
 
 
 # --- what a step is made of -------------------------------------------------------------------------------------------

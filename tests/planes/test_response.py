@@ -79,13 +79,17 @@ def test_basins_are_kept_to_without_noise_and_left_with_it():
     assert (np.diff(rough["time_share"]) <= 0).all()
 
 
-def test_records_and_the_sine_have_no_table():
-    rough = Waveform(np.random.default_rng(0).normal(size=128), 32.0)
-    for excitation in (rough, None, Noise(0.5, 16)):
-        one = response(DEVICE, excitation, realisations=4, periods=8, transient=2)
-        assert "time_share" not in one
-        assert float(one["P_stderr"]) >= 0
-    assert one.attrs["excitation"] == "noise of level 0.5 up to 16.0 times the frequency, seed 0"
+ROUGH = Waveform(np.random.default_rng(0).normal(size=128), 32.0)
+
+
+@pytest.mark.parametrize(
+    "excitation", [None, *(pytest.param(x, marks=pytest.mark.long) for x in (ROUGH, Noise(0.5, 16)))], ids=str
+)
+def test_only_noise_on_what_repeats_has_a_table(excitation):
+    one = response(DEVICE, excitation, realisations=4, periods=8, transient=2)
+    assert "time_share" not in one
+    assert float(one["P_stderr"]) >= 0
+    assert one.attrs["excitation"] == ("sine" if excitation is None else str(excitation))
 
 
 def test_what_cannot_be_is_named():
