@@ -14,6 +14,7 @@ from tests.engine.driven_digits import DIGITS, march
 from vijax import Harmonics, Noise, Sides, Waveform, impact_pair, trajectory
 from vijax.engine import taylor
 from vijax.engine.taylor import Oscillator, Push
+from vijax.model.records import Status
 
 SAMPLES = 64
 # d, kappa, r, gamma, u0, v0; of two walls the left one first.
@@ -172,6 +173,36 @@ def test_a_start_in_contact_and_at_any_phase():
         np.testing.assert_allclose(rest.states.u[-1], whole.states.u[-1], rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_start_at_rest_on_a_wall(side):
+    """Pushed into it, off it, or pushed by gravity alone: as the sine by its own engine, at a knot and between two."""
+    u0 = 0.15 * side
+    # Where the sine at its height pushes the ball off, it comes back to graze the same wall: nobody can tell.
+    for gamma, t0 in ((0.0, 0.5 * (1 - side)), (0.0, 0.3), (0.5, 0.0)):
+        pair = impact_pair(0.3, 20.0, 0.5, gamma)
+        exact, ours = (trajectory(pair, u0, 0.0, 4, t0, excitation=x) for x in (None, SINE))
+        assert int(ours.status) == int(exact.status) == 0
+        assert np.array_equal(ours.filled, exact.filled)
+        np.testing.assert_allclose(ours.impacts.t, exact.impacts.t, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(ours.states.u, exact.states.u, rtol=0, atol=1e-12)
+
+
+def test_the_push_of_a_start_is_that_of_its_own_forcing():
+    """At phase 0 the sine pushes to the right, this record to the left: the ball leaves the right wall at once."""
+    pushed = trajectory(impact_pair(0.3, 20.0, 0.5), 0.15, 0.0, 2, excitation=Waveform([-1.0, -1.0, 0.5, -0.2], 4.0))
+    assert int(pushed.impacts.side[0]) == -1
+    flight = 2 * float(pushed.impacts.n[0]) + float(pushed.impacts.t[0])
+    assert flight == pytest.approx(np.sqrt(2 * 0.3), abs=0.05)
+
+
+def test_a_ball_that_comes_to_rest_inside_a_membrane():
+    """A constant push above gravity: nothing but rounding is left of the motion, and no step waits for an event."""
+    pair = impact_pair(0.12, np.array([24.9, 400.0, 2000.0]), 0.28)
+    path = trajectory(pair, 0.0024, 0.4, 30, excitation=Waveform(np.full(5, 0.3), 5.0))
+    assert (np.asarray(path.status) == Status.PERMANENT_CONTACT).all()
+    np.testing.assert_allclose(path.states.u[:, -1], 0.06 + 0.3 / np.asarray(pair.kappa) ** 2, rtol=0, atol=1e-15)
+
+
 RECORD, WAVES = Waveform(ROUGH, SAMPLES), Harmonics([1.0, 0.4])
 
 
@@ -316,3 +347,25 @@ def test_certificates_never_lie():
         true = holds.all(axis=0) if holds.ndim > 1 else holds
         assert not (claim & ~true).any()
         assert claim.sum() > 0.3 * true.sum() > 100
+
+
+def test_the_fourth_derivative_stays_within_its_bound():
+    """Random membranes, pushes and states, in flight too; and the bound is worth something."""
+    g = np.random.default_rng(9)
+    count = 3000
+    kappa = np.where(g.random(count) < 0.3, 0.0, np.exp(g.uniform(0, 6, count)))
+    mu = kappa * g.uniform(0, 2, count)
+    level, slope, c, q, x, z = g.normal(size=(6, count)) * np.array([1, 5, 1, 1, 0.1, 0.5])[:, None]
+    spring = Oscillator(*map(jnp.asarray, (kappa, kappa**2, mu, kappa)))
+    push = Push(jnp.asarray(level), jnp.asarray(slope), (jnp.asarray(c),), (jnp.asarray(q),), (2,))
+    reach = taylor.REACH / np.maximum(kappa, 2 * np.pi) * g.uniform(0.01, 1, count)
+    bend = (2 * np.pi) ** 2 * np.hypot(c, q)
+    now = taylor.rates(spring, push, jnp.asarray(x), jnp.asarray(z))
+    most = np.asarray(taylor.steepest(spring, jnp.asarray(bend), now, jnp.asarray(reach)))
+    seen = np.zeros(count)
+    for part in np.linspace(0, 1, 21):
+        s = jnp.asarray(reach * part)
+        there = taylor.rates(spring, push.later(s), *taylor.moved(spring, push, jnp.asarray(x), jnp.asarray(z), s))
+        seen = np.maximum(seen, np.abs(there.snap))
+    assert (seen <= most * (1 + 1e-9)).all()
+    assert np.median(seen / most) > 0.1

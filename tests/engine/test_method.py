@@ -195,7 +195,7 @@ class Leapfrog(Method[Sample]):
         """The last sample."""
         return State(m.u, m.v, 2 * m.k / self.steps, m.n, m.mode)
 
-    def most_steps(self, periods, max_impacts):
+    def most_steps(self, pair, periods, max_impacts):
         """As many as there are samples."""
         return int(self.steps) * (periods + HELD)
 

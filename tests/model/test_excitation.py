@@ -22,7 +22,7 @@ SHAKEN = np.cos(4 * np.pi * TIME)
         (lambda: Harmonics([1.0, math.nan]), "amplitudes must be finite; got nan at index 1"),
         (lambda: Harmonics([1.0, 0.5], [0.0, 0.1, 0.2]), "phases must be one number, or one a harmonic, 2; got 3"),
         (lambda: Waveform([1.0], 64), r"values must be a row of at least two numbers; got shape \(1,\)"),
-        (lambda: Waveform([1.0, 2.0], 1.5), "samples must be a number from 2 to 10.6"),
+        (lambda: Waveform([1.0, 2.0], 1.5), "samples must be a number from 2 to 1,000,000"),
         (lambda: Waveform([1.0, 2.0], 64, "yes"), "looped must be True or False; got 'yes'"),
         (lambda: Record(TIME, SHAKEN[:-1]), "acceleration must hold one number a time, 401; got 400"),
         (lambda: Record(TIME**2, SHAKEN), "time must rise by even steps, to 0.001 of one; got steps from"),
@@ -54,7 +54,8 @@ def test_a_record_is_told_in_the_units_of_a_device():
     ("device", "says"),
     [
         (Harvester(omega=np.array([1.0, 2.0])), "omega must be one number with a record; got 2"),
-        (Harvester(omega=600.0), "omega must give the record at least 2 samples a period"),
+        (Harvester(omega=600.0), "omega must give the record 2 to 1,000,000 samples a period .*; lower it"),
+        (Harvester(omega=1e-6), "omega must give the record 2 to 1,000,000 samples a period .*; raise it"),
     ],
 )
 def test_units_that_cannot_be(device, says):
@@ -95,6 +96,7 @@ def test_names_tell_excitations_apart():
 def test_harmonics_add_up():
     f = forcing(Harmonics([1.0, 0.0, 0.4]) + Harmonics([-0.5], math.pi / 2))
     assert f.orders == (1, 3)
+    assert str(sum([Harmonics(), Noise(0.1, 4)])) == str(Harmonics() + Noise(0.1, 4))
     assert f.periodic
     np.testing.assert_allclose(f.cosines + 1j * f.sines, [1.0 - 0.5j, 0.4], atol=1e-15)
     assert not forcing(Harmonics() + Noise(0.1, 4)).periodic

@@ -93,3 +93,20 @@ def test_attractors_want_a_forcing_that_repeats(excitation):
         vijax.orbit_diagram(**ALONG, kappa=40.0, excitation=excitation)
     with pytest.raises(ValueError, match='until must be "window" with an excitation that does not repeat'):
         vijax.basin_fractions(d=0.2, kappa=3.0, excitation=excitation)
+
+
+def test_a_store_is_of_one_excitation(tmp_path):
+    """Whatever excitation a store was made with, a call with another one is refused, the sine too."""
+    from tests.helpers import no_cell_runs
+
+    told = {"d": [0.2, 0.3], "kappa": 10.0, "until": "window", "periods": 5, "outputs": ["P"]}
+    every = [None, SINE, SINE + Noise(0.1, 8), Waveform([0.0, 1.0, 0.5], 8.0)]
+    with no_cell_runs():
+        for i, one in enumerate(every):
+            out = tmp_path / f"{i}.zarr"
+            vijax.sweep(**told, excitation=one, out=out)
+            vijax.sweep(**told, excitation=one, out=out)
+            for other in every:
+                if other is not one:
+                    with pytest.raises(FileExistsError, match="where excitation is"):
+                        vijax.sweep(**told, excitation=other, out=out)

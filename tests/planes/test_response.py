@@ -92,6 +92,13 @@ def test_only_noise_on_what_repeats_has_a_table(excitation):
     assert one.attrs["excitation"] == ("sine" if excitation is None else str(excitation))
 
 
+def test_a_device_that_meets_no_wall_is_drawn(tmp_path):
+    still = response(Harvester(omega=5 * np.pi, omega0=150.0, s=2.0), None, realisations=4, periods=8, transient=2)
+    assert float(still["P"]) == 0
+    assert np.isnan(still["speed_quantile"]).all()
+    vijax.plots.save(vijax.plots.response(still), tmp_path / "still.png")
+
+
 def test_what_cannot_be_is_named():
     with pytest.raises(ValueError, match="realisations must be a whole number of at least 2; got 1"):
         response(DEVICE, NOISY, realisations=1)

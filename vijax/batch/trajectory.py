@@ -117,7 +117,7 @@ def _followed(
     shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves((pair, starts))))
     rows = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), shape).reshape(-1), (pair, starts))
     most = _most(periods) if max_impacts is None else max_impacts
-    chunks = 0 if method is None else -(-method.most_steps(periods, most) // CHUNK)
+    chunks = 0 if method is None else -(-method.most_steps(pair, periods, most) // CHUNK)
     numbers: Any = (np.int32(number) for number in (periods, most, chunks))
     asked = Asked(*numbers)
     wide = tiles.padded(periods)

@@ -17,13 +17,14 @@ from jaxtyping import Array, Int
 
 from vijax.engine import taylor
 from vijax.engine.driven_events import NONE, Decision, DrivenCarry, StepEnd, choose, land, look
-from vijax.engine.forcing import REACHED, Forcing
+from vijax.engine.forcing import REACHED, Draws, Forcing
 from vijax.engine.method import HELD, ImpactOutcome, Method, decided
 from vijax.engine.taylor import Oscillator, Push, Rates
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
-from vijax.model.sides import Sides, at
+from vijax.model.sides import Sides, at, named
+from vijax.runtime import checks
 from vijax.runtime.arrays import Flag, Scalar, present
 from vijax.runtime.xla import share
 
@@ -67,24 +68,31 @@ class Driven(Method[DrivenCarry]):
         """Count the steps so far."""
         return m.steps
 
-    def most_steps(self, periods: int, max_impacts: int) -> int:
-        """Say after how many steps a recorded run is stopped."""
-        return (int(np.max(np.asarray(self.forcing.knots))) + 16) * (periods + HELD) + _PER_IMPACT * max_impacts
+    def most_steps(self, pair: ImpactPair, periods: int, max_impacts: int) -> int:
+        """Say after how many steps a recorded run is stopped: those of a ball that a membrane holds all the time."""
+        knots = int(self.forcing.knots) + 1
+        inside = 0.0
+        if checks.is_concrete(pair.kappa):
+            inside = max(float(np.max(one)) for one in named("kappa", pair._soft_kappa()).values()) * 2 / taylor.REACH
+        return (knots + int(inside) + 16) * (periods + HELD) + _PER_IMPACT * max_impacts
 
     def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> DrivenCarry:
         """Make the carry of a start."""
         zero, whole = jnp.zeros_like(state.u), jnp.zeros_like(state.n)
-        held, side = state.mode != 0, state.mode.astype(zero.dtype)
         n = state.n.astype(zero.dtype)
         k = self.forcing.knot_at(n, state.t)
+        since = jnp.maximum(state.t - (k - n * self.forcing.knots) * self.forcing.gap, 0.0)
+        draws = self.forcing.draws(pair, state, k)
+        mode = self._mode(pair, state, k, since, draws)
+        held, side = mode != 0, mode.astype(zero.dtype)
         x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
         return DrivenCarry(
             x=x,
             z=jnp.where(held, side * state.v, state.v),
             k=k,
-            s=jnp.maximum(state.t - (k - n * self.forcing.knots) * self.forcing.gap, 0.0),
+            s=since,
             n=state.n,
-            mode=state.mode,
+            mode=mode,
             trial=zero + jnp.inf,
             event=zero,
             bracket=zero,
@@ -97,9 +105,17 @@ class Driven(Method[DrivenCarry]):
             left_t=state.t,
             left_n=state.n,
             tangent=_unit(zero) if tangent else None,
-            draws=self.forcing.draws(pair, state, k),
+            draws=draws,
             steps=whole,
         )
+
+    def _mode(self, pair: ImpactPair, state: State, k: Scalar, since: Scalar, draws: Draws | None) -> Int[Array, ""]:
+        """Find the mode of a start: a ball at rest on a wall is held if this forcing, not the sine, pushes it there."""
+        side = jnp.where(state.u < 0, -1.0, 1.0).astype(state.u.dtype)
+        value, rate, *_ = self.forcing.push(pair.gamma, k, since, state.t, draws).derivatives()
+        pushed = side * jnp.where(value == 0, rate, value) > 0
+        rests = (side * state.u == 0.5 * pair.d) & (state.v == 0)
+        return jnp.where(rests, jnp.where(pushed, side, 0.0).astype(state.mode.dtype), state.mode)
 
     def step(
         self, pair: ImpactPair, walls: Oscillator | Sides, m: DrivenCarry, *, recorded: bool = False
@@ -120,7 +136,7 @@ class Driven(Method[DrivenCarry]):
         end = share(taylor.rates(spring, later, *taylor.moved(spring, push, m.x, m.z, s)))
         most = taylor.steepest(spring, self.forcing.bend, now, s)
         ahead = share(look(held, m.work is not None, half, most, now, end, s))
-        choice = decided(lax.stop_gradient(share(choose(m, half, spring, ahead, end, s))))
+        choice = decided(lax.stop_gradient(share(choose(m, half, spring.kappa, ahead, end, s, self.forcing.gap))))
         landing = share(land(choice, half, side, s, end))
         clock = share(self._clock(m, landing.length, to_knot, to_period, choice.goes))
         work, tangent = m.work, m.tangent

@@ -13,15 +13,17 @@ from jaxtyping import Array, Int
 from vijax.engine import taylor
 from vijax.engine.forcing import Draws
 from vijax.engine.roots import converged_step, householder, implicit_root
-from vijax.engine.taylor import Oscillator, Rates
-from vijax.runtime.arrays import Flag, Scalar
+from vijax.engine.taylor import Rates
+from vijax.runtime.arrays import Flag, Scalar, Values
 from vijax.runtime.xla import share
 
 # An event that steps close in on: none, the wall on a side (its sign), the exit, the deepest point of a contact.
 NONE, EXIT, CREST = 0.0, 2.0, 3.0
-# Share of the time since a knot: what is shorter is where rounding holds an event from being certain, and is taken as
-# it comes.
+# Share of the time between two knots: what is shorter is where rounding holds an event from being certain, and is taken
+# as it comes.
 _SHORTEST = 1e-13
+# Roundings of a penetration within which a ball has come to rest.
+_ROUNDING = 64
 
 
 class DrivenCarry(eqx.Module):
@@ -71,16 +73,14 @@ def look(held: Flag, deep: bool, half: Scalar, most: Scalar, now: Rates, end: Ra
     if deep:
         # A contact's deepest point is stopped at: w' must keep its sign, or fall from above 0 to below it.
         slows = taylor.steady_sign((now.a, now.j), most, s)
-        rises = taylor.above((now.z, now.a, now.j, jnp.zeros_like(most)), _third(most, s), s)
-        crest = held & clear & slows & (now.z > 0) & (end.z <= 0)
-        clear = clear & (~held | slows | rises | falls) & ~crest
+        rises = taylor.falling((-now.z, -now.a, -now.j), most, s)
+        # Of a ball that has come to rest inside all but rounding is gone, of which nothing is certain.
+        moves = s * (jnp.abs(now.z) + s * (jnp.abs(now.a) + s * (jnp.abs(now.j) + s * most)))
+        rests = moves < _ROUNDING * jnp.finfo(s.dtype).eps * now.x
+        crest = held & clear & slows & ~rests & (now.z > 0) & (end.z <= 0)
+        clear = clear & (~held | slows | rises | falls | rests) & ~crest
         event = jnp.where(crest, CREST, event)
     return Ahead(clear, event)
-
-
-def _third(most: Scalar, s: Scalar) -> Scalar:
-    """Turn a bound of w'''' into the one that `above` wants of w', whose third derivative it is: s^3/6 as s^4/24."""
-    return 4 * most / s
 
 
 class Decision(NamedTuple):
@@ -99,22 +99,22 @@ class Decision(NamedTuple):
     bracket: Scalar
 
 
-def choose(m: DrivenCarry, half: Scalar, spring: Oscillator, ahead: Ahead, end: Rates, s: Scalar) -> Decision:
-    """Decide what becomes of a step."""
+def choose(m: DrivenCarry, half: Scalar, kappa: Scalar, ahead: Ahead, end: Rates, s: Scalar, gap: Values) -> Decision:
+    """Decide what becomes of a step; `kappa` is 0 in flight, `gap` the time between two knots."""
     eps = jnp.finfo(s.dtype).eps
     closing = m.event != NONE
     event = jnp.where(closing, m.event, ahead.event)
     within = jnp.where(closing, m.bracket, s)
     f, event, within = share((_residual(event, half, end), event, within))
-    short = s < _SHORTEST * (s + m.s)
+    short = s < _SHORTEST * gap
     known = event != NONE
     ahead_of = f[0] > 0
     toward = share(householder(*f[:4]))
     step, small = jnp.abs(toward), converged_step(eps)
-    near = (step * jnp.abs(f[2]) < small * jnp.abs(f[1])) & (step * jnp.maximum(spring.kappa, 1.0) < small)
+    near = (step * jnp.abs(f[2]) < small * jnp.abs(f[1])) & (step * jnp.maximum(kappa, 1.0) < small)
     near = near & (s + toward > 0)
     # A bracket that rounding does not let close any more ends where it is.
-    worn = known & (within < 4 * eps * (m.s + s))
+    worn = known & (within < 4 * eps * gap)
     lands = known & (near | worn)
     delay = jnp.where(lands & near, toward, 0.0)
     # Of a piece too short for any certainty the end tells: outside the ball has arrived, inside it goes on.

@@ -127,8 +127,9 @@ class Forcing(eqx.Module):
             return None
         key = jax.random.key_data(jax.random.key(0))
         words = [half.astype(jnp.uint32) for half in (self.seed[0], self.seed[1])]
-        # -0.0 is 0.0.
-        rounded = ((number + 0.0).astype(jnp.float32) for number in jax.tree.leaves((pair, state.u, state.v)))
+        numbers = jax.tree.leaves((pair, state.u, state.v))
+        # -0.0 is 0.0, but has other bits; a sum with 0.0 would be left out by the compiler.
+        rounded = (jnp.where(number == 0, 0.0, number).astype(jnp.float32) for number in numbers)
         words.extend(lax.bitcast_convert_type(number, jnp.uint32) for number in rounded)
         for word in words:
             key = jax.random.key_data(jax.random.fold_in(jax.random.wrap_key_data(key), word))

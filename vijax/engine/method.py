@@ -160,8 +160,8 @@ class Method(eqx.Module, Generic[C]):
         """Count the steps so far; None where the clock does, as all are of one length."""
         return None
 
-    def most_steps(self, periods: int, max_impacts: int) -> int:
-        """Say after how many steps a recorded run is stopped."""
+    def most_steps(self, pair: ImpactPair, periods: int, max_impacts: int) -> int:
+        """Say after how many steps a recorded run of some cells is stopped."""
         return _PER_IMPACT * (periods + max_impacts)
 
 

@@ -66,7 +66,7 @@ class Rk4(Method[Rk4Carry]):
         """Say whether a step calls no library: it does not, if its membrane does not."""
         return self.law.arithmetic
 
-    def most_steps(self, periods: int, max_impacts: int) -> int:
+    def most_steps(self, pair: ImpactPair, periods: int, max_impacts: int) -> int:
         """Say how many steps a recorded run takes."""
         return int(self.steps) * (periods + HELD)
 

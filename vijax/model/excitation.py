@@ -23,6 +23,8 @@ Samples = Float[AnyArray, "sample"]
 
 # Samples of a measured time may be off so much of their spacing.
 _EVEN = 1e-3
+# Samples a forcing period, at most.
+_MOST = 10**6
 
 
 class Excitation(eqx.Module):
@@ -30,6 +32,10 @@ class Excitation(eqx.Module):
 
     def __add__(self, other: "Excitation") -> "Excitation":
         return Sum((*self.parts, *instance(other).parts))
+
+    def __radd__(self, other: object) -> "Excitation":
+        # `sum` begins with 0.
+        return self if isinstance(other, int) and other == 0 else instance(other) + self
 
     @property
     def parts(self) -> tuple["Excitation", ...]:
@@ -115,8 +121,8 @@ class Waveform(Excitation):
 
     def __init__(self, values: Given, samples: float, looped: bool = True):
         self.values = _samples("values", values)
-        must = "a number from 2 to 10^6, samples a forcing period"
-        self.samples = checks.real("samples", samples, must, lambda x: 2 <= x <= 1e6)
+        must = f"a number from 2 to {_MOST:,}, samples a forcing period"
+        self.samples = checks.real("samples", samples, must, lambda x: 2 <= x <= _MOST)
         self.looped = checks.flag("looped", looped)
 
     @property
@@ -188,12 +194,13 @@ class Record(Excitation):
                 raise ValueError(see("excitation", f"{name} must be one number with a record; got {values.size}"))
             scales[name] = float(values[0])
         samples = 2 * math.pi / (scales["omega"] * self.step)
-        if samples < 2:
+        if not 2 <= samples <= _MOST:
+            advice = "lower it" if samples < 2 else "raise it"
             raise ValueError(
                 see(
                     "excitation",
-                    f"omega must give the record at least 2 samples a period 2 pi/omega, as it is but a unit of time; "
-                    f"got {samples:.3g} at omega = {scales['omega']:g} rad/s; lower it",
+                    f"omega must give the record 2 to {_MOST:,} samples a period 2 pi/omega, as it is but a unit of "
+                    f"time; got {samples:.3g} at omega = {scales['omega']:g} rad/s; {advice}",
                 )
             )
         return Waveform(self.acceleration / scales["A"], samples, self.looped)

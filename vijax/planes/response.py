@@ -63,8 +63,8 @@ def response(
         periods: Forcing periods that are measured, after `transient` of them.
         transient: Forcing periods to drop first.
         bins: Of the distributions.
-        attractors: Whether to find the attractors too: of those that the excitation has without its noise, if that
-            repeats every period, and under noise alone.
+        attractors: Whether to find the attractors that the excitation has without its noise, where it has noise, and
+            what is left of it repeats every period.
         progress: Called with (stages done, stages in all).
 
     Returns:

@@ -20,6 +20,8 @@ from vijax.runtime.pages import see
 if TYPE_CHECKING:
     import xarray as xr
 
+# What is asked only where it is not as usual: where a store has it, a plan without it asks something else.
+_OFTEN_LEFT_OUT = "excitation", "starts"
 _SHOWN = 3  # Settings that differ which an error names; of others it says how many.
 
 
@@ -153,9 +155,11 @@ def check_same(planned: SweepPlan, path: Path) -> None:
 
 def _differences(planned: SweepPlan, store: "xr.Dataset") -> Iterator[str]:
     """Find what was asked otherwise than the store has it, a phrase each."""
-    for name, value in json.loads(json.dumps(asked(planned))).items():
-        if store.attrs.get(name, "left out") != value:
-            yield f"{name} is {store.attrs.get(name, 'left out')}, and not {value}"
+    told = json.loads(json.dumps(asked(planned)))
+    for name in dict.fromkeys([*told, *_OFTEN_LEFT_OUT]):
+        here, there = told.get(name, "left out"), store.attrs.get(name, "left out")
+        if here != there:
+            yield f"{name} is {there}, and not {here}"
     axes = coordinates(planned.cells)
     for name in dict.fromkeys([*axes, *map(str, store.coords)]):
         here, there = axes.get(name), store.coords.get(name)

@@ -49,6 +49,8 @@ def _density(axes: Axes, dataset: "xr.Dataset", axis: str, factor: float, text: 
     seen = density > 0
     axes.errorbar(middle[seen], density[seen], error[seen], fmt=".", color="black", markersize=3, elinewidth=0.6)
     for quantile, value in zip(dataset["quantile"].values, dataset[f"{of}_quantile"].values * factor, strict=True):
+        if np.isnan(value):
+            continue
         axes.axvline(value, color="tab:red", linestyle=":", linewidth=0.8)
         axes.annotate(
             f"{quantile:g}",
@@ -62,9 +64,11 @@ def _density(axes: Axes, dataset: "xr.Dataset", axis: str, factor: float, text: 
             fontsize="x-small",
             color="tab:red",
         )
-    axes.set(xlabel=text, ylabel="probability density", yscale="log", xlim=(0, None))
+    axes.set(xlabel=text, ylabel="probability density", xlim=(0, None))
     if seen.any():
-        axes.set_ylim(density[seen].min() / 3, density[seen].max() * 10)
+        axes.set(yscale="log", ylim=(density[seen].min() / 3, density[seen].max() * 10))
+    else:
+        axes.annotate("no impact", (0.5, 0.5), xycoords="axes fraction", ha="center", va="center")
 
 
 def _attractors(axes: Axes, dataset: "xr.Dataset") -> None:
