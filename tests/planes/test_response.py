@@ -1,10 +1,11 @@
 """What a device does under noise: errors that hold, distributions that add up, basins that are kept to."""
 
+import equinox as eqx
 import numpy as np
 import pytest
 
 import vijax
-from vijax import Harmonics, Harvester, Noise, Waveform, response
+from vijax import Harmonics, Harvester, Noise, Status, Waveform, response, trajectory
 
 DEVICE = Harvester(omega=5 * np.pi, omega0=150.0, s=0.008)  # d 0.2, kappa 30
 MULTISTABLE = Harvester(omega=5 * np.pi, omega0=15.0, s=0.008)
@@ -90,6 +91,24 @@ def test_only_noise_on_what_repeats_has_a_table(excitation):
     assert "time_share" not in one
     assert float(one["P_stderr"]) >= 0
     assert one.attrs["excitation"] == ("sine" if excitation is None else str(excitation))
+
+
+def test_a_realisation_that_fails_counts_nowhere(monkeypatch):
+    """One of five has no room for its impacts: P is that of the four others, and its status says so."""
+    told = {"realisations": 5, "periods": 30, "transient": 6, "attractors": False}
+    whole = response(DEVICE, NOISY, **told)
+
+    def cramped(*args, **kwargs):
+        path = trajectory(*args, **kwargs)
+        return eqx.tree_at(lambda p: p.status, path, path.status.at[2].set(Status.EVENT_BUDGET))
+
+    monkeypatch.setattr("vijax.planes.response.trajectory", cramped)
+    less = response(DEVICE, NOISY, **told)
+    others = np.delete(whole["P_realisation"].values, 2)
+    assert float(less["P"]) == pytest.approx(others.mean())
+    assert np.isnan(less["P_realisation"].values).tolist() == [False, False, True, False, False]
+    assert int(less["status"][2]) == Status.EVENT_BUDGET
+    assert float(less["P_stderr"]) == pytest.approx(others.std(ddof=1) / 2)
 
 
 def test_a_device_that_meets_no_wall_is_drawn(tmp_path):

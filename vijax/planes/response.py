@@ -13,7 +13,7 @@ from vijax.model import energy
 from vijax.model.device import Harvester, one_device
 from vijax.model.excitation import Excitation, Noise, Sum, check_excitation, instance
 from vijax.model.quantities import MEASURED
-from vijax.model.records import State
+from vijax.model.records import State, Status
 from vijax.model.sides import apart
 from vijax.planes import sweep
 from vijax.planes.basins import matched, plan_starts, started
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
 # Realisations are left out in so many groups to find the error of a quantile.
 _GROUPS = 10
+_FAILED = Status.EVENT_BUDGET, Status.NONFINITE
 # Of an attractor's table: what is wanted of it besides the time that is spent there.
 _KEPT = {"label": "label", "period": "period", "P_attractor": "P", "admissible": "admissible"}
 
@@ -72,7 +73,7 @@ def response(
         `impacts_per_period`; `speed_density` over `impact_speed` [m/s] and `penetration_density` over `penetration` [m]
         (middles of bins) with errors; `speed_quantile`, `penetration_quantile` over `quantile` with errors;
         `max_penetration`, `max_impact_speed` of all; `beyond_limit`, the part of impacts that pass the penetration
-        limit, with its error; `status` of every realisation.
+        limit, with its error; `status` of every realisation, of which those that failed count nowhere.
         Over `attractor`, the ones visited longest first: `label`, `period`, `P_attractor` [J per half period] and
         `admissible` of the noiseless motion; `time_share`, the part of the periods that begin in its basin, with its
         error; `losses`, how often it was left; `time_until_lost` [periods], the time there over that, with the
@@ -150,7 +151,8 @@ def _fly(asked: _Asked) -> _Hits:
     start = across * float(pair.d), 2 * SPEED * fast
     run = trajectory(pair, *start, asked.transient + asked.periods, excitation=asked.excitation)
     impacts, states, status = (jax.tree.map(np.asarray, part) for part in (run.impacts, run.states, run.status))
-    real = np.arange(impacts.n.shape[1]) < np.asarray(run.filled)[:, None]
+    # Of a realisation that came to no end what it saw until then says nothing.
+    real = (np.arange(impacts.n.shape[1]) < np.asarray(run.filled)[:, None]) & ~np.isin(status, _FAILED)[:, None]
     of, index = np.nonzero(real & (impacts.n >= asked.transient))
     speed = np.abs(impacts.v_in[of, index]) * float(device.speed_unit)
     depth = impacts.depth[of, index] * float(device.length_unit)
@@ -161,16 +163,17 @@ def _harvest(asked: _Asked, flown: _Hits) -> dict[str, Any]:
     """Find what is harvested, and how often the walls are met."""
     device, periods = asked.device, asked.periods
     energies = np.asarray(energy.harvested_energy(device.at(flown.side), flown.depth))
-    P = np.bincount(flown.of, energies, asked.realisations) / (2 * periods)
-    hits = np.bincount(flown.of, minlength=asked.realisations) / periods
+    every, ended = asked.realisations, ~np.isin(flown.status, _FAILED)
+    P = np.where(ended, np.bincount(flown.of, energies, every) / (2 * periods), np.nan)
+    hits = (np.bincount(flown.of, minlength=every) / periods)[ended]
     watts = float(device.omega) / math.pi
     found = {
-        "P": ((), P.mean(), "J", MEASURED["P"].text),
-        "P_stderr": ((), _error(P), "J", "standard error of P over the realisations"),
-        "power": ((), P.mean() * watts, "W", "harvested power, P omega / pi"),
-        "power_stderr": ((), _error(P) * watts, "W", "standard error of power"),
+        "P": ((), mean := _mean(P[ended]), "J", MEASURED["P"].text),
+        "P_stderr": ((), error := _error(P[ended]), "J", "standard error of P over the realisations"),
+        "power": ((), mean * watts, "W", "harvested power, P omega / pi"),
+        "power_stderr": ((), error * watts, "W", "standard error of power"),
         "P_realisation": ("realisation", P, "J", "harvested energy per half period of every realisation"),
-        "impacts_per_period": ((), hits.mean(), "1", "impacts on both walls per forcing period"),
+        "impacts_per_period": ((), _mean(hits), "1", "impacts on both walls per forcing period"),
         "impacts_per_period_stderr": ((), _error(hits), "1", "standard error of impacts_per_period"),
         "status": ("realisation", flown.status, "1", "how every realisation ended"),
     }
@@ -255,9 +258,15 @@ def _visits(asked: _Asked, quiet: Excitation, flown: _Hits) -> dict[str, Any]:
     return kept | {name: _variable("attractor", values, "1", text) for name, (values, text) in found.items()}
 
 
-def _error(values: np.ndarray, axis: int = 0) -> np.ndarray:
-    """Compute the standard error of a mean."""
-    return values.std(axis=axis, ddof=1) / math.sqrt(values.shape[axis])
+def _mean(values: np.ndarray) -> float:
+    """Compute a mean; NaN of none."""
+    return float(values.mean()) if values.size else math.nan
+
+
+def _error(values: np.ndarray, axis: int = 0) -> Any:
+    """Compute the standard error of a mean; NaN of fewer than two."""
+    count = values.shape[axis]
+    return values.std(axis=axis, ddof=1) / math.sqrt(count) if count > 1 else math.nan
 
 
 def _variable(dims: Any, values: Any, unit: str, text: str) -> Any:
