@@ -162,6 +162,16 @@ def test_samples_need_not_fit_into_the_period():
     assert np.isfinite(one.states.v).all()
 
 
+def test_a_map_tells_time_where_periods_end_between_samples():
+    """Contacts and flights over the end of a period: their lengths are those of the motion, impact by impact."""
+    wave, told = Waveform(ROUGH, 10 * np.pi), {"u0": 0.02, "v0": 0.3, "r": 0.4}
+    found = vijax.sweep(
+        d=0.2, kappa=[9.0, 40.0], **told, excitation=wave, until="window", periods=8, outputs=["contact_time", "P"]
+    )
+    hits = trajectory(impact_pair(0.2, np.array([9.0, 40.0]), 0.4), 0.02, 0.3, 8, excitation=wave).impacts
+    np.testing.assert_allclose(found["contact_time"], np.nanmean(hits.duration, axis=1), rtol=1e-7)
+
+
 def test_a_start_in_contact_and_at_any_phase():
     """Half of a run goes on from where the ball is: between samples in flight, inside a wall in contact."""
     pair, wave = impact_pair(0.1, 4.0, 0.5), Waveform(ROUGH, SAMPLES)
@@ -193,6 +203,10 @@ def test_the_push_of_a_start_is_that_of_its_own_forcing():
     assert int(pushed.impacts.side[0]) == -1
     flight = 2 * float(pushed.impacts.n[0]) + float(pushed.impacts.t[0])
     assert flight == pytest.approx(np.sqrt(2 * 0.3), abs=0.05)
+    # At phase 1 the sine pushes to the left, this one to the right: the ball is held, and no impact begins.
+    held = trajectory(impact_pair(0.3, 20.0, 0.5), 0.15, 0.0, 3, 1.0, excitation=Waveform([-1.0, -1.0, 1.0, 0.5], 4.0))
+    assert int(held.filled) > 0
+    assert (np.abs(held.impacts.v_in)[: int(held.filled)] > 0.01).all()
 
 
 def test_a_ball_that_comes_to_rest_inside_a_membrane():
@@ -287,7 +301,7 @@ def test_noise_is_that_of_its_cell_in_every_plane():
     other = vijax.sweep(d=d, kappa=kappa, **told | {"excitation": SINE + Noise(0.05, 16, seed=8)})["P"]
     assert (other.values != plane.values).all()
     starts = trajectory(
-        impact_pair(0.2, 30.0, 0.5), np.array([0.0, 0.0, 1e-5]), -0.4, 10, excitation=excitation
+        impact_pair(0.2, 30.0, 0.5), np.array([0.0, -0.0, 1e-5]), -0.4, 10, excitation=excitation
     ).states.v
     assert np.array_equal(starts[0], starts[1])
     assert not np.allclose(starts[0], starts[2], atol=1e-3)

@@ -9,6 +9,7 @@ from vijax import Harmonics, Noise, Waveform
 from vijax.batch import chain
 from vijax.engine.driven import Driven
 from vijax.engine.forcing import forcing
+from vijax.model import flow
 
 SINE = Harmonics([1.0, 0.0])
 """The sine, by the method of all other excitations."""
@@ -52,6 +53,19 @@ def test_a_ball_held_for_ever_comes_to_its_steady_motion():
     held = chain.resting(pair, jnp.zeros(2), Driven(forcing(TWO)))
     np.testing.assert_allclose(held.u, path.states.u[:, -1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(held.v, path.states.v[:, -1], rtol=0, atol=1e-11)
+
+
+def test_a_flight_that_meets_no_wall():
+    """Where a round closes, or a diagram hands a ball on, it drifts: as it flies between walls that are far away."""
+    pair, v0, t0 = vijax.impact_pair(1e3, 20.0, 0.5, np.array([0.0, 0.3])), 0.2, 0.7
+    states = vijax.trajectory(pair, 0.0, v0, 3, t0, excitation=TWO).states
+    waves = forcing(TWO).waves(jnp.asarray(t0))
+    for k in range(3):
+        rise, v = flow.drift(waves, pair.gamma, jnp.full(2, v0), jnp.full(2, 2.0 * (k + 1) - t0))
+        np.testing.assert_allclose(rise, states.u[:, k], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(v, states.v[:, k], rtol=0, atol=1e-13)
+    mean = float(flow.mean_velocity(waves, jnp.asarray(v0)))
+    assert mean == pytest.approx(float(states.u[0, 2] - states.u[0, 1]) / 2, abs=1e-13)
 
 
 @pytest.mark.long

@@ -66,8 +66,9 @@ def look(held: Flag, deep: bool, half: Scalar, most: Scalar, now: Rates, end: Ra
     left = half + now.x, now.z, now.a, now.j
     open_first, open_left = taylor.above(first, most, s), held | taylor.above(left, most, s)
     open_first, open_left, falls = share((open_first, open_left, taylor.falling(first[1:], most, s)))
-    closes = falls & (jnp.where(held, end.x, half - end.x) <= 0) & open_left
-    closes_left = ~held & taylor.falling(left[1:], most, s) & (half + end.x <= 0) & open_first
+    # A gap that falls all the way makes the other one grow.
+    closes = falls & (jnp.where(held, end.x, half - end.x) <= 0)
+    closes_left = ~held & taylor.falling(left[1:], most, s) & (half + end.x <= 0)
     event = jnp.where(closes, jnp.where(held, EXIT, 1.0), jnp.where(closes_left, -1.0, NONE))
     clear = open_first & open_left
     if deep:
