@@ -105,6 +105,11 @@ def test_power_map_explains_itself(tmp_path):
     assert "[J per half period]" in bar.get_ylabel()
 
 
+def test_cells_of_a_window_are_not_marked_undecided():
+    window = drawn_map(d=D, kappa=KAPPA).assign_attrs(until="window")
+    assert "undecided" not in words(number_maps.power_map(window))
+
+
 def test_legend_names_only_what_is_there():
     found = drawn_map(d=D, kappa=KAPPA)
     found["period"][:] = 1

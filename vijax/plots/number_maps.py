@@ -263,10 +263,12 @@ def _common_marks(dataset: "xr.Dataset") -> list[Mark]:
         marks.append(Mark(~dataset["admissible"].values, "veil", VEIL, "inadmissible"))
     if "period" in dataset:
         period = dataset["period"].values
+        # Of a window nobody asked what the motion is: it is left undecided everywhere.
+        unknown = (period < 0) & (dataset.attrs.get("until") != "window")
         marks += [
             Mark(period == 1, "border", _LINE, "border of period 1"),
             Mark(period == 0, "most", _DOT, "aperiodic"),
-            Mark(period < 0, "any", _CROSS, "undecided"),
+            Mark(unknown, "any", _CROSS, "undecided"),
         ]
     if "attractors" in dataset:
         marks.append(Mark(dataset["attractors"].values > 1, "border", _LINE, "border of several attractors"))
