@@ -71,6 +71,18 @@ def free(starts: int) -> None:
         _told(f"{ground}, best P of two r over one", best / equal, share)
 
 
+def in_turn(ways: dict[str, Callable[[], Any]], pairs: int) -> dict[str, list[float]]:
+    """Time ways to do something in turn, so often each, after a first time that compiles; give the seconds of each."""
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    for turn in range(pairs + 1):
+        for name, way in ways.items():
+            begun = time.perf_counter()
+            way()
+            if turn:
+                seconds[name].append(time.perf_counter() - begun)
+    return seconds
+
+
 def cost(starts: int) -> None:
     """Compare the program of walls that may differ with that of equal ones, on the same cells."""
     axes = plane(128)
@@ -79,13 +91,7 @@ def cost(starts: int) -> None:
         "equal": lambda: vijax.sweep(**axes, r=r),
         "apart": lambda: vijax.sweep(**axes, r_left=r, r_right=r),
     }
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
-    for turn in range(_PAIRS + 1):
-        for name, way in ways.items():
-            begun = time.perf_counter()
-            way()
-            if turn:
-                seconds[name].append(time.perf_counter() - begun)
+    seconds = in_turn(ways, _PAIRS)
     ratio = statistics.median(b / a for a, b in zip(*seconds.values(), strict=True))
     say(
         "128 x 128 cells with P, seconds of equal walls, of walls that may differ, median ratio of pairs",

@@ -13,7 +13,6 @@ One line a figure.
 
 import argparse
 import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +20,7 @@ import numpy as np
 
 import vijax
 from benchmarks.accelerator import plane
+from benchmarks.asymmetry import in_turn
 from benchmarks.orbits import say
 from vijax import Harmonics, Noise, Waveform
 
@@ -61,13 +61,7 @@ def cost() -> None:
         "two harmonics, counts": ours(Harmonics([1.0, 0.3]), counts),
         "numba RK4, 1,024 steps, counts": numba,
     }
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
-    for turn in range(_PAIRS + 1):
-        for name, way in ways.items():
-            begun = time.perf_counter()
-            way()
-            if turn:
-                seconds[name].append(time.perf_counter() - begun)
+    seconds = in_turn(ways, _PAIRS)
     for name, some in seconds.items():
         peer = statistics.median(b / a for a, b in zip(some, seconds["numba RK4, 1,024 steps, counts"], strict=True))
         us = statistics.median(some) / (d.size * PERIODS) * 1e6

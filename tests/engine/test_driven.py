@@ -15,6 +15,7 @@ from vijax import Harmonics, Noise, Sides, Waveform, impact_pair, trajectory
 from vijax.engine import taylor
 from vijax.engine.taylor import Oscillator, Push
 from vijax.model.records import Status
+from vijax.model.waves import Wave
 
 SAMPLES = 64
 # d, kappa, r, gamma, u0, v0; of two walls the left one first.
@@ -328,7 +329,7 @@ def test_pieces_are_exact_to_rounding(kappa, mu, pace):
     s = taylor.REACH / max(kappa, pace * np.pi, 1.0)
     level, slope, c, q, x, z = 0.7, -3.0, 0.4, -0.9, 1e-3 if kappa > 50 else 0.2, 0.5
     push = (
-        Push(*map(jnp.asarray, (level, slope)), (jnp.asarray(c),), (jnp.asarray(q),), (pace,))
+        Push(*map(jnp.asarray, (level, slope)), (Wave(pace, jnp.asarray(c), jnp.asarray(q)),))
         if pace
         else Push(jnp.asarray(level), jnp.asarray(slope))
     )
@@ -371,7 +372,7 @@ def test_the_fourth_derivative_stays_within_its_bound():
     mu = kappa * g.uniform(0, 2, count)
     level, slope, c, q, x, z = g.normal(size=(6, count)) * np.array([1, 5, 1, 1, 0.1, 0.5])[:, None]
     spring = Oscillator(*map(jnp.asarray, (kappa, kappa**2, mu, kappa)))
-    push = Push(jnp.asarray(level), jnp.asarray(slope), (jnp.asarray(c),), (jnp.asarray(q),), (2,))
+    push = Push(jnp.asarray(level), jnp.asarray(slope), (Wave(2, jnp.asarray(c), jnp.asarray(q)),))
     reach = taylor.REACH / np.maximum(kappa, 2 * np.pi) * g.uniform(0.01, 1, count)
     bend = (2 * np.pi) ** 2 * np.hypot(c, q)
     now = taylor.rates(spring, push, jnp.asarray(x), jnp.asarray(z))

@@ -9,7 +9,7 @@ from vijax import Harmonics, Noise, Waveform
 from vijax.batch import chain
 from vijax.engine.driven import Driven
 from vijax.engine.forcing import forcing
-from vijax.model import flow
+from vijax.model.waves import drift, mean_velocity
 
 SINE = Harmonics([1.0, 0.0])
 """The sine, by the method of all other excitations."""
@@ -59,12 +59,12 @@ def test_a_flight_that_meets_no_wall():
     """Where a round closes, or a diagram hands a ball on, it drifts: as it flies between walls that are far away."""
     pair, v0, t0 = vijax.impact_pair(1e3, 20.0, 0.5, np.array([0.0, 0.3])), 0.2, 0.7
     states = vijax.trajectory(pair, 0.0, v0, 3, t0, excitation=TWO).states
-    waves = forcing(TWO).waves(jnp.asarray(t0))
+    ahead = forcing(TWO).waves(jnp.asarray(t0))
     for k in range(3):
-        rise, v = flow.drift(waves, pair.gamma, jnp.full(2, v0), jnp.full(2, 2.0 * (k + 1) - t0))
+        rise, v = drift(ahead, pair.gamma, jnp.full(2, v0), jnp.full(2, 2.0 * (k + 1) - t0))
         np.testing.assert_allclose(rise, states.u[:, k], rtol=0, atol=1e-13)
         np.testing.assert_allclose(v, states.v[:, k], rtol=0, atol=1e-13)
-    mean = float(flow.mean_velocity(waves, jnp.asarray(v0)))
+    mean = float(mean_velocity(ahead, jnp.asarray(v0)))
     assert mean == pytest.approx(float(states.u[0, 2] - states.u[0, 1]) / 2, abs=1e-13)
 
 

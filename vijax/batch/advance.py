@@ -14,9 +14,9 @@ from vijax.batch.tally import add_event
 from vijax.engine import exact, quick, sampled
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Arrival, Ball, LaneImpact
-from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
+from vijax.model.waves import mean_velocity, sine
 from vijax.runtime import xla
 from vijax.runtime.arrays import choose, present
 
@@ -99,7 +99,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
         matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
     after = out.state
     # A flight that drifts comes to a wall after the horizon.
-    late = out.quiet & ~neutral(pair, flow.mean_velocity(flow.sine(ball.t), ball.v))
+    late = out.quiet & ~neutral(pair, mean_velocity(sine(ball.t), ball.v))
     impact = LaneImpact(
         onset_t=out.impact.t,
         onset_n=jnp.where(late, jnp.inf, ball.n + out.impact.n.astype(ball.n.dtype)),

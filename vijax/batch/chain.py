@@ -16,6 +16,7 @@ from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import START_REACH
 from vijax.model.records import Status
+from vijax.model.waves import drift, held_response
 from vijax.runtime.arrays import choose, present
 
 
@@ -85,7 +86,7 @@ def hand_over(settings: Settings, cell: Cell, periodic: Mask, failed: Mask, end:
     last = choose(periodic, old.last, cell.ball)
     aloft = last.n < end
     left = jnp.where(aloft, 2 * (end - last.n) - last.t, 0.0)
-    rise, v = flow.drift(waves_of(settings.method, last.t), pair.gamma, last.v, left)
+    rise, v = drift(waves_of(settings.method, last.t), pair.gamma, last.v, left)
     ball = Ball(last.u + rise, v, jnp.where(aloft, 0.0, last.t), end)
     ball = choose(permanent, resting(pair, end, settings.method), ball)
     first = end - present(settings.recorded_periods)
@@ -105,7 +106,7 @@ def resting(pair: ImpactPair, end: Lane, method: Method | None = None) -> Ball:
 
     def soft(wall: ImpactPair) -> tuple:
         def steady(wall, side):
-            return flow.held_response(flow.membrane(wall), waves_of(method, jnp.zeros_like(side)), side, wall.gamma)
+            return held_response(flow.membrane(wall), waves_of(method, jnp.zeros_like(side)), side, wall.gamma)
 
         return jax.vmap(steady)(wall, side)
 

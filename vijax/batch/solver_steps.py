@@ -13,9 +13,9 @@ from vijax.batch.cell_end import last_period, out_of_steps
 from vijax.batch.tally import add_event
 from vijax.engine.impact import Ball, LaneImpact
 from vijax.engine.method import Method
-from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
+from vijax.model.waves import mean_velocity
 from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share
 
@@ -60,7 +60,7 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
     idle = cell.running & ~course.waits
     out = idle & (carry.mode == 0) & (late >= (QUIET if cell.candidate is not None else 0))
     # A forcing that does not repeat leaves no ball alone for ever.
-    mean = flow.mean_velocity(method.waves(cell.ball.t), cell.ball.v)
+    mean = mean_velocity(method.waves(cell.ball.t), cell.ball.v)
     quiet = out & neutral(cell.pair, mean) & method.repeats
     permanent = idle & (carry.mode != 0) & (late >= QUIET)
     lane_impact = LaneImpact(

@@ -23,7 +23,7 @@ class Summary(eqx.Module):
     P_stderr: Float[AnyArray, "cell variant"] | None
     energy_ratio: Float[AnyArray, "cell variant"] | None  # largest E_j/W_j
     deepest: Float[AnyArray, "cell"] | None
-    deepest_left: Float[AnyArray, "cell"] | None  # at the left wall alone, known only where the walls may differ
+    deepest_left: Float[AnyArray, "cell"] | None  # the greatest at the left wall; None where both walls are equal
     deepest_right: Float[AnyArray, "cell"] | None
     fastest: Float[AnyArray, "cell"]
     asymmetry: Float[AnyArray, "cell"] | None  # mean of v_in over the greatest speed

@@ -9,6 +9,7 @@ from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Setting
 from vijax.batch.recurrence import grain, recurrence, settled
 from vijax.engine.method import Method, waves_of
 from vijax.model import flow
+from vijax.model.waves import drift
 from vijax.runtime.arrays import present
 
 # Newton rounds on one candidate, each an orbit long. The digits double in each: what has none after so many is no
@@ -103,7 +104,7 @@ def correction(cell: Cell, method: Method | None) -> Correction:
     m = jnp.stack([jnp.stack(tangent[:2], -1), jnp.stack(tangent[2:], -1)], -2) * grown[:, None, None]
     # The round ended at an exit; fly on (or back) to the phase at which it began.
     rest = 2 * (c.base.n + c.laps * c.period - cell.ball.n) + (c.base.t - cell.ball.t)
-    rise, v = flow.drift(waves_of(method, cell.ball.t), cell.pair.gamma, cell.ball.v, rest)
+    rise, v = drift(waves_of(method, cell.ball.t), cell.pair.gamma, cell.ball.v, rest)
     m = jax.vmap(flow.flight_matrix)(rest) @ m
     miss_u, miss_v = cell.ball.u + rise - c.base.u, v - c.base.v
     a, b, e, d = 1 - m[:, 0, 0], -m[:, 0, 1], -m[:, 1, 0], 1 - m[:, 1, 1]

@@ -16,14 +16,14 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from vijax.engine import taylor
-from vijax.engine.driven_events import NONE, Decision, DrivenCarry, StepEnd, choose, land, look
+from vijax.engine.driven_events import NONE, Ahead, Decision, DrivenCarry, StepEnd, choose, land, look, residual
 from vijax.engine.forcing import REACHED, Draws, Forcing
-from vijax.engine.method import HELD, ImpactOutcome, Method, decided
+from vijax.engine.method import HELD, ImpactOutcome, Method, decided, finished
 from vijax.engine.taylor import Oscillator, Push, Rates
-from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.model.records import Impact, State
+from vijax.model.records import State
 from vijax.model.sides import Sides, at, named
+from vijax.model.waves import Waves
 from vijax.runtime import checks
 from vijax.runtime.arrays import Flag, Scalar, present
 from vijax.runtime.xla import share
@@ -135,9 +135,12 @@ class Driven(Method[DrivenCarry]):
         now, later = share(taylor.rates(spring, push, m.x, m.z)), push.later(s)
         end = share(taylor.rates(spring, later, *taylor.moved(spring, push, m.x, m.z, s)))
         most = taylor.steepest(spring, self.forcing.bend, now, s)
-        ahead = share(look(held, m.work is not None, half, most, now, end, s))
-        choice = decided(lax.stop_gradient(share(choose(m, half, spring.kappa, ahead, end, s, self.forcing.gap))))
-        landing = share(land(choice, half, side, s, end))
+        ahead = look(held, m.work is not None, half, most, now, end, s)
+        ahead = share(Ahead(ahead.clear, jnp.where(m.event != NONE, m.event, ahead.event)))
+        f = share(residual(ahead.event, half, end))
+        told = m, half, spring.kappa, ahead, end, f, s, self.forcing.gap
+        choice = decided(lax.stop_gradient(share(choose(*told))))
+        landing = share(land(choice, half, side, s, end, f))
         clock = share(self._clock(m, landing.length, to_knot, to_period, choice.goes))
         work, tangent = m.work, m.tangent
         if work is not None:
@@ -146,7 +149,8 @@ class Driven(Method[DrivenCarry]):
         if tangent is not None:
             carried = _spread(spring, push, later, m, s, landing.delay, _kick(walls, side, landing))
             tangent = tuple(jnp.where(choice.goes, new, old) for new, old in zip(carried, tangent, strict=True))
-        outcome = _outcome(m, half, side, landing.there.z, clock, work, tangent)
+        after = State(side * half, side * landing.there.z, clock.t, clock.n, jnp.zeros_like(m.mode))
+        outcome = finished(m, side, after, _given(m, after.v, work), tangent)
         m = replace(m, work=work, tangent=tangent, draws=self.forcing.drawn(m.draws, m.k, clock.k))
         return _gone_on(m, choice, landing, clock), outcome, landing.exits & m.entered
 
@@ -157,7 +161,7 @@ class Driven(Method[DrivenCarry]):
         t = jnp.maximum(2 - self._to_period(m), 0.0)
         return State(u, jnp.where(held, side * m.z, m.z), t, m.n, m.mode)
 
-    def waves(self, t: Any) -> flow.Waves:
+    def waves(self, t: Any) -> Waves:
         """Give the harmonics of the forcing from phase t on."""
         return self.forcing.waves(t)
 
@@ -272,28 +276,6 @@ def _spread(
     return p, q, r + kick * p, t + kick * q
 
 
-def _outcome(
-    m: DrivenCarry,
-    half: Scalar,
-    side: Scalar,
-    rate: Scalar,
-    clock: _Clock,
-    work: Scalar | None,
-    tangent: tuple[Scalar, ...] | None,
-) -> ImpactOutcome:
-    """Record the impact that ends now with the penetration falling at a rate."""
-    v_out, t, n = side * rate, clock.t, clock.n
-    # What the membrane got is what the ball lost and what the push gave meanwhile.
-    given = jnp.zeros_like(half) if work is None else 0.5 * (m.v_in * m.v_in - v_out * v_out) + work
-    impact = Impact(
-        n=m.onset_n,
-        t=m.onset_t,
-        side=side.astype(m.mode.dtype),
-        v_in=m.v_in,
-        v_out=v_out,
-        depth=m.depth,
-        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
-        work=given,
-    )
-    flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
-    return ImpactOutcome(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), tangent)
+def _given(m: DrivenCarry, v_out: Scalar, work: Scalar | None) -> Scalar:
+    """Compute what the membrane got: what the ball lost, and what the push gave meanwhile."""
+    return jnp.zeros_like(v_out) if work is None else 0.5 * (m.v_in * m.v_in - v_out * v_out) + work

@@ -100,13 +100,31 @@ class Decision(NamedTuple):
     bracket: Scalar
 
 
-def choose(m: DrivenCarry, half: Scalar, kappa: Scalar, ahead: Ahead, end: Rates, s: Scalar, gap: Values) -> Decision:
-    """Decide what becomes of a step; `kappa` is 0 in flight, `gap` the time between two knots."""
+def residual(event: Scalar, half: Scalar, end: Rates) -> tuple[Scalar, ...]:
+    """Give what falls through 0 at the event, and its derivatives, at the end of a step."""
+    zero = jnp.zeros_like(end.x)
+    toward = jnp.where(event == EXIT, 1.0, -event)
+    wall = (jnp.where(event == EXIT, 0.0, half) + toward * end.x, *(toward * f for f in end[1:]))
+    crest = (end.z, end.a, end.j, end.snap, zero)
+    return tuple(jnp.where(event == CREST, f, g) for f, g in zip(crest, wall, strict=True))
+
+
+def choose(
+    m: DrivenCarry, half: Scalar, kappa: Scalar, ahead: Ahead, end: Rates, f: tuple[Scalar, ...], s: Scalar, gap: Values
+) -> Decision:
+    """Decide what becomes of a step.
+
+    Args:
+        m: The carry before it.
+        half: Half of the gap.
+        kappa: Of the membrane that the ball is in; 0 in flight.
+        ahead: What is certain; of a lane that closes in, the event that it closes in on.
+        end, f: Where the step ends, and the `residual` there.
+        s, gap: Its length, and the time between two knots.
+    """
     eps = jnp.finfo(s.dtype).eps
     closing = m.event != NONE
-    event = jnp.where(closing, m.event, ahead.event)
-    within = jnp.where(closing, m.bracket, s)
-    f, event, within = share((_residual(event, half, end), event, within))
+    event, within = ahead.event, jnp.where(closing, m.bracket, s)
     short = s < _SHORTEST * gap
     known = event != NONE
     ahead_of = f[0] > 0
@@ -131,15 +149,6 @@ def choose(m: DrivenCarry, half: Scalar, kappa: Scalar, ahead: Ahead, end: Rates
     next_try = jnp.where(inside, guess, 0.5 * left)
     trial = jnp.where(known & ~lands, next_try, jnp.where(lands, jnp.inf, jnp.where(goes, 2 * s, 0.5 * s)))
     return Decision(goes, lands, event, delay, trial, jnp.where(known & ~lands, left, 0.0))
-
-
-def _residual(event: Scalar, half: Scalar, end: Rates) -> tuple[Scalar, ...]:
-    """Give what falls through 0 at the event, and its derivatives, at the end of a step."""
-    zero = jnp.zeros_like(end.x)
-    toward = jnp.where(event == EXIT, 1.0, -event)
-    wall = (jnp.where(event == EXIT, 0.0, half) + toward * end.x, *(toward * f for f in end[1:]))
-    crest = (end.z, end.a, end.j, end.snap, zero)
-    return tuple(jnp.where(event == CREST, f, g) for f, g in zip(crest, wall, strict=True))
 
 
 def _outside(m: DrivenCarry, half: Scalar, end: Rates) -> Scalar:
@@ -170,9 +179,8 @@ class StepEnd(NamedTuple):
     toward: Scalar
 
 
-def land(choice: Decision, half: Scalar, side: Scalar, s: Scalar, end: Rates) -> StepEnd:
+def land(choice: Decision, half: Scalar, side: Scalar, s: Scalar, end: Rates, f: tuple[Scalar, ...]) -> StepEnd:
     """End a step: where it is, or at the event `delay` later. The time of an event is a function of where that is."""
-    f = _residual(choice.event, half, end)
     usable = choice.lands & (f[1] != 0)
     safe = (f[0], jnp.where(usable, f[1], -1.0), *f[2:])
     delay = jnp.where(usable, implicit_root(lambda s, of: taylor.closed(of, s), choice.delay, safe), choice.delay)

@@ -16,9 +16,10 @@ from jaxtyping import Array, Float
 from vijax.engine import taylor
 from vijax.engine.taylor import Push
 from vijax.model.excitation import Excitation, Harmonics, Noise, Waveform
-from vijax.model.flow import PI, Wave, Waves, half_turn
+from vijax.model.flow import PI
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
+from vijax.model.waves import Wave, Waves
 from vijax.runtime.arrays import AnyArray, Scalar, Values, present
 from vijax.runtime.tiles import padded
 from vijax.runtime.xla import share
@@ -90,17 +91,12 @@ class Forcing(eqx.Module):
                 rise = (after - before) * (1 / (every * self.gap))
                 gone = since if every == 1 else (k - every * jnp.floor(k / every)) * self.gap + since
                 level, slope = level + before + rise * gone, slope + rise
-        waves = self.waves(phase)
-        along, across = tuple(wave.c for wave in waves), tuple(wave.q for wave in waves)
-        return share(Push(level, slope, along, across, self.orders))
+        return share(Push(level, slope, self.waves(phase)))
 
     def waves(self, phase: Values) -> Waves:
         """List the harmonics from a phase on; of any shape."""
-        found = []
-        for k, c, q in zip(self.orders, self.cosines, self.sines, strict=True):
-            sine, cosine, _, _ = half_turn(k * phase)
-            found.append(Wave(k, c * cosine - q * sine, q * cosine + c * sine))
-        return tuple(found)
+        each = zip(self.orders, self.cosines, self.sines, strict=True)
+        return tuple(Wave(k, c, q).later(phase) for k, c, q in each)
 
     def _sampled(self, k: Scalar) -> tuple[Scalar, Scalar] | None:
         """Look up the samples before and after a knot."""

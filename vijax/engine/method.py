@@ -13,10 +13,10 @@ import jax
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vijax.model import flow
 from vijax.model.membrane import Linear, MembraneLaw
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
+from vijax.model.waves import Waves, sine
 from vijax.runtime.arrays import Flag, Scalar
 
 # A method that chooses its steps and takes more of them per impact and period is stopped.
@@ -84,6 +84,34 @@ class Carry(Protocol):
         """Say how deep it has been in this contact so far."""
 
 
+class ContactCarry(Protocol):
+    """What the record of an impact reads of a carry: its contact, and when the ball left the wall before."""
+
+    onset_t: Any
+    onset_n: Any
+    v_in: Any
+    depth: Any
+    left_t: Any
+    left_n: Any
+
+
+def finished(m: ContactCarry, side: Any, after: State, work: Any, tangent: tuple[Any, ...] | None) -> ImpactOutcome:
+    """Record the impact of a carry that ends on the wall of a side, with the ball in the state `after` it."""
+    t, n = after.t, after.n
+    impact = Impact(
+        n=m.onset_n,
+        t=m.onset_t,
+        side=side.astype(n.dtype),
+        v_in=m.v_in,
+        v_out=after.v,
+        depth=m.depth,
+        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
+        work=work,
+    )
+    flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
+    return ImpactOutcome(impact, flight, after, tangent)
+
+
 C = TypeVar("C", bound=Carry)
 
 
@@ -137,9 +165,9 @@ class Method(eqx.Module, Generic[C]):
     def ball(self, pair: ImpactPair, carry: C) -> State:
         """Say where the ball of a carry is."""
 
-    def waves(self, t: Any) -> flow.Waves:
+    def waves(self, t: Any) -> Waves:
         """Give the harmonics of the forcing from phase t on; of any shape."""
-        return flow.sine(t)
+        return sine(t)
 
     @property
     def repeats(self) -> bool:
@@ -165,6 +193,6 @@ class Method(eqx.Module, Generic[C]):
         return _PER_IMPACT * (periods + max_impacts)
 
 
-def waves_of(method: Method | None, t: Any) -> flow.Waves:
+def waves_of(method: Method | None, t: Any) -> Waves:
     """Give the harmonics of a method's forcing from phase t on; the exact engine, None, knows the sine alone."""
-    return flow.sine(t) if method is None else method.waves(t)
+    return sine(t) if method is None else method.waves(t)

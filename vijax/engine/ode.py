@@ -17,12 +17,12 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from vijax.engine.dense_output import SolverState, dense_output
-from vijax.engine.method import ImpactOutcome, Method, decided
+from vijax.engine.method import ImpactOutcome, Method, decided, finished
 from vijax.engine.ode_events import LONGEST, OdeCarry, Sight, Trial, land, look, meet
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair, Real
-from vijax.model.records import Impact, State
+from vijax.model.records import State
 from vijax.model.sides import Sides, at, named
 from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
@@ -145,10 +145,9 @@ class Ode(Method[OdeCarry]):
         side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
         wall = at(walls, side)
         trial = _try(self, _solver(self, recorded), m, FieldArguments(pair.gamma, m.mode, wall), recorded)
-        landing = land(m, half, trial)
         sight = look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
         # Nearly all that follows reads both: without `share` XLA would compute them again for each reader.
-        landing, sight = share((landing, sight))
+        landing, sight = share((land(m, half, trial), sight))
         shut = landing.onset | landing.exits
         # A step on whose way something happens is not taken but tried again, up to there. One that was cut for an event
         # and has met it is taken as it is: what its dense output shows there is that same event.
@@ -160,7 +159,8 @@ class Ode(Method[OdeCarry]):
         over = decided(t >= 2)
         t = jnp.where(moved, jnp.where(over, t - 2, t), m.t)
         n = m.n + (moved & over).astype(m.n.dtype)
-        outcome = _outcome(m, half, side, y, t, n, landing.speed)
+        after = State(side * half, -side * landing.speed, t, n, jnp.zeros_like(m.mode))
+        outcome = finished(m, side, after, jnp.zeros_like(half) if y.work is None else y.work, y.tangent)
         # A step so short will never pass: this cell would hold its lane for ever. NaN compares false, and is lost too.
         lost = ~moved & ~(trial.h > _VANISHING * jnp.finfo(half.dtype).eps)
         outcome = eqx.tree_at(lambda p: p.impact.v_out, outcome, jnp.where(lost, jnp.nan, outcome.impact.v_out))
@@ -263,22 +263,3 @@ def _lengths(engine: Ode, m: OdeCarry, trial: Trial, sight: Sight, seen: Flag, m
     after = jnp.where(shut, m.other, jnp.where(moved, ahead, trial.h_next))
     h = jnp.where(seen, sight.theta * trial.h, after)
     return lax.stop_gradient((h, jnp.where(seen, ahead, m.full), jnp.where(shut, m.full, m.other)))
-
-
-def _outcome(
-    m: OdeCarry, half: Scalar, side: Scalar, y: SolverState, t: Scalar, n: Int[Array, ""], speed: Scalar
-) -> ImpactOutcome:
-    """Record the impact that ends at (t, n) with the ball leaving at a speed."""
-    zero, v_out = jnp.zeros_like(half), -side * speed
-    impact = Impact(
-        n=m.onset_n,
-        t=m.onset_t,
-        side=side.astype(m.mode.dtype),
-        v_in=m.v_in,
-        v_out=v_out,
-        depth=m.depth,
-        duration=(t - m.onset_t) + 2 * (n - m.onset_n).astype(t.dtype),
-        work=zero if y.work is None else y.work,
-    )
-    flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
-    return ImpactOutcome(impact, flight, State(side * half, v_out, t, n, jnp.zeros_like(m.mode)), y.tangent)

@@ -20,11 +20,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vijax.engine.method import HELD, ImpactOutcome, Method, decided
+from vijax.engine.method import HELD, ImpactOutcome, Method, decided, finished
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, Real
-from vijax.model.records import Impact, State
+from vijax.model.records import State
 from vijax.model.sides import Sides, at
 from vijax.runtime.arrays import Scalar
 from vijax.runtime.xla import share
@@ -108,7 +108,7 @@ class Rk4(Method[Rk4Carry]):
         power = _power(pair, walls, m.u, m.v) + _power(pair, walls, new.u, new.v)
         work = jnp.where(onset, 0.0, m.work + 0.5 * h * power)
         t = m.offset + new.k * h
-        outcome = _outcome(replace(new, mode=mode, work=work), m.mode, t)
+        outcome = finished(new, m.mode, State(new.u, new.v, t, new.n, mode), work, new.tangent)
         # A ball that leaves begins a new tangent map: that of an impact is from exit to exit.
         tangent = new.tangent
         if tangent is not None:
@@ -175,19 +175,3 @@ def _power(pair: ImpactPair, walls: Wall | Sides, u: Scalar, v: Scalar) -> Scala
     along = jnp.where(u < 0, -v, v)
     depth = jnp.abs(u) - 0.5 * pair.d
     return jnp.where(depth >= 0, -at(walls, u)(depth, along) * along, 0.0)
-
-
-def _outcome(m: Rk4Carry, side: Int[Array, ""], t: Scalar) -> ImpactOutcome:
-    """Record the impact on a wall that ends with this sample, the first one outside, at a time t."""
-    impact = Impact(
-        n=m.onset_n,
-        t=m.onset_t,
-        side=side,
-        v_in=m.v_in,
-        v_out=m.v,
-        depth=m.depth,
-        duration=(t - m.onset_t) + 2 * (m.n - m.onset_n).astype(t.dtype),
-        work=m.work,
-    )
-    flight = (m.onset_t - m.left_t) + 2 * (m.onset_n - m.left_n).astype(t.dtype)
-    return ImpactOutcome(impact, flight, State(m.u, m.v, t, m.n, m.mode), m.tangent)

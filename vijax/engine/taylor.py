@@ -8,9 +8,11 @@ numbers (`above`, `falling`), however f came about.
 import math
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 
-from vijax.model.flow import PI, half_turn
+from vijax.model.flow import PI
+from vijax.model.waves import Waves
 from vijax.runtime.arrays import Flags, Values
 from vijax.runtime.xla import shared
 
@@ -20,44 +22,34 @@ TERMS = 19
 _OVER_FACTORIAL = tuple(1.0 / math.factorial(n) for n in range(TERMS + 1))
 
 
-class Push(NamedTuple):
-    """What pushes the ball from some moment on, until the next knot: a straight line and harmonics of the forcing.
-
-    f(s) = level + slope s + sum over k in `orders` of along_k cos(k pi s) - across_k sin(k pi s)
+class Push(eqx.Module):
+    """What pushes the ball from some moment on, until the next knot: a straight line, and harmonics of the forcing.
 
     Attributes:
-        level, slope: Of the line; gravity is part of it.
-        along, across: One value a harmonic.
-        orders: Which multiple of the forcing frequency each one is; whole numbers.
+        level, slope: Of the line level + slope s; gravity is part of it.
+        waves: The harmonics.
     """
 
     level: Values
     slope: Values
-    along: tuple[Values, ...] = ()
-    across: tuple[Values, ...] = ()
-    orders: tuple[int, ...] = ()
+    waves: Waves = ()
 
     def turned(self, sign: Values) -> "Push":
         """Give the push as a wall of that sign sees it."""
-        along, across = (tuple(sign * one for one in part) for part in (self.along, self.across))
-        return Push(sign * self.level, sign * self.slope, along, across, self.orders)
+        return Push(sign * self.level, sign * self.slope, tuple(wave.times(sign) for wave in self.waves))
 
     def later(self, s: Values) -> "Push":
         """Start its clock a time s later."""
-        along, across = [], []
-        for k, c, q in zip(self.orders, self.along, self.across, strict=True):
-            sine, cosine, _, _ = half_turn(k * s)
-            along.append(c * cosine - q * sine)
-            across.append(q * cosine + c * sine)
-        return Push(self.level + self.slope * s, self.slope, tuple(along), tuple(across), self.orders)
+        return Push(self.level + self.slope * s, self.slope, tuple(wave.later(s) for wave in self.waves))
 
     def derivatives(self) -> tuple[Values, Values, Values, Values]:
-        """Compute f, f', f'' and f''' now."""
+        """Compute its value and the first three derivatives now."""
         value, rate, bend = self.level, self.slope, jnp.zeros_like(self.level)
         twist = bend
-        for k, c, q in zip(self.orders, self.along, self.across, strict=True):
-            pace = k * PI
-            value, rate, bend, twist = value + c, rate - pace * q, bend - pace**2 * c, twist + pace**3 * q
+        for wave in self.waves:
+            pace = wave.order * PI
+            value, rate = value + wave.c, rate - pace * wave.q
+            bend, twist = bend - pace**2 * wave.c, twist + pace**3 * wave.q
         return value, rate, bend, twist
 
 
@@ -102,17 +94,17 @@ def moved(spring: Oscillator, push: Push, x: Values, z: Values, s: Values) -> tu
     """
     loss, stiffness = spring.mu * s, spring.square * s * s
     value, *_ = push.derivatives()
-    turns = [-((k * PI * s) ** 2) for k in push.orders]
+    turned = [wave.order * PI * s for wave in push.waves]
     # What f^(n) s^(n + 1) is made of: the line ends with its slope, harmonics recur after two steps.
-    even = [s * c for c in push.along]
-    odd = [-(k * PI * s) * (s * q) for k, q in zip(push.orders, push.across, strict=True)]
+    even = [s * wave.c for wave in push.waves]
+    odd = [-turn * (s * wave.q) for turn, wave in zip(turned, push.waves, strict=True)]
     b, after = z, s * (value - spring.mu * z - spring.square * x)
     far, fast = jnp.zeros_like(x), jnp.zeros_like(x)
     for n in range(1, TERMS + 1):
         far, fast = far + _OVER_FACTORIAL[n] * b, fast + _OVER_FACTORIAL[n - 1] * b
         drive = sum(odd, s * s * push.slope if n == 1 else jnp.zeros_like(s))
         b, after = after, drive - loss * after - stiffness * b
-        even, odd = odd, [turn * e for turn, e in zip(turns, even, strict=True)]
+        even, odd = odd, [-turn * turn * e for turn, e in zip(turned, even, strict=True)]
     return x + s * far, fast
 
 

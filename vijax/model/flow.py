@@ -5,7 +5,7 @@ exactly the digits that the naive forms lose.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -141,46 +141,6 @@ def flight(force: Force, v0: Values, s: Values) -> tuple[Values, Values]:
     return rise, v0 - force.g * s + (force.c * sin_s - force.q * versine) / PI
 
 
-class Wave(NamedTuple):
-    """A harmonic of the forcing from some phase on: c cos(k pi s) - q sin(k pi s) at elapsed time s."""
-
-    order: int
-    c: Values
-    q: Values
-
-    def slowed(self) -> Force:
-        """Give it on a clock that runs k times as fast, on which it is the first harmonic."""
-        return Force(self.c, self.q, jnp.zeros_like(self.c))
-
-
-Waves = tuple[Wave, ...]
-
-
-def sine(t: Values) -> Waves:
-    """Give the paper's forcing, cos(pi t), from a phase on."""
-    sin_t, cos_t, _, _ = half_turn(t)
-    return (Wave(1, cos_t, sin_t),)
-
-
-def drift(waves: Waves, gamma: Values, v: Values, s: Values) -> tuple[Values, Values]:
-    """Compute how far a ball of velocity v flies in a time s that meets no wall, and its velocity then."""
-    zero = jnp.zeros_like(s)
-    first = next((wave for wave in waves if wave.order == 1), Wave(1, zero, zero))
-    rise, speed = flight(Force(first.c, first.q, gamma), v, s)
-    for wave in waves:
-        if wave.order != 1:
-            further, faster = flight(wave.slowed(), zero, wave.order * s)
-            rise, speed = rise + further / wave.order**2, speed + faster / wave.order
-    return rise, speed
-
-
-def mean_velocity(waves: Waves, v: Values) -> Values:
-    """Compute the velocity of a flight on level ground over a whole period, from that at the moment of the waves."""
-    for wave in waves:
-        v = v - wave.q / (wave.order * PI)
-    return v
-
-
 def acceleration(gamma: Values, t: Values) -> Values:
     """Compute the acceleration in flight, cos(pi t) - gamma."""
     return half_turn(t)[1] - gamma
@@ -309,17 +269,6 @@ def steady_response(m: Membrane, force: Force) -> Force:
         (stiffness * force.q - loss * force.c) / square,
         force.g / (m.kappa * m.kappa),
     )
-
-
-def held_response(m: Membrane, waves: Waves, side: Values, gamma: Values) -> tuple[Values, Values]:
-    """Compute penetration and rate of a ball that never leaves a membrane, once only its steady motion is left."""
-    zero = jnp.zeros_like(side)
-    w, z = -side * gamma / (m.kappa * m.kappa), zero
-    for k, c, q in waves:
-        slowed = Membrane(m.kappa / k, m.zeta / k, m.omega1 / k, m.rolled)
-        response = steady_response(slowed, Force(side * c / k**2, side * q / k**2, zero))
-        w, z = w + response.at(zero), z + k * response.slope().at(zero)
-    return w, z
 
 
 def flight_matrix(s: Values) -> Float[Array, "2 2"]:

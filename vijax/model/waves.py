@@ -1,0 +1,73 @@
+"""The harmonics of the forcing, and what a ball does under them that meets no wall, or never leaves one."""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from vijax.model.flow import PI, Force, Membrane, flight, half_turn, steady_response
+from vijax.runtime.arrays import Values
+
+
+class Wave(eqx.Module):
+    """A harmonic of the forcing from some moment on: c cos(k pi s) - q sin(k pi s) at elapsed time s.
+
+    Attributes:
+        order: k, which multiple of the forcing frequency it is.
+        c, q: Its parts in phase and a quarter turn behind.
+    """
+
+    order: int = eqx.field(static=True)
+    c: Values
+    q: Values
+
+    def later(self, s: Values) -> "Wave":
+        """Start its clock a time s later."""
+        sine, cosine, _, _ = half_turn(self.order * s)
+        return Wave(self.order, self.c * cosine - self.q * sine, self.q * cosine + self.c * sine)
+
+    def times(self, factor: Values) -> "Wave":
+        """Make it so many times as large."""
+        return Wave(self.order, factor * self.c, factor * self.q)
+
+    def slowed(self) -> Force:
+        """Give it on a clock that runs k times as fast, on which it is the first harmonic."""
+        return Force(self.c, self.q, jnp.zeros_like(self.c))
+
+
+Waves = tuple[Wave, ...]
+
+
+def sine(t: Values) -> Waves:
+    """Give the paper's forcing, cos(pi t), from a phase on."""
+    sin_t, cos_t, _, _ = half_turn(t)
+    return (Wave(1, cos_t, sin_t),)
+
+
+def drift(waves: Waves, gamma: Values, v: Values, s: Values) -> tuple[Values, Values]:
+    """Compute how far a ball of velocity v flies in a time s that meets no wall, and its velocity then."""
+    zero = jnp.zeros_like(s)
+    first = next((wave for wave in waves if wave.order == 1), Wave(1, zero, zero))
+    rise, speed = flight(Force(first.c, first.q, gamma), v, s)
+    for wave in waves:
+        if wave.order != 1:
+            further, faster = flight(wave.slowed(), zero, wave.order * s)
+            rise, speed = rise + further / wave.order**2, speed + faster / wave.order
+    return rise, speed
+
+
+def mean_velocity(waves: Waves, v: Values) -> Values:
+    """Compute the velocity of a flight on level ground over a whole period, from that at the moment of the waves."""
+    for wave in waves:
+        v = v - wave.q / (wave.order * PI)
+    return v
+
+
+def held_response(m: Membrane, waves: Waves, side: Values, gamma: Values) -> tuple[Values, Values]:
+    """Compute penetration and rate of a ball that never leaves a membrane, once only its steady motion is left."""
+    zero = jnp.zeros_like(side)
+    w, z = -side * gamma / (m.kappa * m.kappa), zero
+    for wave in waves:
+        k = wave.order
+        slowed = Membrane(m.kappa / k, m.zeta / k, m.omega1 / k, m.rolled)
+        response = steady_response(slowed, wave.times(side / k**2).slowed())
+        w, z = w + response.at(zero), z + k * response.slope().at(zero)
+    return w, z
