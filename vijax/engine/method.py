@@ -84,6 +84,7 @@ class Carry(Protocol):
         """Say how deep it has been in this contact so far."""
 
 
+@runtime_checkable
 class ContactCarry(Protocol):
     """What the record of an impact reads of a carry: its contact, and when the ball left the wall before."""
 
