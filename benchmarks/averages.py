@@ -40,8 +40,8 @@ import vijax
 from benchmarks import charts, tables
 from vijax.batch.simulate import Starts
 from vijax.design.survey import survey
-from vijax.design.variables import tuned, value_of
 from vijax.model.device import Harvester
+from vijax.model.variables import tuned, value_of
 from vijax.planes.basins import SPEED
 from vijax.runtime import context, tiles
 from vijax.runtime.arrays import present

@@ -32,8 +32,8 @@ from vijax.design.design_settings import DEFAULT
 from vijax.design.ensemble import fly
 from vijax.design.optimise import Design, optimise_all
 from vijax.design.optimum import AperiodicOptimum
-from vijax.design.variables import variables
 from vijax.model.device import Harvester
+from vijax.model.variables import variables
 
 SEED = 28
 KAPPA, D = (3.0, 400.0), (0.04, 0.25)

@@ -15,6 +15,9 @@ Planes of parameters, as `xarray.Dataset`: `sweep` maps power, kind of motion an
 `survival` say how chaotic, and for how long; `response` measures a device under noise. `save` and `load` keep them in
 stores.
 
+A device from its impacts: `fit` makes a `Fit` of times that a bench has measured, with errors, its `Misfit`, and a
+`ConstancyTest` of restitution.
+
 One motion: `trajectory` returns a `Trajectory`, impact by impact, differentiable.
 
 Periodic orbits, stable or not: `find_orbits` from a sequence of impacts, `orbits_from_states` from states; an `Orbit`

@@ -17,6 +17,8 @@ from vijax.design.tolerance import Tolerance
 from vijax.design.tolerance_plane import TolerancePlane
 from vijax.design.tolerance_plane import tolerance_plane as design_plane
 from vijax.explorer.door import explore
+from vijax.fitting.fit import fit
+from vijax.fitting.fitted import ConstancyTest, Fit, Misfit
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
 from vijax.model.excitation import Excitation, Harmonics, Noise, Record, Waveform
@@ -59,10 +61,12 @@ __all__ = [
     "Average",
     "BifurcationCurve",
     "Branch",
+    "ConstancyTest",
     "ContinuationSettings",
     "Design",
     "DesignSettings",
     "Excitation",
+    "Fit",
     "Harmonics",
     "Harvester",
     "HuntCrossley",
@@ -70,6 +74,7 @@ __all__ = [
     "ImpactPair",
     "MapCurves",
     "MembraneLaw",
+    "Misfit",
     "Noise",
     "Optimum",
     "Orbit",
@@ -99,6 +104,7 @@ __all__ = [
     "design_plane",
     "explore",
     "find_orbits",
+    "fit",
     "follow_curves",
     "follow_families",
     "follow_orbits",

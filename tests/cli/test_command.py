@@ -21,7 +21,7 @@ from vijax.plots import branch_diagrams, orbit_diagrams
 
 ROOT = SCRIPTS.parent
 DOORS = {"sweep": "grid", "orbit-diagram": "orbit_diagram"} | {
-    name: name for name in ("basins", "response", "branch", "curves", "design", "explore")
+    name: name for name in ("basins", "response", "fit", "branch", "curves", "design", "explore")
 }
 PAGES = [*DOORS, "compare"]
 # As many kappa as make the programs of `planes/test_compare`.
@@ -225,6 +225,9 @@ def begun(folder, monkeypatch):
         raise BegunError
 
     bar.write = print
+    # What examples read.
+    (folder / "impacts.txt").write_text("".join(f"{0.1 * k} {(-1) ** k} 0.2\n" for k in range(1, 9)))
+    (folder / "bench.csv").write_text("".join(f"{0.01 * k},0.5\n" for k in range(100)))
     monkeypatch.setattr("tqdm.tqdm", bar)
 
 
@@ -274,6 +277,7 @@ def completed(monkeypatch, capsys):
                 "orbit-diagram",
                 "basins",
                 "response",
+                "fit",
                 "branch",
                 "curves",
                 "design",

@@ -38,7 +38,7 @@ def test_options_make_excitations(tmp_path):
         ({"harmonics": "1,x"}, "--harmonics: it must be numbers parted by commas; got '1,x'"),
         ({"noise": "0.1"}, "--noise: it must be two numbers, a level and a highest frequency; got '0.1'"),
         ({"noise": "-1,32"}, "--noise: level must be"),
-        ({"record": "nowhere.csv"}, "--record: it must be a text file of two columns of numbers; got 'nowhere.csv'"),
+        ({"record": "nowhere.csv"}, "--record must be a text file of two columns of numbers; got 'nowhere.csv'"),
     ],
 )
 def test_what_cannot_be_names_its_option(given, says):

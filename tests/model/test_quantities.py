@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from vijax.cli import main as command
-from vijax.design import variables
-from vijax.model import quantities
+from vijax.model import quantities, variables
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.orbits.parameter import MOVED

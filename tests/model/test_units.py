@@ -8,8 +8,7 @@ import pytest
 
 import vijax
 from scripts import orbit_diagram as diagram_script
-from vijax.design import variables
-from vijax.model import quantities, units
+from vijax.model import quantities, units, variables
 from vijax.model.device import CONSTANTS, Harvester, with_constants
 from vijax.model.pair import impact_pair
 from vijax.orbits import continuation, orbit_search

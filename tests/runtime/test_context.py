@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax.design import report, tolerance, variables
+from vijax.design import report, tolerance
 from vijax.model import device as devices
-from vijax.model import energy, restitution
+from vijax.model import energy, restitution, variables
 from vijax.model import pair as pairs
 from vijax.model.pair import membrane_pair
 from vijax.orbits import motion, orbit_properties, orbit_search, parameter, periodic

@@ -179,7 +179,7 @@ def _devices(
     """Give the axis along which designs are wanted, if there is one, and the device at each of its values."""
     import numpy as np
 
-    from vijax.design.variables import constant
+    from vijax.model.variables import constant
     from vijax.planes.axes import parse_axis
 
     if over is None:
@@ -198,7 +198,7 @@ def _devices(
 
 def _bounds(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
     """Read bounds written NAME=LO:HI."""
-    from vijax.design.variables import NAMES
+    from vijax.model.variables import NAMES
     from vijax.planes.axes import parse_axis
 
     found = {}
@@ -251,7 +251,7 @@ def _diagram(found: "Design", device: "Harvester", points: int) -> "xr.Dataset":
     """Compute P up and down along the first tuned axis, closer by about the best design, all else as there."""
     import numpy as np
 
-    from vijax.design.variables import LINEAR, limits
+    from vijax.model.variables import LINEAR, limits
     from vijax.planes.orbit_diagram import orbit_diagram
     from vijax.plots.designs import close_view
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vijax.cli.arguments import about
+from vijax.cli.columns import columns
 from vijax.cli.kinds import Whole
 
 if TYPE_CHECKING:
@@ -22,17 +23,20 @@ def harmonic_options() -> list[click.Parameter]:
     ]
 
 
-def excitation_options() -> list[click.Parameter]:
-    """Make the options of any excitation."""
+def excitation_options(*, noise: bool = True) -> list[click.Parameter]:
+    """Make the options of any excitation; of one that is known without those of noise."""
     file = "measured acceleration in place of the sine: a text file of two columns, time in s and acceleration in m/s^2"
-    noise = "white noise besides: its level and its highest frequency, in units of the forcing's"
-    return [
+    text = "white noise besides: its level and its highest frequency, in units of the forcing's"
+    known: list[click.Parameter] = [
         *harmonic_options(),
         click.Option(["--record"], metavar="FILE", help=file),
         click.Option(["--looped"], is_flag=True, help="of --record: begin it again when it is over"),
-        click.Option(["--noise"], metavar="LEVEL,BAND", help=noise),
+    ]
+    unknown: list[click.Parameter] = [
+        click.Option(["--noise"], metavar="LEVEL,BAND", help=text),
         click.Option(["--seed"], type=Whole(0), help="of --noise: the number of its realisation [0]"),
     ]
+    return [*known, *(unknown if noise else [])]
 
 
 def take_excitation(given: dict[str, Any]) -> "Excitation | None":
@@ -74,20 +78,8 @@ def _numbers(text: str) -> list[float]:
 
 
 def _record(path: str, looped: bool | None) -> "Excitation":
-    import numpy as np
-
     from vijax.model.excitation import Record
 
+    time, acceleration = columns("--record", path, (2,))
     with about("record"):
-        try:
-            columns = np.loadtxt(path, delimiter="," if _parted_by_commas(path) else None, unpack=True, ndmin=2)
-        except (OSError, UnicodeDecodeError, ValueError) as error:
-            raise ValueError(f"it must be a text file of two columns of numbers; got {path!r}: {error}") from None
-        if len(columns) != 2:
-            raise ValueError(f"it must be a text file of two columns of numbers; got {len(columns)} in {path!r}")
-        return Record(columns[0], columns[1], bool(looped))
-
-
-def _parted_by_commas(path: str) -> bool:
-    with open(path, encoding="utf-8") as file:
-        return "," in next((line for line in file if line.strip() and not line.startswith("#")), "")
+        return Record(time, acceleration, bool(looped))

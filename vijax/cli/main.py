@@ -18,6 +18,7 @@ _PAGES = {
     "orbit-diagram": "orbit_diagram",
     "basins": "basins",
     "response": "response",
+    "fit": "fit",
     "branch": "branch",
     "curves": "curves",
     "design": "design",

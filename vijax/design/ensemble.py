@@ -13,10 +13,10 @@ from vijax.design.averages import Averages, averages
 from vijax.design.design_settings import DesignSettings
 from vijax.design.survey import survey
 from vijax.design.tolerance import Tolerance, drawn
-from vijax.design.variables import LINEAR, cells, scattered
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.records import SETTLED, Status
+from vijax.model.variables import LINEAR, cells, scattered
 from vijax.planes.basins import SPEED, spread
 from vijax.runtime import tiles
 

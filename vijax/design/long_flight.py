@@ -14,7 +14,7 @@ from vijax.design.aperiodic_search import Place, climbed
 from vijax.design.averages import LIMITS
 from vijax.design.ensemble import AVERAGED, Ensemble, Task, fly, on_motion
 from vijax.design.optimum import AperiodicOptimum
-from vijax.design.variables import tuned, values
+from vijax.model.variables import tuned, values
 
 _RESERVE = 1.5  # room kept for extremes that a proof has not met, in parts of what its worst ball has less than most
 _TURNS = 1, 2, 4  # periods that every other ball, pair and four of a proof are ahead: they set out in 8, in turn

@@ -15,9 +15,9 @@ from vijax.design.averages import LIMITS, averages
 from vijax.design.design_settings import DEFAULT, DesignSettings
 from vijax.design.promise import Met, highest_promise, near_limits, promise
 from vijax.design.survey import Flown, Survey, flown, survey
-from vijax.design.variables import LINEAR, cells, moving, values
 from vijax.model.device import Harvester
 from vijax.model.records import Status
+from vijax.model.variables import LINEAR, cells, moving, values
 from vijax.runtime import tiles
 from vijax.runtime.lattice import lattice
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from vijax.design import variables
 from vijax.design.ascent import Look
+from vijax.model import variables
 from vijax.model.choices import Objective
 from vijax.model.device import Harvester
 from vijax.model.records import Status

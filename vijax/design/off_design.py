@@ -14,7 +14,7 @@ from vijax.design.design_settings import DEFAULT
 from vijax.design.ensemble import AVERAGED, Ensemble, Task, fly
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.tolerance import Spread, Tolerance, check_samples, check_tolerances
-from vijax.design.variables import LINEAR, variables
+from vijax.model.variables import LINEAR, variables
 from vijax.runtime import checks
 from vijax.runtime.context import door
 

@@ -23,10 +23,10 @@ from vijax.design.objective import OBJECTIVES, Batch, Scene
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.promise import Met
 from vijax.design.tolerance import Nodes, Spread, Tolerance, check_samples, check_tolerances, nodes
-from vijax.design.variables import NAMES, check_names, limits, values, variables
 from vijax.model.choices import Motion, Objective
 from vijax.model.device import Harvester, one_device
 from vijax.model.sides import named
+from vijax.model.variables import NAMES, check_names, limits, values, variables
 from vijax.planes import estimate
 from vijax.planes.estimate import Estimate
 from vijax.runtime import checks

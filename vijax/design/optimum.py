@@ -16,9 +16,9 @@ from vijax.batch.simulate import Starts
 from vijax.design.design_settings import DesignSettings
 from vijax.design.multistart import Begun
 from vijax.design.objective import Scene
-from vijax.design.variables import tuned, values
 from vijax.model.device import Harvester
 from vijax.model.records import Status
+from vijax.model.variables import tuned, values
 from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.steady import Steady, steady

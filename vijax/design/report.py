@@ -12,11 +12,11 @@ from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.robustness import Surroundings
 from vijax.design.tolerance import Spread, Tolerance
 from vijax.design.tolerance_plane import TolerancePlane
-from vijax.design.variables import LINEAR, constant
 from vijax.model.device import CONSTANTS
 from vijax.model.energy import energy_ratio
 from vijax.model.pair import quantities
 from vijax.model.sides import named
+from vijax.model.variables import LINEAR, constant
 from vijax.runtime import checks
 
 if TYPE_CHECKING:

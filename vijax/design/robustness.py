@@ -10,10 +10,10 @@ import numpy as np
 
 from vijax.design.optimise import Design
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum, states
-from vijax.design.variables import tuned, values, variables
 from vijax.model.device import Harvester
 from vijax.model.pair import quantities
 from vijax.model.records import Status
+from vijax.model.variables import tuned, values, variables
 from vijax.orbits import continuation, orbit_properties, periodic
 from vijax.orbits.continuation import Direction
 from vijax.orbits.continuation_settings import ContinuationSettings

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from vijax.design.optimise import optimise
-from vijax.design.variables import NAMES
 from vijax.explorer.plane import Axis, ExploredCell
+from vijax.model.variables import NAMES
 
 EFFORT: dict[str, Any] = {"motion": "periodic", "survey_points": 64, "starts": 4}
 """How far `optimise` looks here: orbits alone, from fewer values and starts than it takes unless told."""

@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from vijax.model import units
 from vijax.model.device import Harvester
 from vijax.model.units import Given
 from vijax.runtime import checks
@@ -156,7 +157,8 @@ class Record(Excitation):
     looped: bool
 
     def __init__(self, time: Given, acceleration: Given, looped: bool = False):
-        self.time, self.acceleration = _samples("time", time), _samples("acceleration", acceleration)
+        self.time = _samples("time", units.plain("time", time))
+        self.acceleration = _samples("acceleration", units.plain("acceleration", acceleration))
         self.looped = checks.flag("looped", looped)
         if self.time.size != self.acceleration.size:
             raise ValueError(

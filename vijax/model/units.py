@@ -25,6 +25,7 @@ Given = Union[ArrayLike, Sequence[float], "Quantity[Any]"]
 """What may be given for a quantity: a number, an array or list of them, or such a quantity of pint."""
 
 UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
+UNITS |= {"time": "s", "speed": "m/s", "acceleration": "m/s^2"}  # of measured rows
 UNITS["depth"] = MEASURED["depth"].units
 """What plain numbers are in; a quantity that is not here has no unit."""
 

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from vijax.model.flow import PI, Force, Membrane, flight, half_turn, steady_response
+from vijax.model.flow import PI, Force, Membrane, flight, half_turn, oscillate, steady_response
 from vijax.runtime.arrays import Values
 
 
@@ -67,7 +67,24 @@ def held_response(m: Membrane, waves: Waves, side: Values, gamma: Values) -> tup
     w, z = -side * gamma / (m.kappa * m.kappa), zero
     for wave in waves:
         k = wave.order
-        slowed = Membrane(m.kappa / k, m.zeta / k, m.omega1 / k, m.rolled)
-        response = steady_response(slowed, wave.times(side / k**2).slowed())
+        response = steady_response(_slowed(m, k), wave.times(side / k**2).slowed())
         w, z = w + response.at(zero), z + k * response.slope().at(zero)
     return w, z
+
+
+def pressed(m: Membrane, waves: Waves, side: Values, gamma: Values, z: Values, s: Values) -> tuple[Values, Values]:
+    """Compute penetration and rate of a ball that entered a membrane at rate z a time s ago; waves from the onset."""
+    zero = jnp.zeros_like(s)
+    first = next((wave for wave in waves if wave.order == 1), Wave(1, zero, zero))
+    w, rate = oscillate(m, Force(side * first.c, side * first.q, side * gamma), zero, z, s)
+    for wave in waves:
+        k = wave.order
+        if k != 1:
+            deeper, faster = oscillate(_slowed(m, k), wave.times(side / k**2).slowed(), zero, zero, k * s)
+            w, rate = w + deeper, rate + k * faster
+    return w, rate
+
+
+def _slowed(m: Membrane, k: int) -> Membrane:
+    """Give a membrane on a clock that runs k times as fast."""
+    return Membrane(m.kappa / k, m.zeta / k, m.omega1 / k, m.rolled)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from vijax.plots.curve_maps import curves
     from vijax.plots.designs import design, design_map
     from vijax.plots.figure import save
+    from vijax.plots.fits import fit
     from vijax.plots.kind_maps import basins, label_map
     from vijax.plots.motions import energies, trajectory
     from vijax.plots.number_maps import difference_map, power_map, variable_map
@@ -23,6 +24,7 @@ else:
         "curves": "curve_maps",
         **dict.fromkeys(("design", "design_map"), "designs"),
         "save": "figure",
+        "fit": "fits",
         **dict.fromkeys(("basins", "label_map"), "kind_maps"),
         **dict.fromkeys(("difference_map", "power_map", "variable_map"), "number_maps"),
         **dict.fromkeys(("energies", "trajectory"), "motions"),
@@ -44,6 +46,7 @@ __all__ = [
     "design_map",
     "difference_map",
     "energies",
+    "fit",
     "label_map",
     "orbit_diagram",
     "power_map",

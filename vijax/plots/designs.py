@@ -11,9 +11,9 @@ from matplotlib.patches import Rectangle
 from vijax.design.report import factors
 from vijax.design.report_lines import amount
 from vijax.design.tolerance_plane import TolerancePlane
-from vijax.design.variables import LINEAR, constant
 from vijax.model.quantities import AXES
 from vijax.model.units import UNITS
+from vijax.model.variables import LINEAR, constant
 from vijax.orbits.curve_dataset import curve_dataset
 from vijax.plots.curve_maps import draw_curves, kind_handles
 from vijax.plots.figure import label_logs, styled

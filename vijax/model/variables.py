@@ -99,15 +99,15 @@ def value_of(device: Harvester, name: str) -> Any:
     return field_of(device.pair(), name)
 
 
-def check_names(names: tuple[str, ...]) -> None:
-    """Raise ValueError unless these can be tuned together."""
+def check_names(names: tuple[str, ...], argument: str = "tune") -> None:
+    """Raise ValueError unless these can be tuned together, or what else they are named for."""
     if not names:
-        raise ValueError("tune must name at least one quantity; got none; omega0 is the membrane's")
+        raise ValueError(f"{argument} must name at least one quantity; got none; omega0 is the membrane's")
     for name in names:
-        checks.choice("tune", name, NAMES)
+        checks.choice(argument, name, NAMES)
         rivals = [one for one in names if constant(one) in (constant(name), of_both_walls(constant(name)))]
         if len(rivals) > 1:
-            raise ValueError(f"tune must name a quantity once; got {' and '.join(rivals)}")
+            raise ValueError(f"{argument} must name a quantity once; got {' and '.join(rivals)}")
 
 
 def limits(names: tuple[str, ...], bounds: Mapping[str, tuple[float, float]], device: Harvester) -> np.ndarray:

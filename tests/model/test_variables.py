@@ -8,9 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from vijax.design import variables
 from vijax.design.averages import averages
-from vijax.model import quantities
+from vijax.model import quantities, variables
 from vijax.model.device import Harvester
 from vijax.model.sides import Sides
 

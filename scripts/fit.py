@@ -1,0 +1,17 @@
+"""A device from the impacts that a bench has measured: `vijax fit`.
+
+python scripts/fit.py impacts.txt --timing-error 1e-4 --s 8mm --omega 5pi --omega0 150
+python scripts/fit.py --help  # options, and more lines to begin with
+"""
+
+from vijax.cli.fit import fit
+from vijax.cli.process import leave, run
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command and give its exit code; see `process.run`."""
+    return run(fit, arguments)
+
+
+if __name__ == "__main__":
+    leave(main())

@@ -1,0 +1,57 @@
+"""`vijax fit`: from a file of impacts to a report, a picture and a few lines, and one line after bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+import vijax
+from tests.fitting.bench import measured
+from vijax.cli.main import main
+
+DEVICE = vijax.Harvester(s=0.02, omega=10.0, A=3.0, r=0.6)
+TOLD = ["--timing-error", "1e-4", "--s", "22mm", "--omega", "10", "--A", "3", "--wall", "rigid", "--unknown", "s,r"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    impacts = measured(DEVICE, 40, wall="rigid", error=1e-4)
+    np.savetxt("impacts.csv", np.c_[impacts], delimiter=",", header="time,side,speed")
+    return tmp_path
+
+
+def test_a_report_and_a_picture(folder, capsys):
+    assert main(["fit", "impacts.csv", *TOLD]) == 0
+    said = capsys.readouterr().out
+    assert "s = 0.02" in said
+    assert "misfit:" in said
+    report = json.loads((folder / "fit.json").read_text())
+    assert report["values"]["r"] == pytest.approx(0.6, abs=0.005)
+    assert report["converged"]
+    assert report["units"] == {"s": "m", "r": ""}
+    assert (folder / "fit.png").stat().st_size > 10_000
+
+
+def test_speeds_of_the_third_column(folder, capsys):
+    arguments = ["fit", "impacts.csv", *TOLD[:-1], "s,A,r", "--speed-error", "1e-3", "--out", "told.json"]
+    assert main(arguments) == 0
+    values = json.loads((folder / "told.json").read_text())["values"]
+    assert values["A"] == pytest.approx(3.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["nowhere.csv", *TOLD], "IMPACTS must be a text file of two or three columns"),
+        (["impacts.csv", *TOLD, "--timing-error", "-1"], "timing_error must be a positive finite number"),
+        (["impacts.csv", *TOLD, "--unknown", "V"], "unknown must be among"),
+        (["impacts.csv", *TOLD, "--out", "fit.zarr"], "out must end in .json"),
+        (["impacts.csv", *TOLD, "--s", "0.01,0.02"], "s must be one number here; got 2 of them"),
+        (["impacts.csv"], "Missing option '--timing-error'"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, says):
+    assert main(["fit", *arguments]) == 2
+    assert says in capsys.readouterr().err.splitlines()[-1]
+    assert [path.name for path in folder.iterdir()] == ["impacts.csv"]

@@ -1,0 +1,45 @@
+"""Benches of known devices: what they would measure, with errors."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+import vijax
+
+SIDES = vijax.Harvester(s=0.02, omega=10.0, A=3.0, omega0=vijax.Sides(60.0, 90.0), r=vijax.Sides(0.6, 0.5), beta=0.01)
+
+
+class Measured(NamedTuple):
+    """Impacts as a bench prints them: times [s], sides, speeds [m/s]."""
+
+    times: np.ndarray
+    sides: np.ndarray
+    speeds: np.ndarray
+
+
+def measured(device, periods, *, excitation=None, wall="soft", skip=10, error=0.0, seed=0, start=(0.01, -0.4)):
+    """Fly a ball in a device, and time its impacts with an error [s]."""
+    run = vijax.trajectory(device.pair(wall), *start, periods, excitation=excitation)
+    kept = slice(skip, int(run.filled))
+    n, t, side, v = (np.asarray(getattr(run.impacts, name))[kept] for name in ("n", "t", "side", "v_in"))
+    times = (2.0 * n + t) * np.pi / float(device.omega)
+    times = times + error * np.random.default_rng(seed).normal(size=times.size)
+    return Measured(times, side.astype(float), np.abs(v) * float(device.speed_unit))
+
+
+def measured_one_by_one(device, count, restitution, *, error=0.0, seed=0, skip=10):
+    """Do what `measured` does where restitution is a function of the impact speed in m/s: impact by impact."""
+    half, unit = float(device.pair().d) / 2, float(device.speed_unit)
+    n, t, side, v = 0, 0.3, 1.0, 0.4
+    found = []
+    for _ in range(count + skip):
+        r = restitution(abs(v) * unit)
+        pair = dataclasses.replace(device, r=r).pair()
+        run = vijax.trajectory(pair, side * half, v, 8, t, max_impacts=1)
+        found.append((2 * n + t, side, abs(v) * unit))
+        further, t, side, v = (np.asarray(getattr(run.impacts, name))[0].item() for name in ("n", "t", "side", "v_in"))
+        n, side = n + further, float(side)
+    times, sides, speeds = np.array(found[skip:]).T
+    times = times * np.pi / float(device.omega) + error * np.random.default_rng(seed).normal(size=count)
+    return Measured(times, sides, speeds)

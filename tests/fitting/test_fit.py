@@ -1,0 +1,193 @@
+"""`vijax.fit`: the device comes back from its impacts, with errors that hold, and what is not told is said."""
+
+import numpy as np
+import pint
+import pytest
+
+import vijax
+from tests.fitting.bench import SIDES, measured, measured_one_by_one
+
+DEVICE = vijax.Harvester(s=0.02, omega=10.0, A=3.0, omega0=60.0, r=0.6)
+GUESS = vijax.Harvester(s=0.02, omega=10.0, A=3.0, omega0=52.0, r=0.5)
+PERIOD = 2 * np.pi / 10
+ERROR = 1e-3 * PERIOD
+
+
+@pytest.fixture(scope="module")
+def chaotic():
+    return measured(DEVICE, 100, error=ERROR, seed=1)
+
+
+def pulls(found, **truth):
+    return np.array([(found.values[name] - value) / found.stderr[name] for name, value in truth.items()])
+
+
+def test_a_device_comes_back_from_its_times(chaotic):
+    found = vijax.fit(chaotic.times, chaotic.sides, timing_error=ERROR, device=GUESS)
+    assert found.converged
+    assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
+    assert found.stderr["omega0"] < 0.05
+    assert found.stderr["r"] < 2e-3
+    assert 0.85 < found.misfit.size < 1.15
+    assert 0.001 < found.misfit.p_value < 0.999
+    assert abs(found.constancy.slope) < 3 * found.constancy.stderr
+    assert not found.astray.any()
+    assert found.untold == found.alternatives == ()
+    np.testing.assert_allclose(found.speeds, chaotic.speeds, atol=0.01)
+    assert float(found.device.omega0) == found.values["omega0"]
+    assert "impacts left out: 0" in str(found)
+
+
+def test_without_errors_it_is_exact():
+    impacts = measured(DEVICE, 60)
+    found = vijax.fit(impacts.times, impacts.sides, timing_error=1e-9, device=GUESS)
+    assert found.values["omega0"] == pytest.approx(60.0, rel=1e-7)
+    assert found.values["r"] == pytest.approx(0.6, rel=1e-7)
+
+
+def test_speeds_add_to_what_is_known(chaotic):
+    error = 0.01
+    speeds = chaotic.speeds + error * np.random.default_rng(2).normal(size=chaotic.speeds.size)
+    told = {"timing_error": ERROR, "device": GUESS}
+    found = vijax.fit(chaotic.times, speeds=chaotic.sides * speeds, speed_error=error, **told)
+    plain = vijax.fit(chaotic.times, chaotic.sides, **told)
+    assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
+    assert found.stderr["r"] < plain.stderr["r"]
+    assert found.misfit.freedom == plain.misfit.freedom + chaotic.times.size - 1
+
+
+def test_impacts_that_the_bench_missed_or_invented_are_left_out(chaotic):
+    times, sides = chaotic.times, chaotic.sides
+    kept = np.ones(times.size, bool)
+    kept[60] = False
+    times, sides = times[kept], sides[kept]
+    false = times[150] + 0.4 * (times[151] - times[150])
+    times, sides = np.insert(times, 151, false), np.insert(sides, 151, sides[150])
+    found = vijax.fit(times, sides, timing_error=ERROR, device=GUESS)
+    assert found.converged
+    assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
+    assert found.astray[57:62].any()
+    assert found.astray[149:153].any()
+    assert found.astray.sum() <= 12
+
+
+def test_units_of_pint(chaotic):
+    # Not dropped: milliseconds are no seconds, and metres no times.
+    ureg = pint.UnitRegistry()
+    told = {"device": GUESS}
+    plain = vijax.fit(chaotic.times, chaotic.sides, timing_error=ERROR, **told)
+    with_units = vijax.fit(chaotic.times * 1e3 * ureg.ms, chaotic.sides, timing_error=ERROR * 1e6 * ureg.us, **told)
+    assert with_units.values["r"] == pytest.approx(plain.values["r"], rel=1e-6)
+    with pytest.raises(ValueError, match="time must be in s"):
+        vijax.fit(chaotic.times * ureg.m, chaotic.sides, timing_error=ERROR, **told)
+    record = vijax.Record(np.arange(5) * 1e3 * ureg.ms, np.ones(5) * ureg.cm / ureg.s**2)
+    assert record.step == pytest.approx(1.0)
+    assert record.acceleration[0] == pytest.approx(0.01)
+
+
+def test_a_fit_that_says_nothing_prints():
+    # All but two equations of five impacts go aside with a gross error: there is no misfit of none.
+    impacts = measured(DEVICE, 30)
+    times = impacts.times[:5].copy()
+    times[1] = (times[1] + times[2]) / 2
+    found = vijax.fit(times, impacts.sides[:5], timing_error=ERROR, device=GUESS)
+    assert "misfit" in str(found)
+    assert not (found.converged and found.misfit.freedom < 1)
+    assert found.report()["misfit"]["freedom"] == found.misfit.freedom
+
+
+def test_what_cannot_be_told_apart_is_named(chaotic):
+    # Times alone have no unit of length: a device twice as large, shaken twice as hard, has the same impacts.
+    unknown = ("r", "s", "A")
+    found = vijax.fit(chaotic.times, chaotic.sides, timing_error=ERROR, device=DEVICE, unknown=unknown)
+    assert found.untold == (("s", "A"),)
+    assert found.stderr["s"] == found.stderr["A"] == np.inf
+    assert abs(found.values["r"] - 0.6) < 3 * found.stderr["r"] < 0.05
+    assert np.isnan(found.correlation[1, 2])
+    assert "s and A cannot be told apart from these data" in str(found)
+
+
+def test_a_motion_of_one_kind_of_impact_does_not_tell_two_unknowns():
+    # On level ground both impacts of a 1:1 motion are alike: one equation for stiffness and restitution.
+    device = vijax.Harvester(s=0.08, omega=10.0, A=3.0, omega0=60.0, r=0.4)
+    impacts = measured(device, 120, error=ERROR, skip=100)
+    assert np.ptp(impacts.speeds) < 1e-6
+    found = vijax.fit(impacts.times, impacts.sides, timing_error=ERROR, device=device)
+    assert found.untold
+    assert found.stderr["omega0"] == np.inf
+    # Nor do impacts of one speed tell whether restitution hangs on it.
+    assert found.constancy.stderr > 1
+
+
+def test_rigid_walls():
+    impacts = measured(DEVICE, 80, wall="rigid", error=ERROR, seed=4)
+    found = vijax.fit(impacts.times, impacts.sides, timing_error=ERROR, device=GUESS, unknown=("s", "r"), wall="rigid")
+    assert np.abs(pulls(found, s=0.02, r=0.6)).max() < 3
+
+
+def test_two_walls_and_a_clock_that_is_late():
+    impacts = measured(SIDES, 60, error=ERROR, seed=5)
+    unknown = ("omega0_left", "r_right", "delay")
+    found = vijax.fit(impacts.times + 0.2, impacts.sides, timing_error=ERROR, device=SIDES, unknown=unknown)
+    assert found.converged
+    assert np.abs(pulls(found, omega0_left=60.0, r_right=0.5, delay=0.2)).max() < 3
+
+
+@pytest.mark.long
+def test_a_measured_record_on_its_own_clock():
+    time = 3.0 + np.arange(0, 40, 0.02)
+    shake = 3 * np.cos(10 * time) + np.random.default_rng(6).normal(size=time.size) * 0.2
+    record = vijax.Record(time, shake)
+    impacts = measured(DEVICE, 40, excitation=record.waveform(DEVICE), error=ERROR, seed=7)
+    found = vijax.fit(impacts.times + 3.0, impacts.sides, record, timing_error=ERROR, device=GUESS)
+    assert found.converged
+    assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
+
+
+def test_restitution_that_hangs_on_speed_is_noticed():
+    # Faster impacts lose more: r falls by 0.1 from one end of the speeds to the other.
+    impacts = measured_one_by_one(DEVICE, 120, lambda speed: 0.65 - 0.25 * speed, error=ERROR, seed=8)
+    found = vijax.fit(impacts.times, impacts.sides, timing_error=ERROR, device=GUESS)
+    assert found.constancy.p_value < 1e-6
+    assert found.constancy.slope == pytest.approx(-0.25, abs=0.08)
+    assert "restitution: hangs on speed" in str(found)
+
+
+GOOD = {"times": [0.0, 0.3, 0.7, 1.1, 1.5, 2.0], "sides": [1, -1, 1, -1, 1, -1], "timing_error": 1e-3}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"times": [0.0, 0.3, 0.2, 1.1, 1.5, 2.0]}, "times must rise from impact to impact; got 0.2 at index 2"),
+        ({"times": [0.0, 0.3], "sides": [1, -1]}, "times must be at least 4 impacts; got 2"),
+        (
+            {"sides": [1, -1, 1, -1, 1, 2]},
+            "sides must be -1 left or .1 right; got 2",
+        ),
+        ({"sides": [1, -1]}, "sides must hold one number a time, 6; got 2"),
+        ({"sides": None}, "sides must be given"),
+        ({"timing_error": 0.0}, "timing_error must be a positive finite number"),
+        ({"speeds": np.ones(6)}, "speed_error must be given with speeds"),
+        ({"speed_error": 0.1}, "speed_error must be given with speeds, .* without speeds"),
+        ({"unknown": "V"}, "unknown must be among .*delay; got"),
+        ({"unknown": ("r", "r_left")}, "unknown must name a quantity once; got r and r_left"),
+        ({"unknown": ("omega0", "r", "s", "gamma")}, "of 4 at least 7 impacts without speeds; got 6"),
+        ({"wall": "rigid"}, "unknown must be told by rigid walls; got omega0"),
+        ({"excitation": vijax.Harmonics() + vijax.Noise(0.1, 8)}, "excitation must be known; got noise"),
+        ({"excitation": vijax.Record([0.0, 0.1, 0.2], [1.0, 0.0, 1.0])}, "times must lie within the record"),
+        (
+            {"excitation": vijax.Record([0.0, 0.1, 0.2], [1.0, 0.0, 1.0], looped=True), "unknown": "omega"},
+            "unknown must be told by the motion; got omega",
+        ),
+        ({"unknown": ("delay", "delay")}, "unknown must name a quantity once; got delay and delay"),
+        ({"wall": "rigid_left", "unknown": "omega0_left"}, "unknown must be told by rigid walls; got omega0_left"),
+        ({"sides": None, "speeds": np.ones(6), "speed_error": 0.1}, "speeds must be velocities, negative at the left"),
+        ({"speeds": [-1, 1, 1, -1, 1, -1], "speed_error": 0.1}, "speeds must have the signs of sides, or none; got -1"),
+        ({"times": []}, "times must be one number an impact, of at least 4; got none"),
+        ({"device": SIDES, "unknown": "r"}, "unknown must name r_left or r_right, or both"),
+    ],
+)
+def test_bad_input_says_what_must_hold(wrong, says):
+    with pytest.raises(ValueError, match=says):
+        vijax.fit(**GOOD | wrong)

@@ -1,0 +1,81 @@
+"""The equations between impact times: they hold on motions of the engines, and their derivatives are right."""
+
+import jax
+import numpy as np
+import pytest
+
+import vijax
+from tests.fitting.bench import SIDES, measured
+from vijax.fitting.mismatch import FitModel, linearised
+from vijax.fitting.series import Series
+from vijax.fitting.shaking import shaking
+from vijax.model.variables import value_of, variables
+
+# Every kind of push at once: a harmonic besides the sine's, and samples that make a knot in every contact.
+ROUGH = vijax.Harmonics([0.0, 0.4], [0.0, 1.0]) + vijax.Waveform(
+    np.random.default_rng(7).normal(size=401) * 0.5 + 1.2 * np.cos(np.pi * np.arange(401) / 10), 20.0
+)
+SCENES = {
+    "the sine": (vijax.Harvester(s=0.02, omega=10.0, A=3.0, omega0=60.0, r=0.6), None, "soft", ("omega0", "r")),
+    "rigid": (vijax.Harvester(s=0.02, omega=10.0, A=3.0, r=0.6, beta=0.01), None, "rigid", ("s", "r")),
+    "all at once": (SIDES, ROUGH, "soft", ("kappa_left", "r_right", "gamma", "A")),
+}
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def scene(request):
+    device, excitation, wall, names = SCENES[request.param]
+    impacts = measured(device, 40, excitation=excitation, wall=wall)
+    longest = 2 * float(np.diff(impacts.times).max() * device.omega / np.pi)
+    known = jax.tree.map(np.asarray, device)
+    model = FitModel(known, names, wall, jax.tree.map(np.asarray, shaking(excitation, longest, 5.0)))
+    series = Series(impacts.times, impacts.sides, impacts.speeds, 1e-3, 1e-3)
+    z = variables(names, [float(value_of(device, name)) for name in names])
+    return model, series, z
+
+
+def about(scene, z=None, times=None):
+    model, series, known = scene
+    asked = model, series, known if z is None else z, series.times if times is None else times
+    return linearised(*asked)
+
+
+def test_they_hold_on_a_motion_of_the_engine(scene):
+    linear = about(scene)
+    model, series, _ = scene
+    # What two intervals say of an impact, and a speed that was measured, agree to rounding; none is missed.
+    told = linear.answered & (np.abs(linear.off) < 1e-9)
+    # Of several ways from an impact to the next that of the ball is taken, under a rough push almost always.
+    assert told.mean() > (0.98 if model.shaking.sampled else 0.999)
+    assert np.abs(linear.off[told]).max() < 1e-12
+    assert linear.outside.max() <= 1e-9
+    assert linear.off.size == series.equations
+
+
+def test_derivatives_by_times_and_unknowns(scene):
+    _, series, z = scene
+    linear = about(scene)
+    rng = np.random.default_rng(3)
+    smooth = linear.answered & (np.abs(linear.off) < 1e-9)
+    for _ in range(2):
+        by_z, by_t, h = rng.normal(size=z.size), rng.normal(size=series.times.size), 1e-7
+        up, down = (about(scene, z + sign * h * by_z, series.times + sign * h * by_t).off for sign in (1, -1))
+        slope = linear.by_unknown @ by_z + linear.by_time @ by_t
+        off = (np.abs((up - down) / (2 * h) - slope) / (1 + np.abs(slope)))[smooth]
+        # The differences are off by the curvature, which slow impacts have much of.
+        assert np.median(off) < 1e-6
+        assert off.max() < 3e-4
+
+
+def test_offset_and_slope_are_those_of_restitution(scene):
+    model, _, _ = scene
+    if "r" not in model.names:
+        pytest.skip("the offset is compared with the derivative by r")
+    linear = about(scene)
+    r = float(model.device.r)
+    by_r = linear.by_unknown[:, model.names.index("r")] / r
+    np.testing.assert_allclose(linear.by_restitution[:, 0], by_r, atol=1e-9 * np.abs(by_r).max())
+    # Of the speed of an impact both hang on the same r, at one speed.
+    every, speeds = linear.by_restitution, linear.speeds[linear.impact]
+    about_speed = linear.own_variance > 0
+    np.testing.assert_allclose(every[about_speed, 1], (every[:, 0] * speeds)[about_speed], rtol=1e-6)

@@ -1,0 +1,115 @@
+"""`vijax fit`: a device from the impacts that a bench has measured."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from vijax.cli import options, process
+from vijax.cli.arguments import at_one_point, device, take_axes
+from vijax.cli.closing import close
+from vijax.cli.columns import columns
+from vijax.cli.excitation import excitation_options, take_excitation
+from vijax.cli.page import Page, Sections
+from vijax.cli.progress import progress, waiting
+from vijax.cli.targets import targets
+from vijax.model.quantities import AXES, STARTS
+
+if TYPE_CHECKING:
+    from vijax.fitting.fitted import Fit
+
+_DEVICE = {"omega0": "400"}
+_FILES = ("fit.json", "fit.png")
+# A file has times and sides, and maybe speeds.
+_COLUMNS = (2, 3)
+
+
+def fitted(
+    impacts: str,
+    unknown: str,
+    timing_error: float,
+    speed_error: float | None,
+    wall: str,
+    constants: tuple[str, ...],
+    out: str | None,
+    plot: str | None,
+    overwrite: bool,
+    **given: Any,
+) -> None:
+    """Find a device from its measured impacts.
+
+    IMPACTS is a text file with a line an impact: its time in s, its wall (-1 left, 1 right) and, with --speed-error,
+    its speed in m/s. The options of the device give what is known of it, and where the search begins.
+    """
+    with process.door():
+        report, picture = targets(out, plot, _FILES, overwrite, ".json")
+        excitation = take_excitation(given)
+        _, known = at_one_point(take_axes(given, _DEVICE), device(constants))
+        time, side, *speed = columns("IMPACTS", impacts, _COLUMNS)
+        if picture is not None:
+            from vijax.plots.style import check_format
+
+            check_format(picture)
+        from vijax.fitting.fit import fit
+
+        with progress(1, "fits") as show:
+            waiting("least squares, compiled at first")
+            found = fit(
+                time,
+                side,
+                excitation,
+                timing_error=timing_error,
+                speeds=speed[0] if speed and speed_error is not None else None,
+                speed_error=speed_error,
+                device=known,
+                unknown=[name.strip() for name in unknown.split(",")],
+                wall=wall,  # type: ignore[arg-type] # checked there
+            )
+            show(1, 1)
+    _write(found, report, picture)
+    close(str(found), report, picture)
+
+
+def _write(found: "Fit", report: Path | None, picture: Path | None) -> None:
+    from vijax import plots
+    from vijax.runtime.files import write_json
+
+    if report is not None:
+        write_json(found.report(), report)
+    if picture is not None:
+        plots.save(plots.fit(found), picture)
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+
+def _sections() -> Sections:
+    axes = {name: axis for name, axis in AXES.items() if name not in STARTS}
+    names = "what is looked for: omega0, k, kappa, r, s, d, beta, gamma, A, omega, of one wall omega0_left, or delay"
+    return {
+        "Impacts": [
+            click.Argument(["impacts"], metavar="IMPACTS"),
+            click.Option(["--unknown"], default="omega0,r", show_default=True, metavar="NAME,NAME", help=names),
+            click.Option(["--timing-error"], type=float, required=True, help="standard error of a time, s"),
+            click.Option(["--speed-error"], type=float, help="standard error of a speed, m/s: the third column counts"),
+            options.wall_option(),
+        ],
+        "Device": [*options.axis_options(axes), *options.device_options()],
+        "Excitation": excitation_options(noise=False),
+        "Files": options.file_options(".json", "report"),
+    }
+
+
+_EXAMPLES = (
+    "impacts.txt --timing-error 1e-4 --s 8mm --omega 5pi --omega0 150",
+    "impacts.txt --timing-error 1e-4 --s 8mm --omega 5pi --unknown omega0,r,delay",
+    "impacts.txt --timing-error 1e-4 --speed-error 0.01 --s 8mm --omega 5pi --record bench.csv",
+)
+
+fit = Page(
+    "fit",
+    fitted,
+    _sections(),
+    _EXAMPLES,
+    f"{options.VALUES} Each is one number here. With neither --out nor --plot, fit.json and fit.png are written.",
+)

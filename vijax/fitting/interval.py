@@ -1,0 +1,240 @@
+"""What lies between two impacts whose times are known: one contact and one flight, and nothing is searched for.
+
+The ball enters a wall at one time and meets the next wall at another. How fast it must have been then follows: so one
+interval says at which speed each of its impacts happens, whatever came before. Chaos has no time to grow.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from vijax.fitting.shaking import Shaking
+from vijax.model import flow
+from vijax.model.pair import ImpactPair
+from vijax.runtime.arrays import Flag, Scalar, Values
+
+# Newton's steps, most of which take 5; a step changes neither number by more than half, and the last by less than this.
+_MOST_STEPS = 15
+_HALF = 0.5
+_ARRIVED = 1e-10
+# A contact is looked for at so many durations, closer to each other where they are short, up to so many half turns of
+# the membrane.
+_DURATIONS, _HALF_TURNS = 64, 8
+# Of an interval so many motions are told: where the miss changes its sign, and two each where it turns back.
+_CROSSINGS, _TURNS = 4, 2
+_MOTIONS = _CROSSINGS + 2 * _TURNS
+# Places in a contact and in a flight where the ball must be on the right side of the walls.
+_PLACES = tuple(k / 8 for k in range(1, 8))
+
+
+class Ends(eqx.Module):
+    """Two impacts that follow each other: their walls, -1 or +1, and their onsets in half forcing periods."""
+
+    side: Scalar
+    next_side: Scalar
+    t: Scalar
+    next_t: Scalar
+
+
+class Motion(eqx.Module):
+    """A motion from an impact to the next: how fast it enters the first wall, and how long it stays; NaN for none.
+
+    Of a rigid wall it needs not be known.
+    """
+
+    speed: Values
+    stay: Values
+
+
+class Interval(eqx.Module):
+    """What an interval says.
+
+    Attributes:
+        speed: How fast the ball enters the first wall, > 0; NaN where no motion leads from one impact to the other.
+        stay: How long it stays there.
+        arrival: Its velocity as it meets the next wall.
+        outside: How far it would pass through a wall on its way; at most 0 if it meets none.
+    """
+
+    speed: Values
+    stay: Values
+    arrival: Values
+    outside: Values
+
+
+class Restitution(eqx.Module):
+    """What is added to r at an impact: offset + slope times its speed. Both are 0; derivatives by them test r."""
+
+    offset: Scalar
+    slope: Scalar
+
+
+def interval(pair: ImpactPair, shaking: Shaking, added: Restitution, ends: Ends, near: Motion) -> Interval:
+    """Find the speeds at both ends of an interval, of the motion near one; differentiable once in all but that."""
+    told = shaking, added, ends
+    return pair.met(ends.side, partial(_behind_rigid, told=told), partial(_behind_soft, told=told, near=near))
+
+
+def motions(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Interval:
+    """List what an interval may be [motion]: a slow ball may stay long, or enter faster, leave sooner and fly longer.
+
+    For every duration of the contact its two ends say how fast the ball enters and leaves, and the next impact says
+    how fast it must leave: a function of the duration alone, of which every change of sign is followed.
+    """
+    none = Restitution(jnp.zeros_like(ends.t), jnp.zeros_like(ends.t))
+    told = shaking, none, ends
+
+    def rigid(wall: ImpactPair) -> Interval:
+        return jax.tree.map(lambda x: jnp.full(_MOTIONS, jnp.nan).at[0].set(x), _behind_rigid(wall, told))
+
+    def soft(wall: ImpactPair) -> Interval:
+        return jax.vmap(lambda near: _behind_soft(wall, told, near))(_crossings(wall, shaking, ends))
+
+    return pair.met(ends.side, rigid, soft)
+
+
+def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Motion:
+    """Guess the motions [motion]: where the miss changes its sign from duration to duration, or turns back near 0.
+
+    Where it turns back two motions may lie closer to each other than the durations; they are those of a parabola.
+    """
+    wall = flow.membrane(pair, rolled=True)
+    longest = jnp.minimum(_HALF_TURNS * jnp.pi / wall.omega1, ends.next_t - ends.t)
+
+    def stay_at(place: Values) -> Values:
+        return (place / (_DURATIONS + 1)) ** 1.5 * longest
+
+    def at(place: Scalar) -> tuple[Scalar, Motion]:
+        """Give the miss, times the impulse response, and the speed that fits both conditions best."""
+        stay = stay_at(place)
+        w, z = shaking.contact(wall, pair.gamma, ends.side, ends.t, jnp.zeros_like(stay), stay)
+        wanted = ends.side * _needed(pair, shaking, ends, ends.t + stay)
+        h, slope = flow.free_response(wall, stay)
+        stiff = wall.kappa * wall.kappa
+        speed = (slope * (wanted - z) - stiff * h * w) / (stiff * h * h + slope * slope)
+        return h * (z - wanted) - w * slope, Motion(speed, stay)
+
+    places = 1 + jnp.arange(_DURATIONS, dtype=ends.t.dtype)
+    miss, _ = jax.vmap(at)(places)
+    crosses = miss[:-1] * miss[1:] < 0
+    crossings = _first(crosses, places[:-1] + miss[:-1] / (miss[:-1] - miss[1:]), _CROSSINGS)
+    before, here, after = miss[:-2], miss[1:-1], miss[2:]
+    bend, rise = (before + after) / 2 - here, (after - before) / 2
+    turns = (before * here > 0) & (here * after > 0) & (here * bend > 0) & (jnp.abs(rise) <= 2 * jnp.abs(bend))
+    apart = jnp.sqrt(jnp.maximum(rise * rise - 4 * bend * here, 0.0))
+    roots = [places[1:-1] + (-rise + sign * apart) / (2 * bend) for sign in (-1, 1)]
+    found = jnp.concatenate([crossings, *(_first(turns, root, _TURNS) for root in roots)])
+    _, guess = jax.vmap(at)(found)
+    return jax.tree.map(lambda x: jnp.where(guess.speed > 0, x, jnp.nan), guess)
+
+
+def _first(real: Array, values: Array, count: int) -> Array:
+    """Take the first values that are real; NaN where there are no more."""
+    first = jnp.argsort(~real, stable=True)[:count]
+    return jnp.where(real[first], values[first], jnp.nan)
+
+
+def _behind_rigid(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends]) -> Interval:
+    """Leave a rigid wall at once: the flight is known by where it begins and ends."""
+    shaking, added, ends = told
+    out = _needed(pair, shaking, ends, ends.t)
+    # -out/speed = r + offset + slope speed, solved for the speed to first order in offset and slope, which are 0.
+    plain = -ends.side * out / pair.r
+    speed = plain * (1 - (added.offset + added.slope * plain) / pair.r)
+    speed = jnp.where(speed > 0, speed, jnp.nan)
+    arrival = shaking.flight(pair.gamma, ends.t, out, ends.next_t - ends.t)[1]
+    return Interval(speed, 0 * speed, arrival, _flown_outside(pair, shaking, ends, ends.t, out))
+
+
+def _behind_soft(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], near: Motion) -> Interval:
+    """Solve for the speed at the onset and the duration of the contact: it ends, and the flight meets the next wall."""
+    shaking, added, ends = told
+    frozen = lax.stop_gradient((pair, told))
+    found, arrived = _newton(partial(_missed, args=frozen), lax.stop_gradient(jnp.stack([near.speed, near.stay])))
+    x = _implicit(_missed, found, (pair, told))
+    speed, stay = x[0], x[1]
+    out, arrival = _left_and_arrived(x, (pair, told))
+    # A contact is over when the ball first comes back.
+    wall = _membrane(pair, added, speed)
+    depths = [shaking.contact(wall, pair.gamma, ends.side, ends.t, speed, part * stay)[0] for part in _PLACES]
+    real = arrived & (stay <= shaking.longest_contact) & (jnp.min(jnp.stack(depths)) > 0)
+    speed, stay, arrival = (jnp.where(real, number, jnp.nan) for number in (speed, stay, arrival))
+    return Interval(speed, stay, arrival, _flown_outside(pair, shaking, ends, ends.t + x[1], out))
+
+
+def _membrane(pair: ImpactPair, added: Restitution, speed: Scalar) -> flow.Membrane:
+    return flow.membrane(replace(pair, r=pair.r + added.offset + added.slope * speed), rolled=True)
+
+
+def _contact_and_flight(x: Array, args: Any) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Follow the ball: penetration as the contact ends, velocity then, distance to the next wall, velocity there."""
+    pair, (shaking, added, ends) = args
+    speed, stay = x[0], x[1]
+    w, z = shaking.contact(_membrane(pair, added, speed), pair.gamma, ends.side, ends.t, speed, stay)
+    exit_t = ends.t + stay
+    rise, arrival = shaking.flight(pair.gamma, exit_t, ends.side * z, ends.next_t - exit_t)
+    miss = 0.5 * pair.d * (ends.side - ends.next_side) + rise
+    return w, ends.side * z, miss, arrival
+
+
+def _missed(x: Array, args: Any) -> Float[Array, "2"]:
+    """Say by how much a speed and a duration fail."""
+    w, _, miss, _ = _contact_and_flight(x, args)
+    # A penetration has a root at the onset, too.
+    return jnp.stack([w / x[1], miss])
+
+
+def _left_and_arrived(x: Array, args: Any) -> tuple[Scalar, Scalar]:
+    _, out, _, arrival = _contact_and_flight(x, args)
+    return out, arrival
+
+
+def _needed(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar) -> Scalar:
+    """Compute the velocity with which a ball that leaves the first wall at a time meets the next one in time."""
+    s = ends.next_t - t
+    rise, _ = shaking.flight(pair.gamma, t, jnp.zeros_like(s), s)
+    return (0.5 * pair.d * (ends.next_side - ends.side) - rise) / s
+
+
+def _newton(equations: Callable[[Array], Array], x: Float[Array, "2"]) -> tuple[Float[Array, "2"], Flag]:
+    """Solve two equations for two positive numbers; say whether they are solved."""
+
+    def goes_on(carry):
+        count, _, step = carry
+        return (count < _MOST_STEPS) & (step > _ARRIVED)
+
+    def go(carry):
+        count, x, _ = carry
+        step = _solved(jax.jacfwd(equations)(x), -equations(x)) / x
+        step = jnp.where(jnp.isfinite(step), jnp.clip(step, -_HALF, _HALF), 0.0)
+        return count + 1, x * (1 + step), jnp.abs(step).max()
+
+    _, x, step = lax.while_loop(goes_on, go, (0, x, jnp.full_like(x[0], jnp.inf)))
+    return x, (step <= _ARRIVED) & jnp.isfinite(x).all()
+
+
+def _implicit(equations: Callable[[Array, Any], Array], x: Array, args: Any) -> Array:
+    """Make a root a function of what its equations are told: its value stays, its first derivatives are right."""
+    x = lax.stop_gradient(x)
+    slopes = lax.stop_gradient(jax.jacfwd(equations)(x, args))
+    moved = equations(x, args)
+    return x - _solved(slopes, moved - lax.stop_gradient(moved))
+
+
+def _solved(matrix: Float[Array, "2 2"], right: Float[Array, "2"]) -> Float[Array, "2"]:
+    (a, b), (c, d) = matrix
+    return jnp.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
+
+
+def _flown_outside(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar, out: Scalar) -> Scalar:
+    """Find how far a flight leaves the gap, at a few places."""
+    whole = ends.next_t - t
+    rises = [shaking.flight(pair.gamma, t, out, part * whole)[0] for part in _PLACES]
+    return jnp.max(jnp.abs(0.5 * pair.d * ends.side + jnp.stack(rises))) - 0.5 * pair.d
