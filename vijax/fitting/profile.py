@@ -41,6 +41,8 @@ _MOST_EVALUATIONS = 60
 _POOR = 2.0
 # Where a smaller part of the equations has a motion, the search does not begin.
 _ANSWERS = 0.9
+# By what part the variance of an equation is its own at least; by more where no factor is found.
+_INDEPENDENT = 1e-9, 1e-6, 1e-3
 # No variable of an unknown changes by more in one step.
 _LONGEST = 0.3
 
@@ -170,9 +172,13 @@ def _factor(shared: Any, own: np.ndarray, used: np.ndarray) -> np.ndarray:
     for k in range(width):
         bands[k, : count - k] = shared.diagonal(-k)
     bands[0] = np.where(used, bands[0] + own, 1.0)
-    # Two equations that read nearly the same are told apart by rounding alone.
-    bands[0] *= 1 + 1e-9
-    return scipy.linalg.cholesky_banded(bands, lower=True)
+    # Equations that read nearly the same are told apart by rounding alone, and of some rounding makes no covariance.
+    for more in _INDEPENDENT:
+        try:
+            return scipy.linalg.cholesky_banded(np.vstack([bands[0] * (1 + more), bands[1:]]), lower=True)
+        except scipy.linalg.LinAlgError:
+            continue
+    return np.vstack([np.sqrt(bands[0]), 0 * bands[1:]])
 
 
 def least_squares(model: FitModel, series: Series, begin: np.ndarray, limits: np.ndarray) -> list[Settled]:
