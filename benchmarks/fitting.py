@@ -6,7 +6,7 @@
 
 Devices have d, kappa, r and gamma of their own; the search for kappa and r begins a tenth off (kappa by a factor, r by
 a tenth of 1, one standard deviation). Times are off by 1e-3 of a forcing period. One line a figure: how many truths are
-within two standard errors (95 of 100 are expected), the root of the mean square error in standard errors, which devices
+within two standard errors (95 of 100 are expected), likewise the slope of the test of constancy, the root of the mean square error in standard errors, which devices
 have values that are not told, or others that fit as well, and seconds: of the first fit, which compiles, and of others.
 """
 
@@ -71,6 +71,7 @@ def main() -> None:
     asked = parser.parse_args()
     pulls: list[list[float]] = []
     seconds: list[float] = []
+    slopes: list[float] = []
     untold: list[int] = []
     several: list[int] = []
     none: list[int] = []
@@ -81,6 +82,7 @@ def main() -> None:
         found = fitted(rng, measured)
         seconds.append(time.perf_counter() - begun)
         pulls.append([(found.values[name] - measured.truth[name]) / found.stderr[name] for name in _UNKNOWN])
+        slopes.append(found.constancy.slope / found.constancy.stderr)
         for kept, is_so in ((untold, found.untold), (several, found.alternatives), (none, not found.converged)):
             kept.extend([seed] * bool(is_so))
     each = np.array(pulls)
@@ -89,6 +91,8 @@ def main() -> None:
         told = column[column != 0]
         size = float(np.sqrt(np.mean(told**2)))
         say(f"{name}: within two standard errors, mean square error", f"{within} of {len(each)}, {size:.2f}")
+    steady = int((np.abs(slopes) <= 2).sum())
+    say("slope of r over speed, which has none: within two standard errors", f"{steady} of {len(each)}")
     say("devices of which a value is not told", str(untold))
     say("devices beside which others fit as well", str(several))
     say("devices not found", str(none))
