@@ -6,8 +6,9 @@
 
 Devices have d, kappa, r and gamma of their own; the search for kappa and r begins a tenth off (kappa by a factor, r by
 a tenth of 1, one standard deviation). Times are off by 1e-3 of a forcing period. One line a figure: how many truths are
-within two standard errors (95 of 100 are expected), likewise the slope of the test of constancy, the root of the mean square error in standard errors, which devices
-have values that are not told, or others that fit as well, and seconds: of the first fit, which compiles, and of others.
+within two standard errors (95 of 100 are expected), and the root of the mean square error in standard errors; likewise
+how many slopes of the test of constancy; which devices have values that are not told, or others that fit as well; and
+seconds: of the first fit, which compiles, and of others.
 """
 
 import argparse
