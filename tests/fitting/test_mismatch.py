@@ -67,10 +67,9 @@ def test_derivatives_by_times_and_unknowns(scene):
         assert off.max() < 3e-4
 
 
+@pytest.mark.parametrize("scene", ["the sine", "rigid"], indirect=True)
 def test_offset_and_slope_are_those_of_restitution(scene):
     model, _, _ = scene
-    if "r" not in model.names:
-        pytest.skip("the offset is compared with the derivative by r")
     linear = about(scene)
     r = float(model.device.r)
     by_r = linear.by_unknown[:, model.names.index("r")] / r
