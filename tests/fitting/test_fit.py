@@ -14,7 +14,7 @@ ERROR = 1e-3 * PERIOD
 
 
 @pytest.fixture(scope="module")
-def chaotic():
+def timed():
     return measured(DEVICE, 100, error=ERROR, seed=1)
 
 
@@ -22,8 +22,8 @@ def pulls(found, **truth):
     return np.array([(found.values[name] - value) / found.stderr[name] for name, value in truth.items()])
 
 
-def test_a_device_comes_back_from_its_times(chaotic):
-    found = vijax.fit(chaotic.times, chaotic.sides, timing_error=ERROR, device=GUESS)
+def test_a_device_comes_back_from_its_times(timed):
+    found = vijax.fit(timed.times, timed.sides, timing_error=ERROR, device=GUESS)
     assert found.converged
     assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
     assert found.stderr["omega0"] < 0.05
@@ -33,7 +33,7 @@ def test_a_device_comes_back_from_its_times(chaotic):
     assert abs(found.constancy.slope) < 3 * found.constancy.stderr
     assert not found.astray.any()
     assert found.untold == found.alternatives == ()
-    np.testing.assert_allclose(found.speeds, chaotic.speeds, atol=0.01)
+    np.testing.assert_allclose(found.speeds, timed.speeds, atol=0.01)
     assert float(found.device.omega0) == found.values["omega0"]
     assert "impacts left out: 0" in str(found)
 
@@ -45,19 +45,19 @@ def test_without_errors_it_is_exact():
     assert found.values["r"] == pytest.approx(0.6, rel=1e-7)
 
 
-def test_speeds_add_to_what_is_known(chaotic):
+def test_speeds_add_to_what_is_known(timed):
     error = 0.01
-    speeds = chaotic.speeds + error * np.random.default_rng(2).normal(size=chaotic.speeds.size)
+    speeds = timed.speeds + error * np.random.default_rng(2).normal(size=timed.speeds.size)
     told = {"timing_error": ERROR, "device": GUESS}
-    found = vijax.fit(chaotic.times, speeds=chaotic.sides * speeds, speed_error=error, **told)
-    plain = vijax.fit(chaotic.times, chaotic.sides, **told)
+    found = vijax.fit(timed.times, speeds=timed.sides * speeds, speed_error=error, **told)
+    plain = vijax.fit(timed.times, timed.sides, **told)
     assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
     assert found.stderr["r"] < plain.stderr["r"]
-    assert found.misfit.freedom == plain.misfit.freedom + chaotic.times.size - 1
+    assert found.misfit.freedom == plain.misfit.freedom + timed.times.size - 1
 
 
-def test_impacts_that_the_bench_missed_or_invented_are_left_out(chaotic):
-    times, sides = chaotic.times, chaotic.sides
+def test_impacts_that_the_bench_missed_or_invented_are_left_out(timed):
+    times, sides = timed.times, timed.sides
     kept = np.ones(times.size, bool)
     kept[60] = False
     times, sides = times[kept], sides[kept]
@@ -71,15 +71,15 @@ def test_impacts_that_the_bench_missed_or_invented_are_left_out(chaotic):
     assert found.astray.sum() <= 12
 
 
-def test_units_of_pint(chaotic):
+def test_units_of_pint(timed):
     # Not dropped: milliseconds are no seconds, and metres no times.
     ureg = pint.UnitRegistry()
     told = {"device": GUESS}
-    plain = vijax.fit(chaotic.times, chaotic.sides, timing_error=ERROR, **told)
-    with_units = vijax.fit(chaotic.times * 1e3 * ureg.ms, chaotic.sides, timing_error=ERROR * 1e6 * ureg.us, **told)
+    plain = vijax.fit(timed.times, timed.sides, timing_error=ERROR, **told)
+    with_units = vijax.fit(timed.times * 1e3 * ureg.ms, timed.sides, timing_error=ERROR * 1e6 * ureg.us, **told)
     assert with_units.values["r"] == pytest.approx(plain.values["r"], rel=1e-6)
     with pytest.raises(ValueError, match="time must be in s"):
-        vijax.fit(chaotic.times * ureg.m, chaotic.sides, timing_error=ERROR, **told)
+        vijax.fit(timed.times * ureg.m, timed.sides, timing_error=ERROR, **told)
     record = vijax.Record(np.arange(5) * 1e3 * ureg.ms, np.ones(5) * ureg.cm / ureg.s**2)
     assert record.step == pytest.approx(1.0)
     assert record.acceleration[0] == pytest.approx(0.01)
