@@ -17,6 +17,8 @@ ROUGH = vijax.Harmonics([0.0, 0.4], [0.0, 1.0]) + vijax.Waveform(
 )
 SCENES = {
     "the sine": (vijax.Harvester(s=0.02, omega=10.0, A=3.0, omega0=60.0, r=0.6), None, "soft", ("omega0", "r")),
+    # A ball that stays in a membrane for more than three half turns, on the verge of leaving it sooner.
+    "slow": (vijax.Harvester(s=0.012, omega=11.25, A=4.24, omega0=49.54, r=0.724), None, "soft", ("omega0", "r")),
     "rigid": (vijax.Harvester(s=0.02, omega=10.0, A=3.0, r=0.6, beta=0.01), None, "rigid", ("s", "r")),
     "all at once": (SIDES, ROUGH, "soft", ("kappa_left", "r_right", "gamma", "A")),
 }
@@ -52,6 +54,7 @@ def test_they_hold_on_a_motion_of_the_engine(scene):
     assert linear.off.size == series.equations
 
 
+@pytest.mark.parametrize("scene", ["the sine", "rigid", "all at once"], indirect=True)
 def test_derivatives_by_times_and_unknowns(scene):
     _, series, z = scene
     linear = about(scene)
