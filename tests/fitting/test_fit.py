@@ -1,11 +1,16 @@
 """`vijax.fit`: the device comes back from its impacts, with errors that hold, and what is not told is said."""
 
+import dataclasses
+
+import jax
 import numpy as np
 import pint
 import pytest
 
 import vijax
 from tests.fitting.bench import SIDES, measured, measured_one_by_one
+from vijax.fitting import verdict
+from vijax.model.device import with_pair
 
 DEVICE = vijax.Harvester(s=0.02, omega=10.0, A=3.0, omega0=60.0, r=0.6)
 GUESS = vijax.Harvester(s=0.02, omega=10.0, A=3.0, omega0=52.0, r=0.5)
@@ -94,6 +99,56 @@ def test_a_fit_that_says_nothing_prints():
     assert "misfit" in str(found)
     assert not (found.converged and found.misfit.freedom < 1)
     assert found.report()["misfit"]["freedom"] == found.misfit.freedom
+
+
+def test_errors_that_are_larger_than_was_said_are_those_of_the_values_too(timed):
+    right = vijax.fit(timed.times, timed.sides, timing_error=ERROR, device=GUESS)
+    bold = vijax.fit(timed.times, timed.sides, timing_error=ERROR / 4, device=GUESS)
+    assert bold.misfit.size == pytest.approx(4 * right.misfit.size, rel=0.15)
+    assert bold.misfit.p_value < 1e-6
+    assert bold.stderr["r"] == pytest.approx(right.stderr["r"] * right.misfit.size, rel=0.3)
+    assert bold.converged
+    # Of errors that are larger by far no device is said to be found.
+    assert not vijax.fit(timed.times, timed.sides, timing_error=ERROR / 16, device=GUESS).converged
+
+
+def test_a_sum_that_rises_more_slowly_than_its_derivatives_say_widens_the_errors(monkeypatch):
+    impacts = measured(DEVICE, 60, wall="rigid", error=ERROR, seed=4)
+    told = {"timing_error": ERROR, "device": DEVICE, "unknown": ("s", "r"), "wall": "rigid"}
+    plain = vijax.fit(impacts.times, impacts.sides, **told)
+    # Two standard errors off it rises by 4. Where by 1, they are one.
+    monkeypatch.setattr(verdict, "rises", lambda *_: 1.0)
+    wider = vijax.fit(impacts.times, impacts.sides, **told)
+    assert wider.stderr["r"] == pytest.approx(2 * plain.stderr["r"], rel=1e-6)
+
+
+def test_a_value_that_runs_to_its_limit_is_not_told():
+    # One kind of impact cannot tell four unknowns: r runs to 1, where nothing is lost.
+    device = vijax.Harvester(s=0.08, omega=10.0, A=3.0, r=0.4)
+    impacts = measured(device, 150, wall="rigid", error=ERROR, skip=180, seed=1)
+    unknown = ("r", "s", "beta", "delay")
+    found = vijax.fit(impacts.times, impacts.sides, timing_error=ERROR, device=device, unknown=unknown, wall="rigid")
+    assert found.untold
+    assert found.stderr["r"] == np.inf
+
+
+def test_of_devices_that_fit_as_well_the_nearest_to_what_was_known_is_taken():
+    # A motion of few kinds of impact has two devices, which differ by a factor of two in stiffness.
+    pair = vijax.impact_pair(d=0.2619, kappa=9.993, r=0.6963, gamma=0.0396)
+    device = jax.tree.map(float, with_pair(vijax.Harvester(), pair))
+    impacts = measured(device, 150, skip=60, error=2e-3, seed=3)
+    ends = []
+    for stiffness, r in ((0.9, 0.65), (2.2, 0.93)):
+        guess = dataclasses.replace(device, omega0=device.omega0 * stiffness, r=r)
+        found = vijax.fit(impacts.times, impacts.sides, timing_error=2e-3, device=guess)
+        assert found.converged
+        ends.append(found)
+    near, far = ends
+    assert abs(near.values["omega0"] - device.omega0) < 4 * near.stderr["omega0"]
+    assert far.values["omega0"] > 1.5 * device.omega0
+    assert abs(near.misfit.chi2 - far.misfit.chi2) < 9
+    others = [other["omega0"] for other in (*near.alternatives, *far.alternatives)]
+    assert others
 
 
 def test_what_cannot_be_told_apart_is_named():

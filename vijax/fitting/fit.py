@@ -103,7 +103,7 @@ def fit(
     known = _known(model)
     limits = _limits(model, known)
     ends = least_squares(model, series, np.clip(_begin(model, series, known), *limits), limits)
-    return told(model, series, ends, known)
+    return told(model, series, ends, known, limits)
 
 
 def _take_names(unknown: str | Iterable[str], device: Harvester, wall: Walls) -> tuple[str, ...]:

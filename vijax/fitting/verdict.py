@@ -30,6 +30,8 @@ _IMPROBABLE, _WORST = 1e-3, 5.0
 # A sum of squares that rises by less than this where it should by 4 is flatter than its derivatives say; and no flatter
 # than can be told from rounding.
 _FLATTER, _FLAT = 2.0, 1e-4
+# A variable that is so near its limit has reached it.
+_AT_LIMIT = 1e-3
 # A derivative of which others leave less than this part is one of theirs.
 _REST = 1e-6
 
@@ -41,7 +43,7 @@ class _Errors(NamedTuple):
     untold: tuple[tuple[str, ...], ...]
 
 
-def told(model: FitModel, series: Series, ends: list[Settled], begin: np.ndarray) -> Fit:
+def told(model: FitModel, series: Series, ends: list[Settled], begin: np.ndarray, limits: np.ndarray) -> Fit:
     """Make the record of a fit.
 
     Args:
@@ -49,10 +51,11 @@ def told(model: FitModel, series: Series, ends: list[Settled], begin: np.ndarray
         series: What it was fitted to.
         ends: Where searches ended, the least sum of squares first.
         begin: Variables of the unknowns where they began: of devices that fit as well the nearest one is taken.
+        limits: Least and largest ones that were looked at [2, unknown].
     """
     as_good = [end for end in ends if end.chi2 <= ends[0].chi2 + _SAME_FIT]
     end = min(as_good, key=lambda one: np.abs(one.z - begin).max()) if as_good else ends[0]
-    covariance, untold = _errors(model, series, end)
+    covariance, untold = _errors(model, series, end, limits)
     freedom = int(end.used.sum()) - len(model.names)
     misfit = Misfit(float((end.residuals**2).sum()), freedom)
     if misfit.p_value < _IMPROBABLE:
@@ -105,7 +108,7 @@ def _per_variable(model: FitModel, z: np.ndarray) -> np.ndarray:
     return np.array([delay_unit(model.device) if name == DELAY else scale[name] for name in model.names])
 
 
-def _errors(model: FitModel, series: Series, end: Settled) -> _Errors:
+def _errors(model: FitModel, series: Series, end: Settled, limits: np.ndarray) -> _Errors:
     """Find the covariance of variables from the derivatives of residuals by them, and from how the sum rises.
 
     The errors of the times make equations differ that would be one, as those of a motion that repeats: derivatives
@@ -120,11 +123,14 @@ def _errors(model: FitModel, series: Series, end: Settled) -> _Errors:
             spreads[k] = spread * np.sqrt(4 / max(rise, _FLAT)) if rise < _FLATTER else spread
     vague, absent = spreads > _UNTOLD, spreads > _NOT_THERE
     parts = [tuple(name for name, part in zip(names, way, strict=True) if abs(part) > _PART) for way in directions]
+    # A value that ran to its limit is none.
+    stuck = np.abs(limits - end.z).min(axis=0) < _AT_LIMIT
     untold = tuple(dict.fromkeys(part for part, one in zip(parts, vague, strict=True) if one))
+    untold += tuple((name,) for name, one in zip(names, stuck, strict=True) if one)
     known = directions[~vague]
     covariance = (known.T * spreads[~vague] ** 2) @ known
     # What bends along with something vague is vague, too; of what is absent the others do not know.
-    lost = set(names) if (vague & ~absent).any() else {name for part in untold for name in part}
+    lost = set(names) if (vague & ~absent).any() or stuck.any() else {name for part in untold for name in part}
     for k, name in enumerate(names):
         if name in lost:
             covariance[k, :] = covariance[:, k] = np.nan
