@@ -27,7 +27,7 @@ SCENES = {
 @pytest.fixture(scope="module", params=SCENES)
 def scene(request):
     device, excitation, wall, names = SCENES[request.param]
-    impacts = measured(device, 40, excitation=excitation, wall=wall)
+    impacts = measured(device, 120 if request.param == "slow" else 40, excitation=excitation, wall=wall)
     longest = 2 * float(np.diff(impacts.times).max() * device.omega / np.pi)
     known = jax.tree.map(np.asarray, device)
     model = FitModel(known, names, wall, jax.tree.map(np.asarray, shaking(excitation, longest, 5.0)))
@@ -49,7 +49,9 @@ def test_they_hold_on_a_motion_of_the_engine(scene):
     told = linear.answered & (np.abs(linear.off) < 1e-9)
     # Of several ways from an impact to the next that of the ball is taken, under a rough push almost always.
     assert told.mean() > (0.98 if model.shaking.sampled else 0.999)
-    assert np.abs(linear.off[told]).max() < 1e-12
+    # On the verge of leaving, a contact multiplies rounding.
+    assert np.abs(linear.off[told]).max() < 1e-11
+    assert np.median(np.abs(linear.off)) < 1e-13
     assert linear.outside.max() <= 1e-9
     assert linear.off.size == series.equations
 
