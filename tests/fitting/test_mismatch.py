@@ -6,10 +6,11 @@ import pytest
 
 import vijax
 from tests.fitting.bench import SIDES, measured
-from vijax.fitting.mismatch import FitModel, linearised
+from vijax.fitting import unknowns
+from vijax.fitting.fit_model import FitModel
+from vijax.fitting.mismatch import least_chain, linearised
 from vijax.fitting.series import Series
 from vijax.fitting.shaking import shaking
-from vijax.model.variables import value_of, variables
 
 # Every kind of push at once: a harmonic besides the sine's, and samples that make a knot in every contact.
 ROUGH = vijax.Harmonics([0.0, 0.4], [0.0, 1.0]) + vijax.Waveform(
@@ -30,10 +31,10 @@ def scene(request):
     impacts = measured(device, 120 if request.param == "slow" else 40, excitation=excitation, wall=wall)
     longest = 2 * float(np.diff(impacts.times).max() * device.omega / np.pi)
     known = jax.tree.map(np.asarray, device)
-    model = FitModel(known, names, wall, jax.tree.map(np.asarray, shaking(excitation, longest, 5.0)))
+    shape = jax.tree.map(np.asarray, shaking(excitation, longest, 5.0))
+    model = FitModel(known, names, wall, shape, unknowns.limits(device, names))
     series = Series(impacts.times, impacts.sides, impacts.speeds, 1e-3, 1e-3)
-    z = variables(names, [float(value_of(device, name)) for name in names])
-    return model, series, z
+    return model, series, unknowns.known(device, names)
 
 
 def about(scene, z=None, times=None):
@@ -83,3 +84,14 @@ def test_offset_and_slope_are_those_of_restitution(scene):
     every, speeds = linear.by_restitution, linear.speeds[linear.impact]
     about_speed = linear.own_variance > 0
     np.testing.assert_allclose(every[about_speed, 1], (every[:, 0] * speeds)[about_speed], rtol=1e-6)
+
+
+def test_the_chain_of_motions_that_agree_best_is_taken():
+    # The first motion of the middle interval is as good by itself, but does not fit what comes before and after.
+    speeds = np.array([[0.3, np.nan], [0.5, 0.2], [0.4, 0.9]])
+    arrivals = np.array([[0.2, np.nan], [0.9, 0.4], [0.1, 0.1]])
+    own = np.where(np.isnan(speeds), 10.0, 0.0)
+    np.testing.assert_array_equal(least_chain(speeds, arrivals, own), [0, 1, 0])
+    # Unless that costs more than it is off: then the last one is taken that fits the first.
+    own[1, 1] = 1.0
+    np.testing.assert_array_equal(least_chain(speeds, arrivals, own), [0, 0, 1])

@@ -103,15 +103,14 @@ class Forcing(eqx.Module):
         if self.samples is None:
             return None
         index = _interval(k, self.every)
-        after = index + 1
+        return self.sample(index), self.sample(index + 1)
+
+    def sample(self, index: Values) -> Values:
+        """Look up samples by their numbers, however many loops that is; of a record that ends the last one stays."""
         if self.looped:
             # Not `jnp.mod`, which calls a library for every lane.
             index = index - self.count * jnp.floor(index / self.count)
-            after = jnp.where(index + 1 >= self.count, 0.0, index + 1)
-        last = self.count - 1
-        # Of a record that ends the last value stays.
-        before, after = (self.samples[jnp.minimum(i, last).astype(jnp.int32)] for i in (index, after))
-        return before, after
+        return present(self.samples)[jnp.minimum(index, self.count - 1).astype(jnp.int32)]
 
     def draws(self, pair: ImpactPair, state: State, k: Scalar) -> Draws | None:
         """Begin a lane's noise: its key is made of the seed, the cell's parameters and the start, and nothing else.

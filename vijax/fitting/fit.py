@@ -3,36 +3,27 @@
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from vijax.fitting.fitted import DELAY, Fit
+from vijax.fitting.fit_model import FitModel
+from vijax.fitting.fitted import Fit
 from vijax.fitting.series import Series, take_series
 from vijax.fitting.shaking import Shaking, shaking
+from vijax.fitting.unknowns import DELAY, half_period, known, limits, take_names
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, one_device
 from vijax.model.excitation import Excitation, Noise, Record, Waveform, instance
 from vijax.model.pair import WALLS
-from vijax.model.quantities import whole
-from vijax.model.sides import Sides, apart
+from vijax.model.sides import apart
 from vijax.model.units import Given
-from vijax.model.variables import LINEAR, NAMES, check_names, moving, value_of, variables
+from vijax.model.variables import LINEAR
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.lattice import lattice
 from vijax.runtime.pages import see
 
-if TYPE_CHECKING:
-    from vijax.fitting.mismatch import FitModel
-
-UNKNOWN = (*(name for name in NAMES if moving(name)), DELAY)
-"""What may be unknown: all that the motion depends on, and the clock."""
-
-# Variables may move by so much from where they begin, a factor of 20; those of inclinations and delays need not.
-_FAR = 3.0
-_LEAST_R = 1e-3
 # The search begins at the best of so many places about the device as it is known: their variables differ by so much at
 # most, of inclinations by less.
 _PLACES, _ABOUT, _LINEAR_ABOUT = 16, 0.2, 0.02
@@ -85,46 +76,24 @@ def fit(
         ValueError: Which argument, what must hold, what came.
     """
     # Here, as SciPy takes half a second, and importing vijax must not load it.
-    from vijax.fitting.mismatch import FitModel
-    from vijax.fitting.profile import least_squares
+    from vijax.fitting.search import least_squares
     from vijax.fitting.verdict import told
 
     series = take_series(times, sides, speeds, timing_error, speed_error)
     device = one_device(device)
     checks.choice("wall", wall, WALLS)
-    names = _take_names(unknown, device, wall)
+    names = take_names(unknown, device, wall)
     if series.equations <= len(names):
         raise ValueError(
             f"times must be so many that they say more than there are unknowns: of {len(names)} at least "
             f"{len(names) + 3} impacts without speeds; got {series.times.size}"
         )
     series, shaken = _clocked(series, excitation, device, names)
-    model = FitModel(jax.tree.map(np.asarray, device), names, wall, _shaking(series, shaken, device, wall))
-    known = _known(model)
-    limits = _limits(model, known)
-    ends = least_squares(model, series, np.clip(_begin(model, series, known), *limits), limits)
-    return told(model, series, ends, known, limits)
-
-
-def _take_names(unknown: str | Iterable[str], device: Harvester, wall: Walls) -> tuple[str, ...]:
-    """Check the names of the unknowns; the delay comes last.
-
-    Raises:
-        ValueError: Which, and what to do.
-    """
-    given = checks.words("unknown", unknown, UNKNOWN)
-    if given.count(DELAY) > 1:
-        raise ValueError(f"unknown must name a quantity once; got {DELAY} and {DELAY}")
-    names = tuple(name for name in given if name != DELAY)
-    if names:
-        check_names(names, "unknown")
-    for name in names:
-        hard = wall == "rigid" or name.endswith(f"_{wall.removeprefix('rigid_')}")
-        if hard and whole(name) in ("kappa", "omega0", "k"):
-            raise ValueError(f'unknown must be told by rigid walls; got {name}; wall="soft" has membranes')
-        if isinstance(value_of(device, name), Sides):
-            raise ValueError(f"unknown must name {name}_left or {name}_right, or both, as walls differ; got {name}")
-    return names + (DELAY,) * (DELAY in given)
+    shape = _shaking(series, shaken, device, wall)
+    model = FitModel(jax.tree.map(np.asarray, device), names, wall, shape, limits(device, names))
+    begin = known(device, names)
+    ends = least_squares(model, series, _begin(model, series, begin))
+    return told(model, series, ends, begin)
 
 
 def _clocked(
@@ -146,7 +115,7 @@ def _clocked(
         series = replace(series, times=series.times - record.time[0])
     shaken = excitation.scaled(device)
     for wave in shaken.of(Waveform):
-        last = wave.periods * 2 * math.pi / float(device.omega)
+        last = wave.periods * 2 * half_period(device)
         within = (series.times >= 0) & (wave.looped | (series.times <= last))
         if not within.all():
             raise ValueError(
@@ -158,43 +127,21 @@ def _clocked(
 
 def _shaking(series: Series, excitation: Excitation | None, device: Harvester, wall: Walls) -> Shaking:
     """Bring the excitation into the form of fits; unknowns may stretch intervals and soften walls by a half."""
-    half_period = math.pi / float(device.omega)
-    longest = float(np.diff(series.times).max()) / half_period
+    longest = float(np.diff(series.times).max()) / half_period(device)
     omega0 = apart(device.omega0)
-    softest = math.inf if wall == "rigid" else min(float(omega0.left), float(omega0.right)) * half_period
+    softest = math.inf if wall == "rigid" else min(float(omega0.left), float(omega0.right)) * half_period(device)
     return jax.tree.map(np.asarray, shaking(excitation, 2 * longest, softest / 2))
 
 
-def _begin(model: "FitModel", series: Series, known: np.ndarray) -> np.ndarray:
+def _begin(model: FitModel, series: Series, here: np.ndarray) -> np.ndarray:
     """Choose where to begin: at the device as it is known, or about it where that explains more, at any delay."""
-    from vijax.fitting.profile import answers, best_begin
+    from vijax.fitting.search import answers, best_begin
 
+    if DELAY not in model.names and answers(model, series, here):
+        return here
     moves = np.array([_LINEAR_ABOUT if name in LINEAR else _ABOUT for name in model.names])
-    points = np.vstack([np.zeros(len(known)), 2 * lattice(_PLACES, len(known)).T - 1])
     if DELAY in model.names:
         moves[-1] = 0.0 if model.shaking.sampled else 1.0
-    places = [known + moves * point for point in points]
-    enough = DELAY not in model.names and answers(model, series, known)
-    return known if enough else best_begin(model, series, places)
-
-
-def _known(model: "FitModel") -> np.ndarray:
-    """Give the variables of the device as it is known."""
-    plain = tuple(name for name in model.names if name != DELAY)
-    z = variables(plain, [float(value_of(model.device, name)) for name in plain]) if plain else np.zeros(0)
-    return np.append(z, 0.0) if DELAY in model.names else z
-
-
-def _limits(model: "FitModel", begin: np.ndarray) -> np.ndarray:
-    """Give the least and the largest variables that are looked at [2, unknown]."""
-    steepest = 0.99 * float(model.device.g / model.device.A)
-    widths = {"beta": 0.49 * math.pi, "gamma": steepest, DELAY: 1.0}
-    limits = []
-    for name, x in zip(model.names, begin, strict=True):
-        if whole(name) == "r":
-            limits.append((math.log(_LEAST_R), 0.0))
-        elif name in widths:
-            limits.append((-widths[name], widths[name]))
-        else:
-            limits.append((x - _FAR, x + _FAR))
-    return np.array(limits).T
+    points = 2 * lattice(_PLACES, len(here)).T - 1
+    places = np.clip([here, *(here + moves * point for point in points)], *model.limits)
+    return best_begin(model, series, list(places))

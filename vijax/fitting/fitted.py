@@ -7,17 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from vijax.fitting.unknowns import unit_of
 from vijax.model.device import Harvester
-from vijax.model.quantities import QUANTITIES
 from vijax.runtime import checks
-
-DELAY = "delay"
-"""The unknown that is no constant of a device: by how much the clock of the times is behind that of the excitation."""
-
-
-def delay_unit(device: Harvester) -> float:
-    """Give the seconds of a delay whose variable is 1: half a forcing period."""
-    return math.pi / float(device.omega)
 
 
 @dataclass(frozen=True)
@@ -137,8 +129,3 @@ class Fit:
             return "whether restitution hangs on speed is not told: all impacts are as fast as each other"
         told = "hangs on speed" if test.p_value < 0.01 else "constant as far as is told"
         return f"restitution: {told}, dr/dv = {test.slope:.2g} +- {test.stderr:.2g} per m/s (p = {test.p_value:.2g})"
-
-
-def unit_of(name: str) -> str:
-    """Name the SI unit of an unknown."""
-    return "s" if name == DELAY else QUANTITIES[name].unit

@@ -19,6 +19,7 @@ from vijax.fitting.shaking import Shaking
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import Flag, Scalar, Values
+from vijax.runtime.linear_solve import solve
 
 # Newton's steps, most of which take 5; a step changes neither number by more than half, and the last by less than this.
 _MOST_STEPS = 15
@@ -160,7 +161,7 @@ def _behind_soft(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], near
     found, arrived = _newton(partial(_missed, args=frozen), lax.stop_gradient(jnp.stack([near.speed, near.stay])))
     x = _implicit(_missed, found, (pair, told))
     speed, stay = x[0], x[1]
-    out, arrival = _left_and_arrived(x, (pair, told))
+    _, out, _, arrival = _contact_and_flight(x, (pair, told))
     # A contact is over when the ball first comes back.
     wall = _membrane(pair, added, speed)
     depths = [shaking.contact(wall, pair.gamma, ends.side, ends.t, speed, part * stay)[0] for part in _PLACES]
@@ -191,11 +192,6 @@ def _missed(x: Array, args: Any) -> Float[Array, "2"]:
     return jnp.stack([w / x[1], miss])
 
 
-def _left_and_arrived(x: Array, args: Any) -> tuple[Scalar, Scalar]:
-    _, out, _, arrival = _contact_and_flight(x, args)
-    return out, arrival
-
-
 def _needed(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar) -> Scalar:
     """Compute the velocity with which a ball that leaves the first wall at a time meets the next one in time."""
     s = ends.next_t - t
@@ -212,7 +208,7 @@ def _newton(equations: Callable[[Array], Array], x: Float[Array, "2"]) -> tuple[
 
     def go(carry):
         count, x, _ = carry
-        step = _solved(jax.jacfwd(equations)(x), -equations(x)) / x
+        step = solve(jax.jacfwd(equations)(x), -equations(x)) / x
         step = jnp.where(jnp.isfinite(step), jnp.clip(step, -_HALF, _HALF), 0.0)
         return count + 1, x * (1 + step), jnp.abs(step).max()
 
@@ -225,12 +221,7 @@ def _implicit(equations: Callable[[Array, Any], Array], x: Array, args: Any) -> 
     x = lax.stop_gradient(x)
     slopes = lax.stop_gradient(jax.jacfwd(equations)(x, args))
     moved = equations(x, args)
-    return x - _solved(slopes, moved - lax.stop_gradient(moved))
-
-
-def _solved(matrix: Float[Array, "2 2"], right: Float[Array, "2"]) -> Float[Array, "2"]:
-    (a, b), (c, d) = matrix
-    return jnp.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
+    return x - solve(slopes, moved - lax.stop_gradient(moved))
 
 
 def _flown_outside(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar, out: Scalar) -> Scalar:

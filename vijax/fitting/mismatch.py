@@ -14,37 +14,20 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-from vijax.fitting.fitted import DELAY
+from vijax.fitting.fit_model import FitModel
 from vijax.fitting.interval import Ends, Interval, Motion, Restitution, interval, motions
 from vijax.fitting.series import Series
 from vijax.fitting.shaking import Shaking
+from vijax.fitting.unknowns import DELAY, made
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.model.variables import tuned
 from vijax.runtime import tiles
 from vijax.runtime.programs import jitted
 
 _TILES = (64, 1024)  # intervals of one compiled call
 # An interval without a motion costs a chain as much as motions that differ by so much, in units of A pi/omega.
 _NO_MOTION = 10.0
-
-
-@dataclass(frozen=True)
-class FitModel:
-    """What is fitted to a series.
-
-    Attributes:
-        device: Gives all that is not fitted.
-        names: What is: quantities of the device, and `DELAY`.
-        wall: What the walls are.
-        shaking: The excitation.
-    """
-
-    device: Harvester
-    names: tuple[str, ...]
-    wall: Walls
-    shaking: Shaking
 
 
 @dataclass(frozen=True)
@@ -93,12 +76,11 @@ class _InUnits(NamedTuple):
     ends: Ends
 
 
-def _scene(device: Harvester, names: tuple[str, ...], wall: Walls, z: Array, row: _Row) -> _InUnits:
-    plain = tuple(name for name in names if name != DELAY)
-    made = tuned(device, plain, z[: len(plain)]) if plain else device
+def _in_units(device: Harvester, names: tuple[str, ...], wall: Walls, z: Array, row: _Row) -> _InUnits:
+    own = made(device, names, z)
     delay = z[-1] * jnp.pi / device.omega if DELAY in names else 0.0
-    t, next_t = ((when - delay) * made.omega / jnp.pi for when in (row.time, row.next_time))
-    return _InUnits(made, made.pair(wall), Ends(row.side, row.next_side, t, next_t))
+    t, next_t = ((when - delay) * own.omega / jnp.pi for when in (row.time, row.next_time))
+    return _InUnits(own, own.pair(wall), Ends(row.side, row.next_side, t, next_t))
 
 
 @partial(jitted, static=("names", "wall"))
@@ -108,7 +90,7 @@ def _possible(
     """List the motions of every interval [interval, motion]."""
 
     def each(row: _Row) -> Interval:
-        scene = _scene(device, names, wall, z, row)
+        scene = _in_units(device, names, wall, z, row)
         return motions(scene.pair, shaking, scene.ends)
 
     return jax.vmap(each)(rows)
@@ -128,7 +110,7 @@ def _said(
 
     def numbers(x: Array, row: _Row, near: Motion) -> tuple[Array, tuple[Array, Interval]]:
         own, (offset, slope, time, next_time) = x[: len(names)], x[len(names) :]
-        scene = _scene(device, names, wall, own, row._replace(time=time, next_time=next_time))
+        scene = _in_units(device, names, wall, own, row._replace(time=time, next_time=next_time))
         found = interval(scene.pair, shaking, Restitution(offset, slope), scene.ends, near)
         values = jnp.stack([found.speed, found.arrival, found.speed * scene.device.speed_unit])
         return values, (values, found)
@@ -147,30 +129,38 @@ def _rows(series: Series, times: np.ndarray) -> _Row:
 
 
 def likely_motions(model: FitModel, series: Series, z: np.ndarray, times: np.ndarray) -> Motion:
-    """Find the motions from impact to impact that hang together best: speeds where two of them meet differ least.
-
-    The chain of least sum is found by dynamic programming, Viterbi's way: of every motion of an interval the best
-    chain that ends with it is known from those of the interval before.
-    """
+    """Find the motions from impact to impact that hang together best: speeds where two of them meet differ least."""
     asked: Any = (model.device, model.shaking, z)
     named = partial(_possible, *asked, names=model.names, wall=model.wall)
     found = jax.tree.map(np.asarray, tiles.map_tiles(named, _rows(series, times), _TILES))
-    speeds, arrivals = found.speed, series.sides[1:, None] * found.arrival
-    own = np.where(np.isnan(speeds), _NO_MOTION, 0.0)
+    speeds, own = found.speed, np.where(np.isnan(found.speed), _NO_MOTION, 0.0)
     if series.speeds is not None:
         own += np.nan_to_num(np.abs(speeds - series.speeds[:-1, None] / float(model.device.speed_unit)))
+    which = least_chain(speeds, series.sides[1:, None] * found.arrival, own)
+    rows: Any = np.arange(len(which))
+    return Motion(speeds[rows, which], found.stay[rows, which])
+
+
+def least_chain(speeds: np.ndarray, arrivals: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Choose a motion of every interval, so that a sum is least: their own costs, and how little neighbours agree.
+
+    By dynamic programming, Viterbi's way: of every motion of an interval the best chain that ends with it is known
+    from those of the interval before.
+
+    Args:
+        speeds: At the first impact of an interval [interval, motion]; NaN for no motion.
+        arrivals: At the next one, towards its wall [interval, motion].
+        own: What a motion costs by itself [interval, motion].
+    """
     cost, came_from = own[0], []
     for k in range(1, len(speeds)):
-        steps = np.nan_to_num(np.abs(arrivals[k - 1][:, None] - speeds[k]), nan=0.0)
-        total = cost[:, None] + steps
+        total = cost[:, None] + np.nan_to_num(np.abs(arrivals[k - 1][:, None] - speeds[k]))
         came_from.append(total.argmin(axis=0))
         cost = total.min(axis=0) + own[k]
     chosen = [int(cost.argmin())]
     for before in reversed(came_from):
         chosen.append(int(before[chosen[-1]]))
-    which = np.array(chosen[::-1])
-    rows: Any = np.arange(len(which))
-    return Motion(found.speed[rows, which], found.stay[rows, which])
+    return np.array(chosen[::-1])
 
 
 def linearised(

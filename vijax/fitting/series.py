@@ -13,7 +13,7 @@ from vijax.runtime.arrays import present
 # What units of pint these may have: those of such a quantity.
 _KINDS = {"times": "time", "speeds": "speed"}
 # With fewer impacts there is no equation for any unknown.
-FEWEST = 4
+_FEWEST = 4
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def take_series(
         ValueError: Which argument, what must hold, what came.
     """
     when = _row("times", times)
-    if when.size < FEWEST:
-        raise ValueError(f"times must be at least {FEWEST} impacts; got {when.size}")
+    if when.size < _FEWEST:
+        raise ValueError(f"times must be at least {_FEWEST} impacts; got {when.size}")
     rises = np.append(True, np.diff(when) > 0)
     if not rises.all():
         raise ValueError(
@@ -88,7 +88,7 @@ def take_series(
 
 def _row(name: str, values: Any) -> np.ndarray:
     if isinstance(values, list | tuple) and not len(values):
-        raise ValueError(f"{name} must be one number an impact, of at least {FEWEST}; got none")
+        raise ValueError(f"{name} must be one number an impact, of at least {_FEWEST}; got none")
     array = np.asarray(checks.finite(name, units.plain(_KINDS.get(name, name), values)), float)
     if array.ndim != 1:
         raise ValueError(f"{name} must be a row of numbers, one an impact; got shape {array.shape}")

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from vijax.fitting.fitted import DELAY, ConstancyTest, Fit, Misfit, delay_unit
-from vijax.fitting.mismatch import FitModel
-from vijax.fitting.profile import Settled, rises
+from vijax.fitting.adjustment import Settled
+from vijax.fitting.fit_model import FitModel
+from vijax.fitting.fitted import ConstancyTest, Fit, Misfit
+from vijax.fitting.search import rises
 from vijax.fitting.series import Series
-from vijax.model.device import Harvester
-from vijax.model.variables import LINEAR, tuned, values
+from vijax.fitting.unknowns import made, natural, per_variable
 
 # A combination of unknowns whose variable (a logarithm, mostly) is not known to this much is not told by the data: its
 # standard error says nothing, as nothing is linear that far.
@@ -24,7 +24,7 @@ _SAME_FIT = 4.0
 # Devices this many standard errors apart are two.
 _APART = 3.0
 # If more than this part of the equations does not hold, the device is another.
-_MOST_ASTRAY = 1 / 3
+_MOST_LEFT_OUT = 1 / 3
 # A misfit that chance makes this rarely is none of chance; one of so many standard errors tells of another device.
 _IMPROBABLE, _WORST = 1e-3, 5.0
 # A sum of squares that rises by less than this where it should by 4 is flatter than its derivatives say; and no flatter
@@ -43,7 +43,7 @@ class _Errors(NamedTuple):
     untold: tuple[tuple[str, ...], ...]
 
 
-def told(model: FitModel, series: Series, ends: list[Settled], begin: np.ndarray, limits: np.ndarray) -> Fit:
+def told(model: FitModel, series: Series, ends: list[Settled], begin: np.ndarray) -> Fit:
     """Make the record of a fit.
 
     Args:
@@ -51,64 +51,40 @@ def told(model: FitModel, series: Series, ends: list[Settled], begin: np.ndarray
         series: What it was fitted to.
         ends: Where searches ended, the least sum of squares first.
         begin: Variables of the unknowns where they began: of devices that fit as well the nearest one is taken.
-        limits: Least and largest ones that were looked at [2, unknown].
     """
     as_good = [end for end in ends if end.chi2 <= ends[0].chi2 + _SAME_FIT]
     end = min(as_good, key=lambda one: np.abs(one.z - begin).max()) if as_good else ends[0]
-    covariance, untold = _errors(model, series, end, limits)
+    covariance, untold = _errors(model, series, end)
     freedom = int(end.used.sum()) - len(model.names)
     misfit = Misfit(float((end.residuals**2).sum()), freedom)
     if misfit.p_value < _IMPROBABLE:
         # Errors are larger than was said, or the model is too poor; then so are those of the unknowns.
         covariance = covariance * misfit.size**2
     others = [one for one in as_good if one is not end and _apart(one.z - end.z, covariance)]
-    values_now = natural(model, end.z)
     spread = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore"):
         correlation = covariance / np.outer(spread, spread)
-    device = _device(model, end.z)
+    known = model.device, model.names
+    device = jax.tree.map(float, made(*known, end.z))
     astray = np.zeros(series.times.size, bool)
     astray[end.linear.impact[~end.counts]] = True
     return Fit(
         device=device,
-        values=values_now,
-        stderr=dict(zip(model.names, map(float, spread * _per_variable(model, end.z)), strict=True)),
+        values=natural(*known, end.z),
+        stderr=dict(zip(model.names, map(float, spread * per_variable(*known, end.z)), strict=True)),
         correlation=correlation,
         untold=untold,
-        alternatives=tuple(natural(model, other.z) for other in others),
+        alternatives=tuple(natural(*known, other.z) for other in others),
         misfit=misfit,
         constancy=_constancy(model, end, float(device.speed_unit)),
         residuals=(series.times - end.times) / series.timing_error,
         speeds=end.linear.speeds * float(device.speed_unit),
         astray=astray,
-        converged=end.held and bool((~end.counts).mean() <= _MOST_ASTRAY) and misfit.size < _WORST,
+        converged=end.held and bool((~end.counts).mean() <= _MOST_LEFT_OUT) and misfit.size < _WORST,
     )
 
 
-def natural(model: FitModel, z: np.ndarray) -> dict[str, float]:
-    """Turn variables into values in SI units."""
-    plain = _plain(model)
-    found = dict(zip(plain, np.atleast_1d(values(plain, z[: len(plain)])).tolist(), strict=True)) if plain else {}
-    return found | ({DELAY: float(z[-1]) * delay_unit(model.device)} if DELAY in model.names else {})
-
-
-def _plain(model: FitModel) -> tuple[str, ...]:
-    return tuple(name for name in model.names if name != DELAY)
-
-
-def _device(model: FitModel, z: np.ndarray) -> Harvester:
-    plain = _plain(model)
-    made = tuned(model.device, plain, z[: len(plain)]) if plain else model.device
-    return jax.tree.map(float, made)
-
-
-def _per_variable(model: FitModel, z: np.ndarray) -> np.ndarray:
-    """Compute how much a value changes with its variable."""
-    scale = {name: 1.0 if name in LINEAR else value for name, value in natural(model, z).items()}
-    return np.array([delay_unit(model.device) if name == DELAY else scale[name] for name in model.names])
-
-
-def _errors(model: FitModel, series: Series, end: Settled, limits: np.ndarray) -> _Errors:
+def _errors(model: FitModel, series: Series, end: Settled) -> _Errors:
     """Find the covariance of variables from the derivatives of residuals by them, and from how the sum rises.
 
     The errors of the times make equations differ that would be one, as those of a motion that repeats: derivatives
@@ -124,7 +100,7 @@ def _errors(model: FitModel, series: Series, end: Settled, limits: np.ndarray) -
     vague, absent = spreads > _UNTOLD, spreads > _NOT_THERE
     parts = [tuple(name for name, part in zip(names, way, strict=True) if abs(part) > _PART) for way in directions]
     # A value that ran to its limit is none.
-    stuck = np.abs(limits - end.z).min(axis=0) < _AT_LIMIT
+    stuck = np.abs(model.limits - end.z).min(axis=0) < _AT_LIMIT
     untold = tuple(dict.fromkeys(part for part, one in zip(parts, vague, strict=True) if one))
     untold += tuple((name,) for name, one in zip(names, stuck, strict=True) if one)
     known = directions[~vague]

@@ -25,8 +25,7 @@ Given = Union[ArrayLike, Sequence[float], "Quantity[Any]"]
 """What may be given for a quantity: a number, an array or list of them, or such a quantity of pint."""
 
 UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
-UNITS |= {"time": "s", "speed": "m/s", "acceleration": "m/s^2"}  # of measured rows
-UNITS["depth"] = MEASURED["depth"].units
+UNITS |= {"depth": MEASURED["depth"].units, "time": "s", "speed": "m/s", "acceleration": "m/s^2"}
 """What plain numbers are in; a quantity that is not here has no unit."""
 
 _PI = r"pi(?![^\W\d])"  # not the pico of picofarads
