@@ -68,7 +68,10 @@ def ahead(parts: list[str]) -> float:
     asked: dict[str, dict[Any, dict[str, Any]]] = {"right": COMPARED, "impacts": WINDOWS, "maps": MAPS}
     planes = [one for part in parts for one in asked.get(part, {}).values()]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        wait([pool.submit(vijax.sweep, **one) for one in planes])  # what fails here fails again where it is measured
+        work = [pool.submit(vijax.sweep, **one) for one in planes]
+        if "basins" in parts:
+            work.append(pool.submit(vijax.basins, **STARTS))
+        wait(work)  # what fails here fails again where it is measured
     return time.perf_counter() - begun
 
 
@@ -103,20 +106,31 @@ WINDOWS: dict[int, dict[str, Any]] = {
 MAPS: dict[str, dict[str, Any]] = {
     "1024 x 1024": plane(1024),
     "2048 x 2048": plane(2048),
-    "512 x 512": plane(512),
     "512 x 512, gamma 0.5": plane(512, gamma=0.5),
     "512 x 512, float32": plane(512, dtype="float32"),
 }
 
 
+STARTS: dict[str, Any] = {"d": 0.2, "kappa": 3.0, "r": 0.5, "v0": np.linspace(-0.6, 0.6, 1000)}
+
+
 def impacts() -> Iterator[Figure]:
-    """Measure what an impact costs as lanes become many: windows of 100 periods, nothing but counts asked for."""
+    """Measure what an impact costs as lanes become many: windows, nothing but counts asked for.
+
+    And what each costs that a longer window has more: without what is done once for each cell, or each tile.
+    """
     import vijax
 
+    def run(asked: dict[str, Any]) -> tuple[float, float]:
+        number = asked["periods"] * float(vijax.sweep(**asked).impacts_per_period.sum())
+        return number, timed(partial(vijax.sweep, **asked), runs=2)
+
     for side, asked in WINDOWS.items():
-        number = 100 * float(vijax.sweep(**asked).impacts_per_period.sum())
-        seconds = timed(partial(vijax.sweep, **asked), runs=3 if side <= 1024 else 1)
+        number, seconds = run(asked)
         yield f"{side * side:,} cells, {number:.2g} impacts", 1e9 * seconds / number, "ns an impact"
+        more, longer = run(asked | {"periods": 1100 if side <= 1024 else 200})
+        rate = 1e9 * (longer - seconds) / (more - number)
+        yield f"{side * side:,} cells, each of {more - number:.2g} impacts more", rate, "ns an impact"
 
 
 def maps() -> Iterator[Figure]:
@@ -131,9 +145,7 @@ def basins() -> Iterator[Figure]:
     """Measure the basins of a million starts."""
     import vijax
 
-    work = partial(vijax.basins, d=0.2, kappa=3.0, r=0.5, v0=np.linspace(-0.6, 0.6, 1000))
-    work()
-    yield "1,000 x 1,000 starts", timed(work, runs=1), "s"
+    yield "1,000 x 1,000 starts", timed(partial(vijax.basins, **STARTS), runs=2), "s"
 
 
 def orbits() -> Iterator[Figure]:
@@ -151,7 +163,7 @@ def kernels() -> Iterator[Figure]:
     """Count the kernels of a trip, and what a step moves and computes: of the optimised program of a level plane."""
     import jax
 
-    from vijax.batch import lanes, rows, simulate
+    from vijax.batch import cell_program, lanes, rows, simulate
     from vijax.batch.cell import Plan, Settings
     from vijax.model.device import Harvester, electrical
     from vijax.runtime import xla
@@ -162,12 +174,12 @@ def kernels() -> Iterator[Figure]:
     device = jax.tree.map(lambda x: one, electrical(Harvester()))
     variant: Any = jax.ShapeDtypeStruct((1,), kind)
     settings = Settings(one, one, device, None, variant, variant)
-    table = jax.ShapeDtypeStruct((cells, rows.width(simulate.entry_shapes(plan, kind))), kind)
+    table = jax.ShapeDtypeStruct((cells, rows.width(cell_program.entry_shapes(plan, kind))), kind)
     width = simulate.width_of(cells)
 
     def tile(table, count, settings):
         outputs = rows.width(simulate.shapes(plan, kind))
-        return lanes.run(simulate.program(plan, settings), table, count, outputs, width)
+        return lanes.run(cell_program.program(plan, settings), table, count, outputs, width)
 
     begun = time.perf_counter()
     lowered = jax.jit(tile).lower(table, jax.ShapeDtypeStruct((), np.int32), settings)
@@ -182,9 +194,9 @@ def kernels() -> Iterator[Figure]:
         yield "kernels of a trip of all lanes", counted[0], "kernels"
         yield "copies of a trip", counted[1], "copies"
     first = jax.ShapeDtypeStruct((width, table.shape[1]), kind)
-    lane = jax.eval_shape(lambda first, settings: simulate.program(plan, settings).load(first), first, settings)
-    step = jax.jit(lambda cell, settings: simulate.program(plan, settings).step(cell)).lower(lane, settings).compile()
-    costs: Any = step.cost_analysis() or {}  # not every platform tells
+    lane = jax.eval_shape(lambda first, settings: cell_program.program(plan, settings).load(first), first, settings)
+    one_step = jax.jit(lambda cell, settings: cell_program.program(plan, settings).step(cell))
+    costs: Any = one_step.lower(lane, settings).compile().cost_analysis() or {}  # not every platform tells
     for name in _PEAK.keys() & costs.keys():
         most, told = _PEAK[name]
         yield f"{name} of a step of a lane, by XLA", costs[name] / width, "a step"

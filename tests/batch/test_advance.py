@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax.batch import advance, simulate
+from vijax.batch import advance, cell_program
 from vijax.batch.cell import Entry, Plan, Settings
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
@@ -35,7 +35,7 @@ def declined():
 
     @partial(jax.jit, compiler_options=xla.compiler_options())
     def work(entry):
-        fresh = simulate.load(PLAN, SETTINGS, entry)
+        fresh = cell_program.load(PLAN, SETTINGS, entry)
         cell = jax.lax.fori_loop(0, STEPS, lambda _, cell: advance.step(PLAN, SETTINGS, cell), fresh)
         request = advance.request(PLAN, SETTINGS, cell)
         return cell, advance.sampled_answer(PLAN, request), advance.careful_answer(PLAN, request)

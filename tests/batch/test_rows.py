@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from vijax.batch import rows, simulate
+from vijax.batch import cell_program, rows
 from vijax.batch.cell import Plan, Settings
 from vijax.batch.rows import pack, unpack, width
 from vijax.batch.summary import shapes, unload
@@ -80,9 +80,9 @@ def test_a_summary_has_the_shapes_that_are_said(asked, dtype):
     settings = Settings(number, number, device, None, variants, variants, number if plan.chained else None)
 
     def end(settings, entry):
-        return unload(plan, settings, simulate.load(plan, settings, entry))
+        return unload(plan, settings, cell_program.load(plan, settings, entry))
 
-    said, found = shapes(plan, jnp.dtype(dtype)), jax.eval_shape(end, settings, simulate.entry_shapes(plan, dtype))
+    said, found = shapes(plan, jnp.dtype(dtype)), jax.eval_shape(end, settings, cell_program.entry_shapes(plan, dtype))
     assert jax.tree.structure(said) == jax.tree.structure(found)
     for one, other in zip(jax.tree.leaves(said), jax.tree.leaves(found), strict=True):
         assert (one.shape, one.dtype) == (other.shape, other.dtype)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.yardstick import reference_rows
-from vijax.batch import lanes, perturbed, rows, simulate, summary
+from vijax.batch import cell_program, lanes, perturbed, rows, summary
 from vijax.design.average import Smoothness, average
 from vijax.engine.ground import Ground
 from vijax.model.device import CONSTANTS, Harvester
@@ -148,7 +148,7 @@ def test_a_traced_ensemble_runs_the_program_of_its_ground(monkeypatch, beta):
 
     def run(program, table, count, outputs, width):
         plan = program.step.args[0]
-        entry = rows.unpack(table, simulate.entry_shapes(plan, table.dtype))
+        entry = rows.unpack(table, cell_program.entry_shapes(plan, table.dtype))
         like = summary.shapes(plan, table.dtype)
         blank = rows.unpack(jnp.zeros((table.shape[0], outputs)), like)
         P = entry.pair.kappa[:, None] * jnp.where(plan.ground is Ground.LEVEL, 1.0, 2.0) + jnp.zeros_like(blank.P)

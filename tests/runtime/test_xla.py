@@ -90,6 +90,15 @@ def test_blocks_do_not_wait_for_each_other():
 
 
 @ON_CPU
+@pytest.mark.parametrize(("version", "known"), [((0, 10, 2), True), ((0, 11, 0), False), ((0, 12, 1), False)])
+def test_xla_is_asked_for_no_option_that_it_does_not_know(version, known, monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr(jax, "__version_info__", version)
+    assert ("xla_cpu_use_fusion_emitters" in xla.compiler_options()) == known
+    assert "xla_cpu_prefer_vector_width" in xla.compiler_options()
+
+
+@ON_CPU
 @pytest.mark.parametrize(("lanes", "whole"), [(1, 64), (64, 64), (65, 128), (512, 512)])
 def test_lanes_come_in_whole_blocks(lanes, whole):
     assert whole_blocks(lanes) == whole

@@ -3,7 +3,7 @@
 Knows no physics: a `Program` says what a cell is, what one quick step does to every lane at once, and what the rare
 lane that declines it needs instead. Memory is set by L and by the rows that go in and come out.
 
-Begin with `run`: refill, round, until nothing is left. A round (`_round`) is some quick steps of all lanes (`_steps`),
+Begin with `_run`: refill, round, until nothing is left. A round (`_round`) is some quick steps of all lanes (`_steps`),
 then the service of those that declined one (`_serve`), then the review of those that have stopped.
 """
 
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vijax.batch import rows
 from vijax.runtime.arrays import choose
 from vijax.runtime.xla import first, in_blocks, kernel, put, repeat, shared, whole_blocks
 
@@ -192,6 +193,13 @@ class _Table(NamedTuple):
     real: Int[Array, ""]
 
 
+class Left(NamedTuple):
+    """Cells that were not flown to their end: which (-1: none), and all that their lanes know of them, as rows."""
+
+    cell: Int[Array, "few"]
+    lanes: Float[Array, "few column"]
+
+
 def run(
     program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int
 ) -> Float[Array, "cell out"]:
@@ -209,7 +217,29 @@ def run(
     LLVM makes several loops of one, of whole vectors and of what is left, and fuses multiplications and additions in
     each as it sees fit.
     """
-    lanes, table = whole_blocks(lanes), _Table(cells, count)
+    return _run(program, _Table(cells, count), outputs, lanes, 0).results
+
+
+def run_most(
+    program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int, few: int
+) -> tuple[Float[Array, "cell out"], Left]:
+    """Do what `run` does until so few cells are left, whose rows of results are zeros; `resumed` goes on with them."""
+    queue = _run(program, _Table(cells, count), outputs, lanes, few)
+    batch = _first(queue.at.cell >= 0, few)
+    real = jnp.arange(few, dtype=jnp.int32) < batch.real
+    cell = jnp.where(real, queue.at.cell[batch.members], -1)
+    return queue.results, Left(cell, rows.pack(_take(queue.at.carry, batch.members)))
+
+
+def resumed(program: Program, like: Float[Array, "row in"]) -> Program:
+    """Make the program whose cells are rows of `Left`; `like` has the shape of rows of the one that left them."""
+    lane = jax.eval_shape(program.load, like)
+    return program._replace(load=partial(rows.unpack, like=lane))
+
+
+def _run(program: Program, table: _Table, outputs: int, lanes: int, few: int) -> _Queue:
+    """Run cells until none waits and no more than `few` are on a lane."""
+    lanes = whole_blocks(lanes)
     width = min(max(lanes // _SHARE, _FEWEST), lanes)
 
     def refill_and_round(queue: _Queue) -> _Queue:
@@ -217,9 +247,10 @@ def run(
         return queue._replace(at=queue.at._replace(carry=_round(program, width, queue.at)))
 
     def goes_on(queue: _Queue) -> Bool[Array, ""]:
-        return (queue.at.cell >= 0).any() | (queue.waiting < count)
+        busy = queue.at.cell >= 0
+        return (busy.sum() > few if few else busy.any()) | (queue.waiting < table.real)
 
-    return lax.while_loop(goes_on, refill_and_round, _all_waiting(program, table, outputs, lanes)).results
+    return lax.while_loop(goes_on, refill_and_round, _all_waiting(program, table, outputs, lanes))
 
 
 def _all_waiting(program: Program, table: _Table, outputs: int, lanes: int) -> _Queue:

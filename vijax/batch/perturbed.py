@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from vijax.batch import lanes, rows
 from vijax.batch.cell import TRANSIENT_SHARE, Entry, Plan, Settings, walls_of
-from vijax.batch.simulate import compiled, program, width_of
+from vijax.batch.cell_program import program
+from vijax.batch.simulate import compiled, width_of
 from vijax.batch.summary import Summary, shapes
 from vijax.engine.ground import Ground, ground_of
 from vijax.model.device import Harvester

@@ -10,19 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vijax.batch import advance, chain, lanes, rows, solver_steps
-from vijax.batch.attractor_search import blank_candidate, review
-from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, blank_tally, walls_of
+from vijax.batch import chain, lanes, rows, stragglers
+from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, walls_of
+from vijax.batch.cell_program import entry_shapes, program
 from vijax.batch.recurrence import MAX_PERIOD, recurrence, settled
 from vijax.batch.summary import Summary, shapes, unload
-from vijax.engine import exact, quick_wall
+from vijax.engine import exact
 from vijax.engine.ground import ground_of
-from vijax.engine.impact import Arrival, Ball
 from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device, electrical
 from vijax.model.pair import ImpactPair, check_pair
-from vijax.model.sides import Sides
-from vijax.runtime import checks, export_cache, xla
+from vijax.runtime import checks, context, export_cache, xla
 from vijax.runtime.arrays import AnyArray, present
 from vijax.runtime.context import door
 
@@ -44,85 +42,6 @@ class Scale(eqx.Module):
     speed_variant: Float[AnyArray, "variant"]
 
 
-def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
-    """Make fresh cells."""
-    pair, d = entry.pair, entry.pair.d
-    zero, no = jnp.zeros_like(d), jnp.zeros(d.shape, bool)
-    ball = Ball(entry.u, entry.v, zero if entry.t is None else entry.t, zero)
-    held = exact.start_mode(pair, ball.u, ball.v, ball.t)
-    start = settings.transient + zero
-    eye = (zero + 1, zero, zero, zero + 1) if plan.tangent else None
-    attractor, method = plan.until == "attractor", settings.method
-    return Cell(
-        pair=pair,
-        wall=quick_wall.prepare(pair, ground=plan.ground) if method is None else None,
-        course=None if method is None else solver_steps.set_off(method, plan, pair, ball, held),
-        length=entry.length,
-        speed=entry.speed,
-        device=entry.device,
-        ball=ball,
-        held=held,
-        running=~no,
-        declined=no,
-        hard=no,
-        arrival=Arrival(zero, zero, zero, no) if advance.knows_arrival(plan) and method is None else None,
-        done=no,
-        status=jnp.zeros(d.shape, jnp.int32),
-        count=zero,
-        since=start,
-        batch=zero - 1,
-        tally=blank_tally(plan, d),
-        candidate=blank_candidate(settings, d, ball) if attractor else None,
-        tangent=eye,
-        exponent=zero if plan.tangent else None,
-        multiplier=zero if plan.tangent else None,
-        relay=chain.begin(ball, held) if plan.chained else None,
-    )
-
-
-def entry_shapes(plan: Plan, dtype: Any) -> Entry:
-    """Give what a run is told of a cell, as shapes."""
-    one: Any = jax.ShapeDtypeStruct((1,), dtype)
-    each: Any = Sides(one, one) if plan.unequal else one
-    kappa: Any = None if plan.rigid else each
-    if plan.hard_wall:
-        kappa = Sides(*(None if side == plan.hard_wall else one for side in (-1, 1)))
-    pair = ImpactPair(one, kappa, each, one)
-    device = electrical(Harvester(), unequal=plan.unequal) if plan.devices else None
-    device = jax.tree.map(lambda _: one, device)
-    return Entry(pair, length=one, speed=one, u=one, v=one, t=one if plan.chained else None, device=device)
-
-
-def program(plan: Plan, settings: Settings) -> lanes.Program:
-    """Make what lanes are told of a cell."""
-    entry, method = entry_shapes(plan, settings.periods.dtype), settings.method
-    cells = lanes.Program(
-        load=lambda table: load(plan, settings, rows.unpack(table, entry)),
-        step=partial(advance.step, plan, settings),
-        review=partial(review, plan, settings),
-        stopped=lambda cell: ~cell.running,
-        done=lambda cell: cell.done,
-        unload=lambda cell: rows.pack(unload(plan, settings, cell)),
-    )
-    if method is not None:
-        return cells._replace(
-            step=partial(solver_steps.step, method),
-            review=partial(solver_steps.review_steps, method, plan, settings),
-            steps=solver_steps.STEPS,
-            arithmetic=method.arithmetic,
-        )
-    return cells._replace(
-        service=lanes.Service(
-            declined=lambda cell: cell.declined,
-            hard=lambda cell: cell.hard,
-            request=partial(advance.request, plan, settings),
-            second=partial(advance.sampled_answer, plan),
-            careful=partial(advance.careful_answer, plan),
-            settle=partial(advance.settle, plan, settings),
-        )
-    )
-
-
 @lru_cache(maxsize=32)
 def compiled(plan: Plan, width: int) -> export_cache.TracedProgram:
     """Compile the program of a plan: a whole tile of cells in one call."""
@@ -132,6 +51,17 @@ def compiled(plan: Plan, width: int) -> export_cache.TracedProgram:
         return lanes.run(program(plan, settings), cells, count, outputs, width)
 
     return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width}")
+
+
+@lru_cache(maxsize=32)
+def _compiled_most(plan: Plan, width: int, few: int) -> export_cache.TracedProgram:
+    """Compile the program of a plan that ends when so few cells are left; see `stragglers`."""
+
+    def tile(cells, count, settings):
+        outputs = rows.width(shapes(plan, cells.dtype))
+        return lanes.run_most(program(plan, settings), cells, count, outputs, width, few)
+
+    return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width} {few}")
 
 
 def width_of(cells: int) -> int:
@@ -246,8 +176,20 @@ def summarise(
 
 def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""], settings: Settings) -> Summary:
     """Make the summary of a tile, of NumPy's arrays."""
-    table = compiled(plan, width_of(cells.shape[0]))(cells, count, settings)
-    return rows.unpack(np.asarray(table), shapes(plan, cells.dtype))
+    width, like = width_of(cells.shape[0]), shapes(plan, cells.dtype)
+    # What a lane of a method carries need not be a row of numbers.
+    few = stragglers.most() if settings.method is None else 0
+    if not few:
+        return rows.unpack(np.asarray(compiled(plan, width)(cells, count, settings)), like)
+    with context.pool(1) as beside:
+        ready = beside.submit(stragglers.prepare, plan, settings)  # compiled while the other program is
+        table, left = jax.tree.map(np.asarray, _compiled_most(plan, width, few)(cells, count, settings))
+        ready.result()
+    found, real = rows.unpack(table, like), left.cell >= 0
+    rest = rows.unpack(stragglers.finish(plan, settings, left.lanes[real]), like)
+    for field, values in zip(jax.tree.leaves(found), jax.tree.leaves(rest), strict=True):
+        field[left.cell[real]] = values
+    return found
 
 
 def blank(count: int, variants: int, dtype: str) -> Summary:

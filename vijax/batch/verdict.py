@@ -2,13 +2,11 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Settings
 from vijax.batch.recurrence import grain, recurrence, settled
 from vijax.engine.method import Method, waves_of
-from vijax.model import flow
 from vijax.model.waves import drift
 from vijax.runtime.arrays import present
 
@@ -99,21 +97,20 @@ def judge(settings: Settings, cell: Cell, newton: Correction, judged: Mask) -> V
 
 def correction(cell: Cell, method: Method | None) -> Correction:
     """Compute Newton's correction of the round's start, by the tangent map of the round."""
-    c, tangent = present(cell.candidate), present(cell.tangent)
-    grown = jnp.exp(present(cell.exponent) * jnp.log(TANGENT_SCALE))
-    m = jnp.stack([jnp.stack(tangent[:2], -1), jnp.stack(tangent[2:], -1)], -2) * grown[:, None, None]
+    c, grown = present(cell.candidate), jnp.exp(present(cell.exponent) * jnp.log(TANGENT_SCALE))
+    p, q, r, s = (entry * grown for entry in present(cell.tangent))
     # The round ended at an exit; fly on (or back) to the phase at which it began.
     rest = 2 * (c.base.n + c.laps * c.period - cell.ball.n) + (c.base.t - cell.ball.t)
     rise, v = drift(waves_of(method, cell.ball.t), cell.pair.gamma, cell.ball.v, rest)
-    m = jax.vmap(flow.flight_matrix)(rest) @ m
+    # Times the flight's matrix, entry by entry: an accelerator has nothing slower than many products of small matrices.
+    p, q = p + rest * r, q + rest * s
     miss_u, miss_v = cell.ball.u + rise - c.base.u, v - c.base.v
-    a, b, e, d = 1 - m[:, 0, 0], -m[:, 0, 1], -m[:, 1, 0], 1 - m[:, 1, 1]
+    a, b, e, d = 1 - p, -q, -r, 1 - s
     determinant = a * d - b * e
     safe = jnp.where(determinant == 0, jnp.nan, determinant)
     nudge_u, nudge_v = (d * miss_u - b * miss_v) / safe, (a * miss_v - e * miss_u) / safe
     gain = (jnp.abs(a) + jnp.abs(b) + jnp.abs(e) + jnp.abs(d)) / jnp.abs(safe)
-    half_trace = 0.5 * (m[:, 0, 0] + m[:, 1, 1])
-    product = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+    half_trace, product = 0.5 * (p + s), p * s - q * r
     spread = half_trace * half_trace - product
     largest = jnp.where(
         spread > 0, jnp.abs(half_trace) + jnp.sqrt(jnp.maximum(spread, 0.0)), jnp.sqrt(jnp.maximum(product, 0.0))

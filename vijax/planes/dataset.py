@@ -154,7 +154,7 @@ def _variable(name: str, found: Found, planned: SweepPlan) -> "xr.Variable":
     values = output.formula(found, planned.cells, planned.device) if output.formula else found[output.needs[0]]
     values = values.transpose(*(dim for dim in planned.cells.sizes if dim in values.dims))
     # Scales are float64 whatever the cells were computed in.
-    values = values.astype(planned.settings.dtype if values.dtype.kind == "f" else values.dtype)
+    values = values.astype(planned.settings.dtype if values.dtype.kind == "f" else values.dtype, copy=False)
     values.attrs = {"units": output.units, "long_name": output.description}
     return values
 

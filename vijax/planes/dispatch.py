@@ -76,7 +76,10 @@ def _each(planned: SweepPlan, group: np.ndarray, rows: int) -> Iterator[tuple[np
 
 
 def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
-    """Lay a part of the cells into the fields of all."""
+    """Lay a part of the cells into the fields of all; what is all of them, in order, is not copied."""
+    if np.array_equal(index, np.arange(count)):
+        found.update(part)
+        return
     for name, values in part.items():
         found.setdefault(name, np.empty((count, *values.shape[1:]), values.dtype))[index] = values
 

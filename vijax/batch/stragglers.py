@@ -1,0 +1,87 @@
+"""The last cells of an accelerator's tile: the cores beside it fly them to their end.
+
+A step of one lane takes an accelerator nearly as long as that of eight thousand, and some cells of every map have
+thousands of impacts to go, or ask again and again for a step with loops in it: it would work on them for many times as
+long as on all others together. Cores are quick with few cells, and nothing that is known of one gets lost on the way.
+"""
+
+from functools import lru_cache, partial
+
+import jax
+import numpy as np
+
+from vijax.batch import cell_program, lanes, rows
+from vijax.batch.cell import Plan, Settings
+from vijax.batch.summary import shapes
+from vijax.runtime import context, export_cache, tiles, xla
+
+# Cells that a core takes over. So many take it as long as they take an H100, which has cores of its host to spare.
+_EACH = 512
+_LANES = 128  # of a core: fewer would leave its vectors empty
+
+
+def most() -> int:
+    """Say how many cells an accelerator leaves to the cores beside it; none where those are what computes."""
+    if xla.on_cpu() or (core := _core()) is None:
+        return 0
+    with jax.default_device(core):
+        return _EACH * tiles.workers()
+
+
+def _core() -> jax.Device | None:
+    """Find the device that is the cores; None if JAX was told to leave them alone."""
+    try:
+        return jax.devices("cpu")[0]
+    except RuntimeError:
+        return None
+
+
+@lru_cache(maxsize=32)
+def _compiled(plan: Plan) -> export_cache.TracedProgram:
+    """Compile the program of a core's share: cells that are on their way, to their end."""
+
+    def finish(table, count, settings):
+        kind = table.dtype
+        columns = rows.width(cell_program.entry_shapes(plan, kind))
+        like = jax.ShapeDtypeStruct((1, columns), kind)
+        cells = lanes.resumed(cell_program.program(plan, settings), like)
+        return lanes.run(cells, table, count, rows.width(shapes(plan, kind)), _LANES)
+
+    return export_cache.TracedProgram(finish, f"{finish.__qualname__} {plan}")
+
+
+def finish(plan: Plan, settings: Settings, left: np.ndarray) -> np.ndarray:
+    """Fly cells to their end, on all cores.
+
+    Args:
+        plan, settings: Those of the tile.
+        left: What is known of each [cell, column], as `lanes.run_most` gives it; no more than `most`.
+
+    Returns:
+        Their rows of results [cell, column]; for no cell the program is compiled all the same.
+    """
+    settings = jax.tree.map(np.asarray, settings)
+    with jax.default_device(_core()), context.pool(tiles.workers()) as pool:
+        # Strided, so that no core is left with the slow ones.
+        workers = tiles.workers() if len(left) else 1
+        shares = [left[first::workers] for first in range(workers)]
+        parts = list(pool.map(partial(_finish_share, plan, settings), shares))
+    found = np.empty((len(left), parts[0].shape[1]), parts[0].dtype)
+    for first, part in enumerate(parts):
+        found[first::workers] = part
+    return found
+
+
+def _finish_share(plan: Plan, settings: Settings, left: np.ndarray) -> np.ndarray:
+    """Fly the share of one core, padded so that one program serves all."""
+    table = np.zeros((_EACH, left.shape[1]), left.dtype)
+    table[: len(left)] = left
+    return np.asarray(_compiled(plan)(table, np.int32(len(left)), settings))[: len(left)]
+
+
+def prepare(plan: Plan, settings: Settings) -> None:
+    """Compile what `finish` needs."""
+    kind = settings.periods.dtype
+    like = jax.ShapeDtypeStruct((1, rows.width(cell_program.entry_shapes(plan, kind))), kind)
+    lane = jax.eval_shape(lambda table, settings: cell_program.program(plan, settings).load(table), like, settings)
+    finish(plan, settings, np.zeros((0, rows.width(lane)), kind))
