@@ -6,6 +6,7 @@ long as on all others together. Cores are quick with few cells, and nothing that
 """
 
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from vijax.batch import cell_program, lanes, rows
 from vijax.batch.cell import Plan, Settings
 from vijax.batch.summary import shapes
+from vijax.model.device import Harvester, electrical
 from vijax.runtime import context, export_cache, tiles, xla
 
 # Cells that a core takes over. So many take it as long as they take an H100, which has cores of its host to spare.
@@ -80,8 +82,16 @@ def _finish_share(plan: Plan, settings: Settings, left: np.ndarray) -> np.ndarra
 
 
 def prepare(plan: Plan, settings: Settings) -> None:
-    """Compile what `finish` needs."""
-    kind = settings.periods.dtype
+    """Compile what `finish` needs, once."""
+    kind = np.dtype(settings.periods.dtype)
+    finish(plan, settings, np.zeros((0, _columns(plan, kind)), kind))
+
+
+@lru_cache(maxsize=32)
+def _columns(plan: Plan, kind: np.dtype) -> int:
+    """Count the columns of what is known of a cell."""
     like = jax.ShapeDtypeStruct((1, rows.width(cell_program.entry_shapes(plan, kind))), kind)
-    lane = jax.eval_shape(lambda table, settings: cell_program.program(plan, settings).load(table), like, settings)
-    finish(plan, settings, np.zeros((0, rows.width(lane)), kind))
+    zero: Any = np.zeros((), kind)
+    variants: Any = np.zeros(plan.variants, kind)
+    settings = Settings(zero, zero, electrical(Harvester()), None, variants, variants, zero if plan.chained else None)
+    return rows.width(jax.eval_shape(cell_program.program(plan, settings).load, like))
