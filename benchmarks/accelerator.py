@@ -175,7 +175,7 @@ def kernels() -> Iterator[Figure]:
     variant: Any = jax.ShapeDtypeStruct((1,), kind)
     settings = Settings(one, one, device, None, variant, variant)
     table = jax.ShapeDtypeStruct((cells, rows.width(cell_program.entry_shapes(plan, kind))), kind)
-    width = simulate.width_of(cells)
+    width = lanes.width_of(cells)
 
     def tile(table, count, settings):
         outputs = rows.width(simulate.shapes(plan, kind))

@@ -8,7 +8,7 @@ from jax import export
 import vijax
 from tests.helpers import cases
 from tests.runtime.test_programs import CALLS, known  # noqa: F401  a fixture
-from vijax.batch import simulate, stragglers
+from vijax.batch import lanes, simulate, stragglers
 from vijax.planes import tile_size
 from vijax.runtime import export_cache, xla
 from vijax.runtime.export_cache import TracedProgram
@@ -78,10 +78,10 @@ def test_every_program_is_lowered_for_a_gpu(name, known, called, on_gpu):  # noq
 
 def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):
     monkeypatch.delenv("VIJAX_TILE", raising=False)
-    assert (tile_size.largest(), simulate.width_of(10**6)) == (32_768, 512)
+    assert (tile_size.largest(), lanes.width_of(10**6)) == (32_768, 512)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert tile_size.largest() == 4_194_304
-    assert [simulate.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [100, 8_192, 12_500, 131_072]
+    assert [lanes.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [100, 8_192, 12_500, 131_072]
 
 
 def test_a_gpu_is_given_what_it_is_asked_for_in_xla_flags(monkeypatch):

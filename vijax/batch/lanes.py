@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.batch import rows
 from vijax.runtime.arrays import choose
-from vijax.runtime.xla import first, in_blocks, kernel, put, repeat, shared, whole_blocks
+from vijax.runtime.xla import first, in_blocks, kernel, on_cpu, put, repeat, shared, whole_blocks
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -28,8 +28,8 @@ Carry = Any
 
 # Quick steps between two rounds of serving, reviewing and refilling: with fewer, the rounds cost more than the steps,
 # with more, lanes that wait stand idle. No result depends on it.
-STEPS = 8
-_SHARE, _FEWEST = 32, 16  # one lane in so many is served or refilled together: a larger batch keeps slow cells waiting
+STEPS = 16
+_SHARE, _FEWEST = 32, 4  # one lane in so many is served or refilled together: a larger batch keeps slow cells waiting
 
 
 class Service(NamedTuple):
@@ -191,6 +191,18 @@ class _Table(NamedTuple):
 
     cells: Float[Array, "cell in"]
     real: Int[Array, ""]
+
+
+def width_of(cells: int) -> int:
+    """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
+
+    At the end of a tile they stand idle: with 512 lanes instead of 64 planes of 2,000 cells take half again as long. An
+    accelerator takes nearly as long for a step of 8,192 lanes as for one of 32,768, and beyond in proportion; at the
+    end of a tile few lanes are left, and the steps of all are waited for.
+    """
+    if on_cpu():
+        return max(min(cells // 64, 512), 64)
+    return max(min(cells // 8, 131_072), min(cells, 8_192))
 
 
 class Left(NamedTuple):

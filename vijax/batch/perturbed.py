@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from vijax.batch import lanes, rows
 from vijax.batch.cell import TRANSIENT_SHARE, Entry, Plan, Settings, walls_of
 from vijax.batch.cell_program import program
-from vijax.batch.simulate import compiled, width_of
+from vijax.batch.simulate import compiled
 from vijax.batch.summary import Summary, shapes
 from vijax.engine.ground import Ground, ground_of
 from vijax.model.device import Harvester
@@ -61,7 +61,7 @@ def averages(
     plans = [_plan(pair, ground, length.size) for ground in (Ground.LEVEL, Ground.GENTLE)]
     if checks.is_concrete(given):
         plan = _plan(pair, ground_of(pair.gamma), length.size)
-        found = compiled(plan, width_of(table.shape[0]))(*given)
+        found = compiled(plan, lanes.width_of(table.shape[0]))(*given)
     else:
         # Rows of padding may hold anything.
         real = jnp.arange(table.shape[0], dtype=count.dtype) < count
@@ -87,7 +87,7 @@ def _traced(plan: Plan, given: Any) -> Float[Array, "ball out"]:
     @sequential_vmap
     def run(table, count, settings):
         outputs = rows.width(shapes(plan, table.dtype))
-        return lanes.run(program(plan, settings), table, count, outputs, width_of(table.shape[0]))
+        return lanes.run(program(plan, settings), table, count, outputs, lanes.width_of(table.shape[0]))
 
     return run(*given)
 

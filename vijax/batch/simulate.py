@@ -20,7 +20,7 @@ from vijax.engine.ground import ground_of
 from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device, electrical
 from vijax.model.pair import ImpactPair, check_pair
-from vijax.runtime import checks, context, export_cache, xla
+from vijax.runtime import checks, context, export_cache
 from vijax.runtime.arrays import AnyArray, present
 from vijax.runtime.context import door
 
@@ -62,17 +62,6 @@ def _compiled_most(plan: Plan, width: int, few: int) -> export_cache.TracedProgr
         return lanes.run_most(program(plan, settings), cells, count, outputs, width, few)
 
     return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width} {few}")
-
-
-def width_of(cells: int) -> int:
-    """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
-
-    An accelerator takes nearly as long for a step of 8,192 lanes as for one of 32,768, and beyond in proportion; at the
-    end of a tile few lanes are left, and the steps of all are waited for.
-    """
-    if xla.on_cpu():
-        return max(min(cells // 8, 512), 128)
-    return max(min(cells // 8, 131_072), min(cells, 8_192))
 
 
 def tolerances(dtype: str) -> dict[str, float]:
@@ -176,7 +165,7 @@ def summarise(
 
 def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""], settings: Settings) -> Summary:
     """Make the summary of a tile, of NumPy's arrays."""
-    width, like = width_of(cells.shape[0]), shapes(plan, cells.dtype)
+    width, like = lanes.width_of(cells.shape[0]), shapes(plan, cells.dtype)
     # What a lane of a method carries need not be a row of numbers.
     few = stragglers.most() if settings.method is None else 0
     if not few:

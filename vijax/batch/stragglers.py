@@ -19,7 +19,6 @@ from vijax.runtime import context, export_cache, tiles, xla
 
 # Cells that a core takes over. So many take it as long as they take an H100, which has cores of its host to spare.
 _EACH = 512
-_LANES = 128  # of a core: fewer would leave its vectors empty
 
 
 def most() -> int:
@@ -47,7 +46,7 @@ def _compiled(plan: Plan) -> export_cache.TracedProgram:
         columns = rows.width(cell_program.entry_shapes(plan, kind))
         like = jax.ShapeDtypeStruct((1, columns), kind)
         cells = lanes.resumed(cell_program.program(plan, settings), like)
-        return lanes.run(cells, table, count, rows.width(shapes(plan, kind)), _LANES)
+        return lanes.run(cells, table, count, rows.width(shapes(plan, kind)), lanes.width_of(_EACH))
 
     return export_cache.TracedProgram(finish, f"{finish.__qualname__} {plan}")
 
