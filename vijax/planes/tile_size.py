@@ -7,7 +7,7 @@ from vijax.runtime.pages import see
 
 # The largest take a core a second or two, large enough to keep lanes full and files few, small enough to lose.
 _LARGEST = 32768
-# A GPU takes a second or two for the last cells of a call, however many there were.
+# A call takes a GPU, with the cores that fly its last cells, a third of a second besides what grows with its cells.
 _LARGEST_ELSEWHERE = 1 << 22
 # Smaller ones leave lanes empty.
 _SMALLEST = 1024

@@ -53,8 +53,8 @@ _BRIEF = {"xla_backend_optimization_level": 0}
 _STAYS = {"inlineable": "false"}  # a call that XLA does not see through
 _ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
 _TRIPS = 4  # of a short loop, between two looks whether it goes on, on an accelerator
-# Trips of a long loop that an accelerator's kernels make at once: what the second reads of the first is stored in fewer
-# places, and a step of all lanes takes a fifth less time. Four would take as long again to compile, for a tenth more.
+# Trips of a long loop that an accelerator's kernels make at once: less of what the second reads of the first is stored,
+# and a step of all lanes takes a sixth less time. Four would take twice as long to compile, for a twentieth more.
 _UNROLLED = 2
 _BLOCK = 64  # lanes: what a step stores of them stays in the first cache; with 32 LLVM runs out of registers
 
