@@ -5,7 +5,8 @@ user needs stands here; what each function takes and returns its docstring says.
 
 Devices and pairs: `Harvester` (SI units) gives an `ImpactPair` (nondimensional), as `impact_pair` does from numbers;
 `Sides` holds what two walls that differ have;
-`HuntCrossley` is another membrane, `MembraneLaw` makes one of your own, `harvested_energy` is the energy of one impact.
+`HuntCrossley` and `Hyperelastic` are other membranes, `MembraneLaw` makes one of your own; `harvested_energy` is the
+energy of one impact.
 An `Excitation` takes the place of the sine: `Harmonics`, a measured `Record`, a `Waveform`, `Noise`, or a sum of them.
 `State`, `Impact` and `Status` are what records are made of.
 

@@ -137,6 +137,8 @@ LEAST = {
     "sweep --method ode --atol 0": lambda: vijax.sweep(**CELL, method="ode", atol=0.0),
     "sweep --chi=-1": lambda: vijax.HuntCrossley(-1.0),
     "sweep --exponent 0.5": lambda: vijax.HuntCrossley(1.0, 0.5),
+    "sweep --prestretch 1": lambda: vijax.Hyperelastic(1.0, 0.1),
+    "sweep --radius 0": lambda: vijax.Hyperelastic(2.0, 0.0),
     "orbit-diagram --recorded-periods 0": lambda: vijax.orbit_diagram(along="d", values=[0.2, 0.3], recorded_periods=0),
     "basins --starts 0": lambda: vijax.basin_fractions(**CELL, starts=0),
     "basins --seed=-1": lambda: vijax.basin_fractions(**CELL, starts=4, seed=-1),
@@ -170,11 +172,12 @@ def test_the_least_that_may_be_given_is_that_of_python(folder, capsys, line):
 # --- help ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["solver", "rtol", "atol", "steps", "exponent"])
+@pytest.mark.parametrize("name", ["solver", "rtol", "atol", "steps", "exponent", "stretch_limit"])
 def test_what_help_calls_a_default_is_what_a_method_is_told(name):
     (option,) = [option for option in page("sweep").params if option.name == name]
     told = [record(choose(engine, {})) for engine in ("ode", "rk4")]
-    default = {"exponent": vijax.HuntCrossley(0.5).exponent, **told[0], **told[1]}[name]
+    laws = {"exponent": vijax.HuntCrossley(0.5).exponent, "stretch_limit": vijax.Hyperelastic(2, 0.1).stretch_limit}
+    default = {**laws, **told[0], **told[1]}[name]
     assert type(default)(re.search(r"\[(.+)\]$", option.help)[1]) == default
 
 

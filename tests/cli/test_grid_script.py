@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import vijax
 from scripts import grid as script
 from tests.helpers import SCRIPTS
 from vijax.cli import closing, progress
@@ -75,10 +76,17 @@ BAD = [
     (["--method", "rk4", "--steps", "4"], "steps must be a whole number of at least 8"),
     (["--method", "rk4", "--steps", "1.5"], "--steps"),
     (["--membrane", "hunt-crossley", "--chi", "0.5"], 'membrane must be linear for method="exact"'),
-    (["--method", "ode", "--membrane", "rubber"], "membrane must be linear or hunt-crossley; got 'rubber'"),
+    (
+        ["--method", "ode", "--membrane", "rubber"],
+        "membrane must be one of linear, hunt-crossley, hyperelastic; got 'rubber'",
+    ),
     (["--method", "ode", "--membrane", "hunt-crossley"], "chi must be given"),
     (["--method", "ode", "--chi", "0.5"], "chi must be left out"),
     (["--method", "ode", "--exponent", "2"], "exponent must be left out"),
+    (["--method", "ode", "--membrane", "hyperelastic", "--radius", "0.1"], "prestretch must be given"),
+    (["--method", "ode", "--membrane", "hyperelastic", "--prestretch", "2"], "radius must be given"),
+    (["--method", "ode", "--membrane", "hyperelastic", "--chi", "2"], "chi must be left out unless --membrane is hunt"),
+    (["--method", "ode", "--stretch-limit", "20"], "stretch_limit must be left out unless --membrane is hyper"),
     (["--method", "ode", "--membrane", "hunt-crossley", "--chi=-1"], "chi must be one finite number"),
     (["--method", "ode", "--membrane", "hunt-crossley", "--chi", "0.5", "--r", "0.5"], "r must be left out"),
     (["--until", "never"], "until must be"),
@@ -219,6 +227,10 @@ def test_methods_and_membranes_arrive(planned):
     assert (plan.method.solver, plan.method.rtol, plan.method.atol) == ("Dopri8", 1e-9, 1e-11)
     plan = planned("--method", "ode", "--membrane", "hunt-crossley", "--chi", "0.5", "--exponent", "1.4")
     assert (plan.method.law.chi, plan.method.law.exponent) == (0.5, 1.4)
+    rubber = ("--membrane", "hyperelastic", "--prestretch", "1.4", "--radius", "0.1")
+    assert planned("--method", "ode", *rubber).method.law == vijax.Hyperelastic(1.4, 0.1)
+    law = planned("--method", "rk4", *rubber, "--stretch-limit", "20").method.law
+    assert (law.prestretch, law.radius, law.stretch_limit) == (1.4, 0.1, 20.0)
     plan = planned("--method", "rk4", "--steps", "500", "--membrane", "linear")
     assert plan.method.steps == 500
     assert planned().method is None

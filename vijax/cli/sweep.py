@@ -144,25 +144,26 @@ def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: d
     from vijax.planes.sweep import plan
     from vijax.planes.sweep_settings import SweepSettings
 
-    membrane = _membrane(*(given.pop(name) for name in ("membrane", "chi", "exponent")))
+    membrane = _membrane(given.pop("membrane"), {name: given.pop(name) for name in options.MEMBRANE_NUMBERS})
     refine, starts, excitation = given.pop("refine"), given.pop("starts"), take_excitation(given)
     settings = SweepSettings(**given, membrane=membrane, excitation=excitation)
     return plan(axes, outputs, device, settings, refine, starts)
 
 
-def _membrane(name: str | None, chi: float | None, exponent: float | None) -> Any:
-    from vijax.model.membrane import HuntCrossley, Linear
+def _membrane(name: str | None, numbers: dict[str, float | None]) -> Any:
+    from vijax.model.membrane import HuntCrossley, Hyperelastic, Linear
 
-    if name == "hunt-crossley":
-        if chi is None:
-            raise ValueError("chi must be given with --membrane hunt-crossley; got none")
-        return HuntCrossley(chi) if exponent is None else HuntCrossley(chi, exponent)
-    for option, value in (("chi", chi), ("exponent", exponent)):
-        if value is not None:
-            raise ValueError(f"{option} must be left out unless --membrane is hunt-crossley; got {value:g}")
-    if name not in (None, "linear"):
-        raise ValueError(f"membrane must be linear or hunt-crossley; got {name!r}")
-    return None if name is None else Linear()
+    if name not in (None, *options.MEMBRANES):
+        raise ValueError(f"membrane must be one of {', '.join(options.MEMBRANES)}; got {name!r}")
+    for number, value in numbers.items():
+        if value is not None and (owner := options.MEMBRANE_NUMBERS[number]) != name:
+            raise ValueError(f"{number} must be left out unless --membrane is {owner}; got {value:g}")
+    told: dict[str, Any] = {number: value for number, value in numbers.items() if value is not None}
+    for number, owner in (("chi", "hunt-crossley"), ("prestretch", "hyperelastic"), ("radius", "hyperelastic")):
+        if owner == name and number not in told:
+            raise ValueError(f"{number} must be given with --membrane {owner}; got none")
+    laws: dict[str | None, Any] = {"hunt-crossley": HuntCrossley, "hyperelastic": Hyperelastic, "linear": Linear}
+    return None if name is None else laws[name](**told)
 
 
 def _check_picture(path: Path, planned: "SweepPlan", show: str) -> None:
@@ -281,7 +282,14 @@ def _method_options() -> list[click.Parameter]:
         click.Option(["--membrane"], type=_Membrane(options.MEMBRANES), help="of ode and rk4 [linear]"),
         click.Option(["--chi"], type=_at_least(0), help="of hunt-crossley: damping over stiffness"),
         click.Option(["--exponent"], type=_at_least(1), help="of hunt-crossley: exponent of the penetration [1.5]"),
+        click.Option(["--prestretch"], type=_above(1), help="of hyperelastic: stretch without the ball, above 1"),
+        click.Option(["--radius"], type=_above(0), help="of hyperelastic: in units of displacement"),
+        click.Option(["--stretch-limit"], type=float, help="of hyperelastic: Gent's J_m [inf]"),
     ]
+
+
+def _above(least: int) -> Real:
+    return Real(f"one finite number above {least}", min=least, min_open=True)
 
 
 def _at_least(least: int) -> Real:
