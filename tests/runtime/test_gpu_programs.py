@@ -79,6 +79,7 @@ def test_every_program_is_lowered_for_a_gpu(name, known, called, on_gpu):  # noq
 def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):
     monkeypatch.delenv("VIJAX_TILE", raising=False)
     assert (tile_size.largest(), lanes.width_of(10**6)) == (32_768, 512)
+    assert [lanes.width_of(cells) for cells in (10, 4_096, 16_384)] == [64, 64, 256]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert tile_size.largest() == 4_194_304
     assert [lanes.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [100, 8_192, 12_500, 131_072]
