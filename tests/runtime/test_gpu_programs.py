@@ -9,6 +9,7 @@ import vijax
 from tests.helpers import cases
 from tests.runtime.test_programs import CALLS, known  # noqa: F401  a fixture
 from vijax.batch import lanes, simulate, stragglers
+from vijax.batch.cell import Plan
 from vijax.planes import tile_size
 from vijax.runtime import export_cache, xla
 from vijax.runtime.export_cache import TracedProgram
@@ -62,18 +63,31 @@ def test_every_program_is_lowered_for_a_gpu(name, known, called, on_gpu):  # noq
     on_gpu()
     assert called
     for program, shapes in called.values():
-        leaves, tree = jax.tree.flatten(shapes)
+        check_lowered(program, shapes)
 
-        def flat(*leaves, work=program._work, tree=tree):
-            return jax.tree.leaves(work(*jax.tree.unflatten(tree, leaves)))
 
-        made = export.export(jax.jit(flat), platforms=["cuda"])(*leaves)
-        text = made.mlir_module()
-        assert "callback" not in text  # the host is never called
-        assert "lapack" not in text
-        assert "xla_cpu" not in text
-        assert any(value.dtype == np.float64 for value in made.out_avals)
-        assert not any(value.dtype == np.float32 for value in made.out_avals)
+def check_lowered(program, shapes):
+    """Look at what a program becomes for CUDA."""
+    leaves, tree = jax.tree.flatten(shapes)
+
+    def flat(*leaves):
+        return jax.tree.leaves(program._work(*jax.tree.unflatten(tree, leaves)))
+
+    made = export.export(jax.jit(flat), platforms=["cuda"])(*leaves)
+    text = made.mlir_module()
+    assert "callback" not in text  # the host is never called
+    assert "lapack" not in text
+    assert "xla_cpu" not in text
+    assert any(value.dtype == np.float64 for value in made.out_avals)
+    assert not any(value.dtype == np.float32 for value in made.out_avals)
+
+
+def test_the_program_that_leaves_its_last_cells_is_lowered_for_a_gpu(known, called, on_gpu):  # noqa: F811
+    """Public functions call it there, and the program of a whole tile here: the same arguments go into both."""
+    CALLS["sweep"](0, known)
+    on_gpu()
+    (shapes,) = (shapes for (name, _), (_, shapes) in called.items() if "tile" in name)
+    check_lowered(simulate._compiled_most(Plan(deep=True, energies=True), 64, 16), shapes)
 
 
 def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):

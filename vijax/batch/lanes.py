@@ -196,9 +196,9 @@ class _Table(NamedTuple):
 def width_of(cells: int) -> int:
     """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
 
-    At the end of a tile they stand idle: with 512 lanes instead of 64 planes of 2,000 cells take half again as long. An
-    accelerator takes nearly as long for a step of 8,192 lanes as for one of 32,768, and beyond in proportion; at the
-    end of a tile few lanes are left, and the steps of all are waited for.
+    At the end of a tile they stand idle: 4,096 cells take half again as long with 512 lanes as with 64. An accelerator
+    takes nearly as long for a step of 8,192 lanes as for one of 32,768, and beyond in proportion; at the end of a tile
+    few lanes are left, and the steps of all are waited for.
     """
     if on_cpu():
         return max(min(cells // 64, 512), 64)
