@@ -7,7 +7,7 @@
 Every measurement is a study of the (d, kappa) plane in a process of its own, on so many cores, compiled beforehand:
 with default settings; with cheap ones (5 periods), where what is done besides simulating shows; and with an engine that
 does nothing, where nothing else is left. From these the table: its cost on two cores is measured up to 10^6 cells and
-in proportion to the cells beyond; that on a GPU is what 1024 x 1024 cells took on the one that was lent once.
+in proportion to the cells beyond; that on a GPU is what 2048 x 2048 cells took on one (`accelerator.py`).
 """
 
 import argparse
@@ -32,7 +32,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "cheap": {"until": "window", "periods": 5},
 }
 _WARM = 363  # the least side whose tiles are compiled as those of any larger plane; smaller planes are run twice
-_GPU = ("one H200, 4.1 s for 1,048,576 cells, compiled", 4.1 / (1 << 20))
+_GPU = ("one H100 with 16 cores, 4.57 s for 4,194,304 cells, compiled", 4.57 / (1 << 22))
 _LARGE = (1e8, 1e10, 1e12)
 _THREADS = 128  # of workers that take empty tasks: so many that no turn is waited for
 _TILE = 32768  # cells of the tiles of large planes, at most
