@@ -29,12 +29,17 @@ def shares(monkeypatch):
     return given
 
 
-@pytest.mark.parametrize(("cells", "expected"), [(0, [0]), (1, [0, 0, 1]), (10, [3, 3, 4]), (1536, [512] * 3)])
+@pytest.mark.parametrize(("cells", "expected"), [(0, [0] * 3), (1, [0, 0, 1]), (10, [3, 3, 4]), (1536, [512] * 3)])
 def test_every_core_has_its_share_and_rows_come_back_in_order(shares, cells, expected):
     left = np.random.default_rng(3).uniform(1, 2, (cells, 5))
     found = stragglers.finish(Plan(), SETTINGS, left)
     np.testing.assert_array_equal(found, 2 * left[:, :2])
     assert sorted(shares) == expected
+
+
+def test_what_is_needed_is_compiled_by_a_share_without_a_cell(shares):
+    stragglers.prepare(Plan(deep=True, energies=True), SETTINGS)
+    assert shares == [0]
 
 
 def test_an_accelerator_leaves_cells_to_every_core_beside_it_and_cores_to_nobody(monkeypatch):

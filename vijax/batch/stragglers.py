@@ -38,18 +38,37 @@ def _core() -> jax.Device | None:
         return None
 
 
+def _entry(plan: Plan, kind: Any) -> Any:
+    """Give what a tile is told of a cell, a row, as its shape."""
+    return jax.ShapeDtypeStruct((1, rows.width(cell_program.entry_shapes(plan, kind))), kind)
+
+
 @lru_cache(maxsize=32)
 def _compiled(plan: Plan) -> export_cache.TracedProgram:
     """Compile the program of a core's share: cells that are on their way, to their end."""
 
     def finish(table, count, settings):
         kind = table.dtype
-        columns = rows.width(cell_program.entry_shapes(plan, kind))
-        like = jax.ShapeDtypeStruct((1, columns), kind)
-        cells = lanes.resumed(cell_program.program(plan, settings), like)
+        cells = lanes.resumed(cell_program.program(plan, settings), _entry(plan, kind))
         return lanes.run(cells, table, count, rows.width(shapes(plan, kind)), lanes.width_of(_EACH))
 
     return export_cache.TracedProgram(finish, f"{finish.__qualname__} {plan}")
+
+
+def prepare(plan: Plan, settings: Settings) -> None:
+    """Compile what `finish` needs: by a share without a cell, which costs nothing once that is done."""
+    kind = np.dtype(settings.periods.dtype)
+    with jax.default_device(_core()):
+        _finish_share(plan, jax.tree.map(np.asarray, settings), np.zeros((0, _columns(plan, kind)), kind))
+
+
+@lru_cache(maxsize=32)
+def _columns(plan: Plan, kind: np.dtype) -> int:
+    """Count the columns of what is known of a cell."""
+    zero: Any = np.zeros((), kind)
+    variants: Any = np.zeros(plan.variants, kind)
+    settings = Settings(zero, zero, electrical(Harvester()), None, variants, variants, zero if plan.chained else None)
+    return rows.width(jax.eval_shape(cell_program.program(plan, settings).load, _entry(plan, kind)))
 
 
 def finish(plan: Plan, settings: Settings, left: np.ndarray) -> np.ndarray:
@@ -60,14 +79,15 @@ def finish(plan: Plan, settings: Settings, left: np.ndarray) -> np.ndarray:
         left: What is known of each [cell, column], as `lanes.run_most` gives it; no more than `most`.
 
     Returns:
-        Their rows of results [cell, column]; for no cell the program is compiled all the same.
+        Their rows of results [cell, column].
     """
     settings = jax.tree.map(np.asarray, settings)
-    with jax.default_device(_core()), context.pool(tiles.workers()) as pool:
+    with jax.default_device(_core()):
+        workers = tiles.workers()
         # Strided, so that no core is left with the slow ones.
-        workers = tiles.workers() if len(left) else 1
         shares = [left[first::workers] for first in range(workers)]
-        parts = list(pool.map(partial(_finish_share, plan, settings), shares))
+        with context.pool(workers) as pool:
+            parts = list(pool.map(partial(_finish_share, plan, settings), shares))
     found = np.empty((len(left), parts[0].shape[1]), parts[0].dtype)
     for first, part in enumerate(parts):
         found[first::workers] = part
@@ -79,19 +99,3 @@ def _finish_share(plan: Plan, settings: Settings, left: np.ndarray) -> np.ndarra
     table = np.zeros((_EACH, left.shape[1]), left.dtype)
     table[: len(left)] = left
     return np.asarray(_compiled(plan)(table, np.int32(len(left)), settings))[: len(left)]
-
-
-def prepare(plan: Plan, settings: Settings) -> None:
-    """Compile what `finish` needs, once."""
-    kind = np.dtype(settings.periods.dtype)
-    finish(plan, settings, np.zeros((0, _columns(plan, kind)), kind))
-
-
-@lru_cache(maxsize=32)
-def _columns(plan: Plan, kind: np.dtype) -> int:
-    """Count the columns of what is known of a cell."""
-    like = jax.ShapeDtypeStruct((1, rows.width(cell_program.entry_shapes(plan, kind))), kind)
-    zero: Any = np.zeros((), kind)
-    variants: Any = np.zeros(plan.variants, kind)
-    settings = Settings(zero, zero, electrical(Harvester()), None, variants, variants, zero if plan.chained else None)
-    return rows.width(jax.eval_shape(cell_program.program(plan, settings).load, like))

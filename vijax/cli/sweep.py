@@ -1,5 +1,6 @@
 """`vijax sweep`: a map over a plane of parameters."""
 
+import dataclasses
 import math
 from functools import partial
 from pathlib import Path
@@ -158,12 +159,14 @@ def _membrane(name: str | None, numbers: dict[str, float | None]) -> Any:
     for number, value in numbers.items():
         if value is not None and (owner := options.MEMBRANE_NUMBERS[number]) != name:
             raise ValueError(f"{number} must be left out unless --membrane is {owner}; got {value:g}")
-    told: dict[str, Any] = {number: value for number, value in numbers.items() if value is not None}
-    for number, owner in (("chi", "hunt-crossley"), ("prestretch", "hyperelastic"), ("radius", "hyperelastic")):
-        if owner == name and number not in told:
-            raise ValueError(f"{number} must be given with --membrane {owner}; got none")
     laws: dict[str | None, Any] = {"hunt-crossley": HuntCrossley, "hyperelastic": Hyperelastic, "linear": Linear}
-    return None if name is None else laws[name](**told)
+    if name is None:
+        return None
+    told = {number: value for number, value in numbers.items() if value is not None}
+    for field in dataclasses.fields(laws[name]):
+        if field.default is dataclasses.MISSING and field.name not in told:
+            raise ValueError(f"{field.name} must be given with --membrane {name}; got none")
+    return laws[name](**told)
 
 
 def _check_picture(path: Path, planned: "SweepPlan", show: str) -> None:

@@ -198,6 +198,9 @@ class HuntCrossley(_Shipped):
         return f"hunt-crossley with chi {float(self.chi):g}, exponent {float(self.exponent):g}"
 
 
+_STRAIGHT = 1e-9  # the least part of their limit that is left to chains: beyond, the push is held there
+
+
 class Cone(eqx.Module):
     """The wall of a `Hyperelastic` membrane, a cone: -(kappa^2 w f(w) + mu w'), where f(0) = 1.
 
@@ -237,9 +240,6 @@ class Cone(eqx.Module):
         growth = jnp.where(some, -jnp.log1p(-part) / part, 1.0)
         linear = more * (1 - self.slack / (1 + more)) / (1 - self.slack)
         return 0.5 * self.square * self.radius**2 * linear * growth
-
-
-_STRAIGHT = 1e-9  # part of their limit that chains are held from
 
 
 class Hyperelastic(_Shipped):
