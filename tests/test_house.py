@@ -23,7 +23,8 @@ PACKAGE = [path for path in SOURCES if ROOT / "vijax" in path.parents]
 
 # Heavy packages, and the files (or folders) that alone may import them.
 ONLY_IN = {
-    "diffrax": {"vijax/engine/ode.py", "benchmarks/peers.py", "benchmarks/naive.py"},  # what users write without vijax
+    # Those of benchmarks are what users write without vijax.
+    "diffrax": {"vijax/engine/ode.py", "vijax/engine/ode_contact.py", "benchmarks/peers.py", "benchmarks/naive.py"},
     "distributed": {"vijax/planes/cluster.py"},
     "pint": {"vijax/model/units.py"},
     "bokeh": {"vijax/explorer"},

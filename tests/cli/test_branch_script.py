@@ -23,9 +23,30 @@ def test_a_branch_begins_within_its_bounds_where_the_device_does_not_lie_there(f
     assert {str(found[f"end_{end}"].values[0]) for end in ("first", "last")} == {"low", "high"}
 
 
+def test_a_branch_of_another_membrane_says_which(folder, capsys):
+    told = ["--kappa", "40", "--along", "d=0.19:0.21", "--membrane", "hunt-crossley", "--chi", "0.3"]
+    assert script.main([*told, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0
+    assert "met pitchfork 0.19705393" in capsys.readouterr().out
+    found = vijax.load(folder / "branch.zarr")
+    assert found.attrs["membrane"] == "hunt-crossley with chi 0.3, exponent 1.5"
+    assert "r" not in found.coords
+
+
 @pytest.mark.parametrize(
     ("arguments", "say"),
     [
+        (
+            ["--wall", "soft", "--r_left", "0.5", "--membrane", "hunt-crossley", "--chi", "0.3"],
+            "r_left must be left out with a membrane that has no restitution; got 0.5",
+        ),
+        (
+            ["--wall", "soft", "--along", "r=0.3:0.5", "--membrane", "hunt-crossley", "--chi", "0.3"],
+            "the loss of this membrane is told by its law, not by r",
+        ),
+        (
+            ["--membrane", "hyperelastic", "--prestretch", "2", "--radius", "1"],
+            "membrane must be left out with a rigid",
+        ),
         (
             ["--omega", "3", "--along", "omega=6pi:16pi"],
             "omega must lie within the bounds of along",

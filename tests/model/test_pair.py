@@ -13,6 +13,7 @@ import pytest
 from vijax.model.device import Harvester, with_constants, with_pair
 from vijax.model.pair import ImpactPair, from_membrane_pair, impact_pair, membrane_pair
 from vijax.model.restitution import damping_ratio
+from vijax.model.sides import Sides
 
 # Round trips are a handful of roundings.
 ROUND_TRIP = 1e-14
@@ -240,3 +241,9 @@ def test_impact_pair_broadcasts_and_keeps_single_precision():
     single = impact_pair(jnp.ones(2, "float32"), 4.0, 1, 0)
     assert {field.dtype for field in jax.tree.leaves(single)} == {jnp.dtype("float32")}
     assert impact_pair(1, 4, 1).d.dtype == jnp.dtype("float64")
+
+
+def test_a_pair_of_a_membrane_that_takes_no_restitution_has_none():
+    assert impact_pair([0.2, 0.3], 40.0, None).r is None
+    with pytest.raises(ValueError, match="r_right must"):
+        impact_pair(0.2, 40.0, Sides(0.5, None))

@@ -17,7 +17,7 @@ from vijax.engine.method import Method
 from vijax.engine.method_choice import choose
 from vijax.model.choices import MethodName, SolverName
 from vijax.model.excitation import Excitation, check_excitation
-from vijax.model.membrane import MembraneLaw
+from vijax.model.membrane import Linear, MembraneLaw, check_restitution
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
@@ -37,12 +37,7 @@ def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any], excitation:
         method = choose(method, options, wall=pair.walls, dtype=_precision(pair), excitation=excitation)
     elif excitation is not None:
         raise ValueError(f"excitation must be left out with a method of your own; got {checks.shown(excitation)}")
-    lossy = method is None or method.law.restitution
-    if (pair.r is None) == lossy:
-        raise ValueError(
-            "r must be None with a membrane that takes none, as HuntCrossley, and a number with others; "
-            f"got {checks.shown(pair.r)}"
-        )
+    check_restitution(pair, Linear() if method is None else method.law)
     return method
 
 

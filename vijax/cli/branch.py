@@ -3,25 +3,26 @@
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from vijax.cli import options, process
+from vijax.cli import membranes, options, process
 from vijax.cli.arguments import about, at_one_point, device, take_axes
 from vijax.cli.closing import finish, pace
 from vijax.cli.kinds import Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
 from vijax.cli.targets import targets
-from vijax.model.quantities import AXES, BRANCH_QUANTITIES, PARAMETERS
+from vijax.model.quantities import AXES, BRANCH_QUANTITIES, PARAMETERS, whole
 from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     from vijax.model.choices import Walls
     from vijax.model.device import Harvester
+    from vijax.model.membrane import MembraneLaw
     from vijax.model.pair import ImpactPair
     from vijax.orbits.continuation import Branch
     from vijax.orbits.events import Point
@@ -39,7 +40,7 @@ class BranchRequest:
 
     Attributes:
         pair, device: What the orbits belong to.
-        impacts, guesses, max_switches: As `orbit_search.search` and `switching.family` take them.
+        impacts, guesses, membrane, max_switches: As `orbit_search.search` and `switching.family` take them.
         along, within: The parameter that is followed, and its bounds.
         places: Values of it at which orbits to begin with are looked for, in turn.
     """
@@ -48,6 +49,7 @@ class BranchRequest:
     device: "Harvester"
     impacts: str
     guesses: int
+    membrane: "MembraneLaw | None"
     max_switches: int
     along: str
     within: tuple[float, float]
@@ -94,6 +96,7 @@ def branches(
 def _asked(
     constants: tuple[str, ...], along: str, impacts: str, guesses: int, max_switches: int, wall: "Walls", **given: Any
 ) -> BranchRequest:
+    from vijax.model.membrane import with_law
     from vijax.orbits import orbit_search, parameter, switching
     from vijax.runtime import checks
 
@@ -101,14 +104,28 @@ def _asked(
     chosen = given.get(name) is not None
     # Along a quantity of the device a branch begins at that of Tables I and II, all that is not given.
     start = {} if name in options.DEVICE else _START
+    membrane = membranes.take_membrane(given)
+    own_r = {name: given[name] for name in PARAMETERS if whole(name) == "r" and given[name] is not None}
     pair, made = at_one_point(take_axes(given, start), device(constants), wall)
+    pair = _without_r(pair, membrane, own_r)
+    with_law(pair, membrane)  # which says what such a pair cannot have
     checks.whole("max_switches", max_switches, 0, switching.MOST_SWITCHES)
     walls, _ = orbit_search.sequences(impacts)
     orbit_search.check_guesses(guesses, len(walls))
     with about("along"):
         parameter.check_along(pair, name, within)
     places = list(_places(float(parameter.value_at(pair, name, made)), name, within, chosen))
-    return BranchRequest(pair, made, impacts, guesses, max_switches, name, within, places)
+    return BranchRequest(pair, made, impacts, guesses, membrane, max_switches, name, within, places)
+
+
+def _without_r(pair: "ImpactPair", membrane: "MembraneLaw | None", given: dict[str, str]) -> "ImpactPair":
+    """Leave r out of the pair of a membrane that takes none."""
+    if membrane is None or membrane.restitution:
+        return pair
+    for name, value in given.items():
+        raise ValueError(f"{name} must be left out with a membrane that has no restitution; got {value}")
+    nothing: Any = None
+    return replace(pair, r=nothing)
 
 
 def _check_picture(path: Path | None, quantity: str) -> None:
@@ -144,11 +161,11 @@ def _places(own: float, name: str, within: tuple[float, float], chosen: bool) ->
 
 def _found(asked: BranchRequest) -> "Orbit":
     """Search for orbits, and take those at the first place that has any."""
-    from vijax.orbits import orbit_search, parameter
+    from vijax.orbits import parameter
 
     for place in asked.places:
         pair = parameter.pair_at(asked.pair, asked.along, place, asked.device)
-        if len(found := orbit_search.search(pair, asked.impacts, guesses=asked.guesses)):
+        if len(found := _searched(asked, pair)):
             return found
     tried = ", ".join(f"{place:.6g}" for place in asked.places)
     raise ValueError(
@@ -158,6 +175,12 @@ def _found(asked: BranchRequest) -> "Orbit":
             f"{asked.along} = {tried}; try more guesses",
         )
     )
+
+
+def _searched(asked: BranchRequest, pair: "ImpactPair") -> "Orbit":
+    from vijax.orbits import orbit_search
+
+    return orbit_search.search(pair, asked.impacts, guesses=asked.guesses, membrane=asked.membrane)
 
 
 def _summary(followed: "list[Branch]", seconds: float) -> str:
@@ -203,6 +226,7 @@ def _sections() -> Sections:
             *options.axis_options(PARAMETERS),
             *options.device_options(),
             options.wall_option(),
+            *membranes.membrane_options("law of the soft walls"),
         ],
         "Files": [options.quantity_option(BRANCH_QUANTITIES), *options.file_options()],
     }
@@ -213,6 +237,7 @@ _EXAMPLES = (
     "--wall rigid --d 0.19 --impacts RLL --along d=0.1:0.3",
     "--s 0.2 --omega 11 --impacts 1:1/3T --along omega=2.5:13 --max-switches 2",
     "--s 0.3 --along omega0=20:400 --quantity P",
+    "--kappa 40 --along d=0.1:0.3 --membrane hunt-crossley --chi 0.3",
 )
 
 branch = Page(

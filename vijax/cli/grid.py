@@ -4,15 +4,16 @@ from typing import Any
 
 import click
 
-from vijax.cli import options, process
+from vijax.cli import process
 from vijax.cli import sweep as page
 from vijax.cli.compare import difference_map, tolerance_option
 from vijax.cli.excitation import take_excitation
 from vijax.cli.kinds import Choice
+from vijax.cli.membranes import MEMBRANE_NUMBERS
 from vijax.cli.page import Page, Sections
 from vijax.planes.sweep_settings import SweepSettings
 
-_METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", *options.MEMBRANE_NUMBERS)
+_METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", *MEMBRANE_NUMBERS)
 
 
 def map_or_difference(compare: str | None, tolerance: str | None, **given: Any) -> None:

@@ -26,15 +26,6 @@ DEVICE = {name for name, axis in AXES.items() if axis.unit}
 PHYSICAL = {name for of in ("d", "kappa") for name in synonyms(of) if name in DEVICE}
 PHYSICAL |= {name for name in DEVICE if of_both_walls(name) in PHYSICAL}
 
-MEMBRANES = ("linear", "hunt-crossley", "hyperelastic")
-# Which option is of which membrane.
-MEMBRANE_NUMBERS = {
-    "chi": "hunt-crossley",
-    "exponent": "hunt-crossley",
-    "prestretch": "hyperelastic",
-    "radius": "hyperelastic",
-    "stretch_limit": "hyperelastic",
-}
 OBJECTIVES, MOTIONS = get_args(Objective), get_args(Motion)
 
 

@@ -1,6 +1,5 @@
 """`vijax sweep`: a map over a plane of parameters."""
 
-import dataclasses
 import math
 from functools import partial
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from vijax.cli import options, process
+from vijax.cli import membranes, options, process
 from vijax.cli.arguments import device, take_axes
 from vijax.cli.closing import finish, statuses, tally
 from vijax.cli.excitation import excitation_options, take_excitation
@@ -145,28 +144,10 @@ def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: d
     from vijax.planes.sweep import plan
     from vijax.planes.sweep_settings import SweepSettings
 
-    membrane = _membrane(given.pop("membrane"), {name: given.pop(name) for name in options.MEMBRANE_NUMBERS})
+    membrane = membranes.take_membrane(given)
     refine, starts, excitation = given.pop("refine"), given.pop("starts"), take_excitation(given)
     settings = SweepSettings(**given, membrane=membrane, excitation=excitation)
     return plan(axes, outputs, device, settings, refine, starts)
-
-
-def _membrane(name: str | None, numbers: dict[str, float | None]) -> Any:
-    from vijax.model.membrane import HuntCrossley, Hyperelastic, Linear
-
-    if name not in (None, *options.MEMBRANES):
-        raise ValueError(f"membrane must be one of {', '.join(options.MEMBRANES)}; got {name!r}")
-    for number, value in numbers.items():
-        if value is not None and (owner := options.MEMBRANE_NUMBERS[number]) != name:
-            raise ValueError(f"{number} must be left out unless --membrane is {owner}; got {value:g}")
-    laws: dict[str | None, Any] = {"hunt-crossley": HuntCrossley, "hyperelastic": Hyperelastic, "linear": Linear}
-    if name is None:
-        return None
-    told = {number: value for number, value in numbers.items() if value is not None}
-    for field in dataclasses.fields(laws[name]):
-        if field.default is dataclasses.MISSING and field.name not in told:
-            raise ValueError(f"{field.name} must be given with --membrane {name}; got none")
-    return laws[name](**told)
 
 
 def _check_picture(path: Path, planned: "SweepPlan", show: str) -> None:
@@ -264,14 +245,6 @@ def _starts_option() -> click.Parameter:
     return click.Option(["--starts"], type=Whole(1), default=1, show_default=True, help=many)
 
 
-class _Membrane(Choice):
-    """The name of a membrane, any text at first: Python takes records in its place, so that `_membrane` refuses it."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Leave the text as it is."""
-        return value
-
-
 def _method_options() -> list[click.Parameter]:
     solvers = get_args(SolverName)
     listed = f"of ode: {', '.join(solvers)} [Tsit5]"
@@ -282,21 +255,8 @@ def _method_options() -> list[click.Parameter]:
         options.setting("rtol", "of ode: relative tolerance of a step [1e-8]", float),
         options.setting("atol", "of ode: absolute tolerance of a step [1e-10]", above),
         options.setting("steps", "of rk4: steps per forcing period [1000]", Whole(8)),
-        click.Option(["--membrane"], type=_Membrane(options.MEMBRANES), help="of ode and rk4 [linear]"),
-        click.Option(["--chi"], type=_at_least(0), help="of hunt-crossley: damping over stiffness"),
-        click.Option(["--exponent"], type=_at_least(1), help="of hunt-crossley: exponent of the penetration [1.5]"),
-        click.Option(["--prestretch"], type=_above(1), help="of hyperelastic: stretch without the ball, above 1"),
-        click.Option(["--radius"], type=_above(0), help="of hyperelastic: in units of displacement"),
-        click.Option(["--stretch-limit"], type=float, help="of hyperelastic: Gent's J_m [inf]"),
+        *membranes.membrane_options("of ode and rk4"),
     ]
-
-
-def _above(least: int) -> Real:
-    return Real(f"one finite number above {least}", min=least, min_open=True)
-
-
-def _at_least(least: int) -> Real:
-    return Real(f"one finite number of at least {least}", min=least)
 
 
 def _dask_options() -> list[click.Parameter]:

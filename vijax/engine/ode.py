@@ -3,7 +3,7 @@
 One `step` of a lane is one attempt of a solver step, accepted, rejected or cut short, so that no lane waits for
 another's solve. A cell's motion is a chain of smooth spells: flight in the displacement u, contact in the penetration
 w = side u - d/2; `mode` says which, and no sign of a rounded number is asked. What a step meets, where and in what
-state, `ode_events` says. This is the only file that imports diffrax.
+state, `ode_events` says. This and `ode_contact` are the only files that import diffrax.
 """
 
 from functools import reduce

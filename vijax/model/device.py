@@ -258,7 +258,8 @@ def realised(device: Harvester, table: Mapping[Any, Any], wall: Walls) -> tuple[
         table: What `pair_of` reads, A and omega; of rigid walls kappa says how deep a membrane they are lent.
         wall: What the walls are.
     """
-    pair = impact_pair(**vars(pair_of(table, wall)))
+    fields = pair_of(table, wall)
+    pair = impact_pair(fields.d, fields.kappa, fields.r, fields.gamma)
     if wall == "rigid" and "kappa_left" in table:
         # Both are of the one membrane that rigid walls are lent.
         table = {name: value for name, value in table.items() if name != "kappa_right"}

@@ -13,7 +13,7 @@ import numpy as np
 
 from vijax.model.pair import ImpactPair, Real
 from vijax.model.sides import Sides
-from vijax.runtime import checks
+from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import Values
 from vijax.runtime.pages import see
 
@@ -302,6 +302,43 @@ class Hyperelastic(_Shipped):
 
 _INSIDE = np.geomspace(1e-6, 0.1, 6)
 _NOMINAL = (0.2, 40.0, 0.5, 0.0)
+
+
+def with_law(pair: ImpactPair, law: Any) -> ImpactPair:
+    """Give a pair its membrane, whose numbers become those of every cell; None leaves the pair as it is.
+
+    Args:
+        pair: A checked pair; r is None with a membrane that takes none.
+        law: A membrane, or None.
+
+    Raises:
+        ValueError: No membrane, or one that the pair cannot have.
+    """
+    law = check_law(Linear() if law is None else law)
+    check_restitution(pair, law)
+    if isinstance(law, Linear):
+        return pair
+    if pair.rigid or pair.hard_wall:
+        raise ValueError(see("methods", f"membrane must be left out with a rigid wall; got {law}"))
+    dtype, shape, own = jnp.result_type(float, pair.d), np.shape(pair.d), tiles.library((pair, law))
+    wide = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), (*shape, *np.shape(x))), law)
+    return dataclasses.replace(pair, law=wide)
+
+
+def told(pair: ImpactPair) -> dict[str, str]:
+    """Name the membrane of some pairs for attributes, one for all; nothing of the linear one."""
+    if pair.law is None:
+        return {}
+    return {"membrane": str(jax.tree.map(lambda x: np.asarray(x)[(0,) * np.ndim(pair.d)], pair.law))}
+
+
+def check_restitution(pair: ImpactPair, law: MembraneLaw) -> None:
+    """Raise ValueError unless a pair has r where its membrane takes one, and None where it takes none."""
+    if (pair.r is None) == law.restitution:
+        raise ValueError(
+            "r must be None with a membrane that takes none, as HuntCrossley, and a number with others; "
+            f"got {checks.shown(pair.r)}"
+        )
 
 
 def check_law(law: Any) -> MembraneLaw:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import reduce
 from operator import and_
 from typing import Any, TypeVar, get_args
@@ -22,6 +23,7 @@ from vijax.runtime import checks
 from vijax.runtime.arrays import AnyArray, choose
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
+from vijax.runtime.pages import see
 
 Real = float | Float[AnyArray, "..."]
 T = TypeVar("T")
@@ -37,6 +39,8 @@ class ImpactPair(eqx.Module):
         kappa: Natural frequency of the soft walls, omega0 pi/omega > 0; None for rigid walls.
         r: Coefficient of restitution of a free contact, in (0, 1].
         gamma: Gravity along the axis over the forcing amplitude, g sin(beta)/A.
+        law: The membrane of a periodic orbit, a `MembraneLaw`; None for the linear one, and wherever a method of its
+            own knows it.
 
     Of walls that differ in kappa or r both are `Sides`, a number for each wall; kappa of a rigid one beside a soft one
     is None. It has no membrane: the depth of its impacts is 0, and nothing is harvested from them.
@@ -47,6 +51,7 @@ class ImpactPair(eqx.Module):
     kappa: Float[AnyArray, "..."] | None
     r: Float[AnyArray, "..."]
     gamma: Float[AnyArray, "..."]
+    law: eqx.Module | None = eqx.field(default=None, kw_only=True)
 
     def __post_init__(self):
         # One of two forms, so that no program need be compiled for walls that differ in one of both alone.
@@ -67,7 +72,7 @@ class ImpactPair(eqx.Module):
         """Give the pair in the form of walls that differ."""
         kappa: Any = None if self.rigid else apart(self.kappa)
         r: Any = apart(self.r)
-        return ImpactPair(self.d, kappa, r, self.gamma)
+        return replace(self, kappa=kappa, r=r)
 
     def at(self, side: Any) -> "ImpactPair":
         """Give the pair whose walls are both as that on a side is, +1 right or -1 left; itself unless they differ."""
@@ -77,7 +82,7 @@ class ImpactPair(eqx.Module):
         if self.hard_wall:
             # A number stands in for that of the rigid wall, whose form does not read it; see `met`.
             kappa = kappa.left if self.hard_wall > 0 else kappa.right
-        return ImpactPair(self.d, at(kappa, side), at(self.r, side), self.gamma)
+        return replace(self, kappa=at(kappa, side), r=at(self.r, side))
 
     @property
     def hard_wall(self) -> int:
@@ -186,13 +191,19 @@ def from_membrane_pair(pair: MembranePair) -> ImpactPair:
     return ImpactPair(pair.length_unit, 1 / pair.time_unit, restitution(ratio), pair.g_star / pair.A_star)
 
 
-def check_pair(pair: Any) -> ImpactPair:
+def check_pair(pair: Any, *, any_law: bool = False) -> ImpactPair:
     """Return the pair, if its fields may be; those of traced values pass unseen.
+
+    Args:
+        pair: What came.
+        any_law: Whether its membranes need not be linear.
 
     Raises:
         ValueError: No pair, a field that cannot be, or fields that do not broadcast.
     """
-    given = vars(checks.instance("pair", pair, ImpactPair, "vijax.impact_pair(...)"))
+    given = dict(vars(checks.instance("pair", pair, ImpactPair, "vijax.impact_pair(...)")))
+    if (law := given.pop("law")) is not None and not any_law:
+        raise ValueError(see("methods", f"pair must have linear membranes here; got {type(law).__name__}"))
     fields: dict[str, Any] = {}
     for name, value in given.items():
         for argument, one in named(name, value).items():
@@ -216,16 +227,19 @@ def check_start(pair: ImpactPair, name: str, u: Any) -> None:
         )
 
 
+_MAY_BE_NONE = "kappa", "kappa_left", "kappa_right", "r"
+
+
 @door
 def impact_pair(
-    d: Given, kappa: Given | Sides[Given | None] | None, r: Given | Sides[Given], gamma: Given = 0.0
+    d: Given, kappa: Given | Sides[Given | None] | None, r: Given | Sides[Given] | None, gamma: Given = 0.0
 ) -> ImpactPair:
     """Make a checked `ImpactPair`, its fields broadcast to one shape.
 
     Args:
         d: Gap between the walls, > 0, any shape.
         kappa: Natural frequency of the soft walls, > 0 and finite; None for rigid walls.
-        r: Coefficient of restitution, in (0, 1].
+        r: Coefficient of restitution, in (0, 1]; None with a membrane that takes none, as `HuntCrossley`.
         gamma: Gravity over forcing amplitude, finite.
 
     kappa and r may be `Sides(left, right)`, of walls that differ; `Sides(25.0, None)` has a rigid wall on the right.
@@ -234,7 +248,7 @@ def impact_pair(
         ValueError: A value that cannot be, or shapes that do not broadcast (traced values are not looked at).
     """
     given = {"d": d, **named("kappa", kappa), **named("r", r), "gamma": gamma}
-    given = {name: value for name, value in given.items() if value is not None or not name.startswith("kappa")}
+    given = {name: value for name, value in given.items() if value is not None or name not in _MAY_BE_NONE}
     given = {name: units.plain(whole(name), value) for name, value in given.items()}
     for name, value in given.items():
         check(whole(name), value, name)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vijax.model.device import Harvester, depth_unit, one_device, with_constants
+from vijax.model.membrane import told
 from vijax.model.pair import quantities
 from vijax.model.quantities import AXES, MEASURED
 from vijax.model.sides import at
@@ -59,7 +60,8 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
             "title": "Branches of periodic orbits of a vibro-impact pair",
             "along": along,
             "wall": branches[0].orbit.pair.walls,
-        },
+        }
+        | told(branches[0].orbit.pair),
     )
 
 

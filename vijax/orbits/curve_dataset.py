@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vijax.model.label import label
+from vijax.model.membrane import told
 from vijax.model.pair import quantities
 from vijax.model.quantities import AXES, MEASURED
 from vijax.orbits import orbit_properties
@@ -72,7 +73,8 @@ def curve_dataset(curves: list[BifurcationCurve] | MapCurves) -> "xr.Dataset":
             "title": "Curves of bifurcations of a vibro-impact pair",
             "along": " ".join(along),
             "wall": listed[0].orbit.pair.walls,
-        },
+        }
+        | told(listed[0].orbit.pair),
     )
     return made if of_map is None else _with_borders(made, of_map)
 

@@ -19,7 +19,7 @@ from vijax.model import flow
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.sides import at
-from vijax.orbits import grazing, multipliers, shooting, steady
+from vijax.orbits import contacts, grazing, multipliers, shooting, steady
 from vijax.orbits.arclength_step import PathEquations
 from vijax.orbits.parameter import moved_together
 from vijax.orbits.shooting import Sequence
@@ -142,9 +142,7 @@ class CurvePath(eqx.Module):
             return self._loads(self.device, y[-2:], pair, knots)[self.touch.impact][None] - 1
         if self.condition == "split":
             t, speed, _ = knots[self.touch.impact]
-            force = flow.contact_force(pair.gamma, self.touch.wall, t)
-            wall = flow.membrane(pair.at(self.touch.wall), rolled=True)
-            return jnp.stack(flow.oscillate(wall, force, 0.0 * t, speed, y[-3]))
+            return jnp.stack(contacts.within(pair.at(self.touch.wall), self.touch.wall, t, speed, y[-3]))
         leave = jax.tree.map(lambda leaf: leaf[self.touch.impact], shooting.departures(pair, self.sequence, knots))
         rise, v = flow.flight(flow.flight_force(pair.gamma, leave.t), -leave.side * leave.speed, y[-3])
         return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])

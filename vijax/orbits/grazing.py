@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax.engine import contact_search, flight_search
+from vijax.engine import flight_search
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.orbits import shooting
+from vijax.orbits import contacts, shooting
 from vijax.orbits.shooting import Knots, Sequence
 
 _NOTHING = 1.0  # clearance where there is nothing to clear
@@ -67,18 +67,10 @@ class Between(NamedTuple):
     deepest: Float[Array, "impact"]
 
 
-def _contact(pair: ImpactPair, side, knot, real) -> contact_search.Turns:
-    """Find when a contact is deepest, and where it is shallowest between."""
-    t, speed, stay = knot
-    zero, wanted = jnp.zeros_like(t), real & (stay > 0) & ~pair.hard(side)
-    force = flow.contact_force(pair.gamma, side, t)
-    wall = flow.membrane(pair.at(side), rolled=True)
-    return contact_search.turning_points(wall, force, zero, speed, wanted, length=stay)
-
-
 def _contacts(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real):
     """Find when each contact is deepest, and its least penetration at a minimum inside where there is one, and when."""
-    turns = jax.vmap(_contact, in_axes=(None, 0, 0, 0))(pair, departure.side, knots, real)
+    t, speed, stay = knots.T
+    turns = jax.vmap(contacts.turns, in_axes=(None, 0, 0, 0, 0, 0))(pair, departure.side, t, speed, stay, real)
     deepest = jnp.where(turns.lost | (turns.crest == 0), jnp.nan, turns.crest)
     shallow = jnp.where(jnp.isfinite(turns.lowest), turns.lowest, _NOTHING)
     return deepest, jnp.where(turns.lost, jnp.nan, shallow), turns.trough

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from vijax.model import flow
 from vijax.model.pair import ImpactPair, check_pair
+from vijax.orbits import contacts
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.programs import jitted
@@ -116,8 +117,7 @@ def _contact(pair: ImpactPair, t, side, v_in, s) -> tuple[Float[Array, ""], Floa
         return 0.5 * side * pair.d + 0.0 * s, jnp.where(s > 0, 0.0, v_in)
 
     def soft(wall: ImpactPair) -> tuple:
-        force = flow.contact_force(pair.gamma, side, t)
-        w, z = flow.oscillate(flow.membrane(wall, rolled=True), force, 0.0 * s, side * v_in, s)
+        w, z = contacts.within(wall, side, t, side * v_in, s)
         return side * (0.5 * pair.d + w), side * z
 
     return pair.met(side, rigid, soft)

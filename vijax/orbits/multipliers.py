@@ -2,19 +2,22 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
+from vijax.orbits import contacts
 from vijax.orbits.shooting import Knots, Sequence, joined_knots
 
 
 def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, "2 2"]:
     """Compute the tangent map once around in (du, du'), from the last contact's end; onto a mirror image where need be.
 
-    Saltations included; its determinant is exp(-mu (contact time)), or r^(2 impacts) at rigid walls.
+    Saltations included; its determinant is exp(-mu (contact time)) of linear membranes, or r^(2 impacts) at rigid
+    walls.
     """
     side, _, joined = joined_knots(sequence, knots)
     t, speed, stay, next_t, _ = joined.T
@@ -26,7 +29,7 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
             return flow.rigid_matrix(wall.r, flow.acceleration(pair.gamma, t), side * speed)
 
         def soft(wall: ImpactPair) -> Float[Array, "2 2"]:
-            return flow.contact_matrix(flow.membrane(wall, rolled=True), stay)
+            return contacts.tangent(wall, side, t, speed, stay)
 
         step = flow.flight_matrix(flight) @ pair.met(side, rigid, soft)
         return jnp.where(real, step @ before, before), None
@@ -79,34 +82,35 @@ def multiplier_conditions(pair: ImpactPair, sequence: Sequence, knots: Knots) ->
     """
     side, _, joined = joined_knots(sequence, knots)
     t, speed, stay, next_t, _ = joined.T
-    real = sequence.real
+    real, on = sequence.real, (t, speed, stay)
     slow = speed + _SLOW
 
     def weighed(wall: ImpactPair) -> tuple:  # how much its matrix is weighed down, and what it multiplies det M by
         return speed / slow, wall.r**2 + jnp.zeros_like(speed)
 
-    def damped(wall: ImpactPair) -> tuple:
-        return jnp.ones_like(speed), jnp.exp(-flow.membrane(wall, rolled=True).mu * stay)
+    def damped(_: ImpactPair) -> tuple:
+        return jnp.ones_like(speed), jax.vmap(lambda side, *on: contacts.loss(pair.at(side), side, *on))(side, *on)
 
     weight, product = (jnp.where(real, factor, 1.0).prod() for factor in pair.met(side, weighed, damped))
 
     def one(before, here):
-        side, t, speed, stay, flight, slow, real = here
+        side, on, flight, slow, real = here
 
         def rigid(wall: ImpactPair) -> Float[Array, "2 2"]:
             # The matrix for v = v + 0.1, and that part of r which remains.
+            t, speed, _ = on
             contact = flow.rigid_matrix(wall.r, flow.acceleration(pair.gamma, t), side * slow)
             keep = speed / slow
             return contact * jnp.array([[keep, 1.0], [1.0, keep]])
 
         def soft(wall: ImpactPair) -> Float[Array, "2 2"]:
-            return flow.contact_matrix(flow.membrane(wall, rolled=True), stay)
+            return contacts.tangent(wall, side, *on)
 
         contact = pair.met(side, rigid, soft)
         return jnp.where(real, flow.flight_matrix(flight) @ contact @ before, before), None
 
     start = jnp.eye(2, dtype=knots.dtype)
-    around, _ = lax.scan(one, start, (side, t, speed, stay, next_t - t - stay, slow, real))
+    around, _ = lax.scan(one, start, (side, on, next_t - t - stay, slow, real))
     trace = jnp.where(sequence.mirrored, -1.0, 1.0) * (around[0, 0] + around[1, 1])
     return MultiplierConditions(weight * (1 + product) - trace, weight * (1 + product) + trace)
 

@@ -3,6 +3,7 @@
 import itertools
 import math
 import re
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax.batch.trajectory import trajectory
+from vijax.model.membrane import MembraneLaw, with_law
 from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
@@ -26,7 +28,14 @@ _MOST_IMPACTS, _MOST_SEQUENCES, _MOST_GUESSES = 64, 10_000, 10**7
 
 @door
 def from_state(
-    pair: ImpactPair, u: ArrayLike, v: ArrayLike, t: ArrayLike = 0.0, *, period: int = 1, settle: int = 0
+    pair: ImpactPair,
+    u: ArrayLike,
+    v: ArrayLike,
+    t: ArrayLike = 0.0,
+    *,
+    period: int = 1,
+    settle: int = 0,
+    membrane: MembraneLaw | None = None,
 ) -> Orbit:
     """Find periodic orbits near states: each is flown once around to learn its impacts, then corrected by Newton.
 
@@ -35,6 +44,7 @@ def from_state(
         u, v, t: Displacements, velocities and phases in [0, 2).
         period: Forcing periods of the orbits.
         settle: Forcing periods that the states are flown first: the guesses are then near attractors.
+        membrane: The membrane, as in `trajectory`; the linear one if None. States are then flown by "ode".
 
     Returns:
         One orbit a state, stable or not; NO_ORBIT where Newton found none, or the state meets no wall.
@@ -50,28 +60,38 @@ def from_state(
     shape = checks.shapes(u=u, v=v, t=t, **quantities(pair))
     check_start(pair, "u", u)
     pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)
+    lawful = with_law(pair, membrane)
+    follow = partial(trajectory, pair, method="ode" if lawful.law else "exact", membrane=membrane)
     u, v, t = (np.broadcast_to(x, shape) for x in (u, v, t))
     inside = (t >= 0) & (t < 2)
     if not inside.all():
         raise ValueError(f"t must lie in [0, 2); got {checks.first(t, inside)}")
     lost = np.zeros(shape, bool)
     if settle:
-        last = jax.tree.map(lambda x: np.asarray(x)[..., -1], trajectory(pair, u, v, periods=settle, t0=t).states)
+        last = jax.tree.map(lambda x: np.asarray(x)[..., -1], follow(u, v, periods=settle, t0=t).states)
         # More impacts than a trajectory has room for: the state is not known.
         lost = ~np.isfinite(last.u + last.v)
         u, v, t = np.where(lost, 0.0, last.u), np.where(lost, 0.0, last.v), np.zeros(shape)
     # Impacts are counted from the first one on: a start may sit on a wall or in a contact.
-    found = jax.tree.map(np.asarray, trajectory(pair, u, v, periods=tiles.padded(2 * period + 1), t0=t).impacts)
+    found = jax.tree.map(np.asarray, follow(u, v, periods=tiles.padded(2 * period + 1), t0=t).impacts)
     onset = 2 * found.n + found.t
     around = (onset < onset[:, :1] + 2 * period - SAME) & ~lost[:, None]
     width = tiles.padded(int(around.sum(axis=1).max(initial=1)))
     side = np.where(around[:, :width], found.side[:, :width], 0)
     knots = np.stack([onset[:, :width], np.abs(found.v_in[:, :width]), found.duration[:, :width]], axis=-1)
-    return solved(pair, *guessed(side, np.full(shape, 2.0 * period), np.zeros(shape, bool), knots))
+    return solved(lawful, *guessed(side, np.full(shape, 2.0 * period), np.zeros(shape, bool), knots))
 
 
 @door
-def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses: int = 2048, seed: int = 0) -> Orbit:
+def search(
+    pair: ImpactPair,
+    impacts: str,
+    period: int | None = None,
+    *,
+    guesses: int = 2048,
+    seed: int = 0,
+    membrane: MembraneLaw | None = None,
+) -> Orbit:
     """Search every orbit with a given impact sequence, stable or unstable, from random guesses.
 
     Args:
@@ -81,6 +101,7 @@ def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses
         period: Forcing periods; 1, or the label's.
         guesses: Random guesses a sequence.
         seed: Of the guesses.
+        membrane: The membrane, as in `trajectory`; the linear one if None.
 
     Returns:
         The distinct orbits, each once.
@@ -95,6 +116,7 @@ def search(pair: ImpactPair, impacts: str, period: int | None = None, *, guesses
         raise ValueError(f"pair must be one cell; got shape {np.shape(pair.d)}; search each")
     every, period = sequences(impacts, period)
     check_guesses(guesses, len(every))
+    pair = with_law(pair, membrane)
     draw = np.random.default_rng(checks.seed(seed))
     found = [_search(pair, walls, period, guesses, draw) for walls in every]
     return distinct(concatenate(found))
@@ -151,10 +173,10 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     gaps = draw.dirichlet(np.ones(count), guesses) * 2 * period
     t = draw.uniform(0, 2, (guesses, 1)) + np.cumsum(gaps, axis=1) - gaps[:, :1]
     speed = draw.uniform(0, _FASTEST, (guesses, count))
-    lasts = pair.met(np.asarray(walls), lambda wall: 0.0 * wall.r, lambda wall: np.pi / wall.omega1)
+    lasts = pair.met(np.asarray(walls), lambda wall: 0.0 * wall.r, _lasts)
     free = np.asarray(lasts)  # contacts without forcing
     knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
-    wide = jax.tree.map(lambda x: np.broadcast_to(x, guesses), pair)
+    wide = jax.tree.map(lambda x: np.broadcast_to(x, (guesses, *np.shape(x))), pair)
     side = np.broadcast_to(np.asarray(walls, np.int32), (guesses, count))
     sequence, near = guessed(side, np.full(guesses, 2.0 * period), np.zeros(guesses, bool), knots)
     begin_judgement(wide, sequence, near)
@@ -163,6 +185,11 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     first = _each_once(side, claim.knots, np.flatnonzero(np.isfinite(claim.residual)))
     kept = first if first.size else np.zeros(1, int)
     return judged(*jax.tree.map(lambda leaf: np.asarray(leaf)[kept], (wide, sequence, claim)))
+
+
+def _lasts(wall: ImpactPair) -> Any:
+    """Say how long a contact with a soft wall lasts without forcing; of a membrane that has no r, or any law, about."""
+    return np.pi / (wall.kappa if wall.r is None else wall.omega1)
 
 
 def _each_once(side: Any, knots: Any, good: np.ndarray) -> np.ndarray:

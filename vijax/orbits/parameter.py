@@ -127,7 +127,9 @@ def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tu
     stiff = [name for name, (first, *_) in MOVED.items() if whole(first) == "kappa" and pair.rigid]
     of_both = [name for name in stiff if not of_both_walls(name)]
     hint = f"a rigid wall has no {' or '.join(of_both)}" if stiff else ""
-    checks.choice("along", along, [name for name in MOVED if name not in stiff], hint)
+    lossless = [name for name in MOVED if whole(name) == "r" and pair.r is None]
+    hint = "the loss of this membrane is told by its law, not by r" if lossless else hint
+    checks.choice("along", along, [name for name in MOVED if name not in (*stiff, *lossless)], hint)
     (first, *more) = MOVED[along]
     both = getattr(pair, first, None)
     if not more and isinstance(both, Sides) and not np.array_equal(both.left, both.right):

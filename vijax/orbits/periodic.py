@@ -15,7 +15,8 @@ from vijax.engine.ground import Ground, ground_of
 from vijax.model import flow
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
-from vijax.orbits import multipliers, shooting
+from vijax.orbits import contacts, multipliers, shooting
+from vijax.orbits.grazing import Clearance, between
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks, context, tiles
 from vijax.runtime.arrays import AnyArray
@@ -142,7 +143,9 @@ def _first_row(*rows: Any) -> Any:
 
 
 def judged(pair: ImpactPair, sequence: Sequence, claim: "Claim") -> Orbit:
-    """Prove claims by the impact map, or say what they lack."""
+    """Prove claims by the impact map, or say what they lack; of membranes that are not linear by what lies between."""
+    if pair.law is not None:
+        return _by_tiles(_prove_between, (pair, sequence, claim))
     return _by_tiles(partial(_prove, ground_of(pair.gamma)), (pair, sequence, claim))
 
 
@@ -199,8 +202,7 @@ def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[AnyArray, "orbit i
 
 @jitted
 def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Claim:
-    residual = jnp.abs(jax.vmap(shooting.gap)(pair, sequence, knots)).max(axis=1)
-    return _claim(pair, sequence, knots, residual)
+    return _claim(pair, sequence, knots, shooting.residuals(pair, sequence, knots))
 
 
 def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"]) -> Claim:
@@ -222,6 +224,27 @@ def _prove(ground: Ground, rows: tuple) -> Orbit:
 
 
 @jitted
+def _prove_between(rows: tuple) -> Orbit:
+    """Judge claims by their turning points, between which nothing can happen.
+
+    The impact map knows linear membranes alone; flights are in closed form here too.
+    """
+    pair, sequence, claim = rows
+    clearance, depth, work = jax.vmap(_between)(pair, sequence, claim.knots)
+    found = (claim.residual < SAME) & sequence.real.any(axis=1)
+    verified = found & (jnp.stack(clearance).min(axis=0) > 0)
+    return _as_orbits(pair, sequence, claim, found, verified, depth, work)
+
+
+def _between(pair: ImpactPair, sequence: Sequence, knots: shooting.Knots) -> tuple[Clearance, Any, Any]:
+    """Find the clearances of one claim, and depth and work of each impact, with membranes of any law."""
+    motion, departure = between(pair, sequence, knots), shooting.departures(pair, sequence, knots)
+    each = jax.vmap(lambda side, *impact: contacts.given(pair.at(side), side, *impact))
+    out = -departure.side * departure.speed
+    return motion.clearance, *each(departure.side, *knots.T, out, jnp.nan_to_num(motion.deepest))
+
+
+@jitted
 def _judged(pair: ImpactPair, sequence: Sequence, claim: Claim, flown: Next) -> Orbit:
     """Judge the claims by what the flights say of them."""
     real, departure = sequence.real, claim.departure
@@ -235,18 +258,23 @@ def _judged(pair: ImpactPair, sequence: Sequence, claim: Claim, flown: Next) -> 
     # Rounding decides whether a ball meets the wall that it just touches, or flies by to the impact after it.
     by = (departure.next_speed == 0) & meets(*(jnp.roll(one, -1, axis=1) for one in ahead))
     verified = found & (meets(*ahead) | by | ~real).all(axis=1)
-    status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
-    good = verified[:, None] & real
     # What was flown to is the impact after each.
     place = jnp.arange(real.shape[1], dtype=jnp.int32)
     before = jnp.where(place == 0, real.sum(axis=1, dtype=jnp.int32)[:, None] - 1, place - 1)
     depth, work = (jnp.take_along_axis(jnp.where(by, 0.0, x), before, axis=1) for x in (flown.depth, flown.work))
+    return _as_orbits(pair, sequence, claim, found, verified, depth, work)
+
+
+def _as_orbits(pair: ImpactPair, sequence: Sequence, claim: Claim, found, verified, depth, work) -> Orbit:
+    """Make the records of claims, by which of them an orbit was found, and which was verified."""
+    status = jnp.where(verified, Status.OK, jnp.where(found, Status.VIRTUAL, Status.NO_ORBIT)).astype(jnp.int32)
+    good = verified[:, None] & sequence.real
     # The first impact is put into the first period.
     knots = claim.knots.at[..., 0].add(-2 * jnp.floor(0.5 * claim.knots[:, :1, 0]))
     return Orbit(
         pair=pair,
         sequence=sequence,
-        knots=jnp.where((real & found[:, None])[..., None], knots, jnp.nan),
+        knots=jnp.where((sequence.real & found[:, None])[..., None], knots, jnp.nan),
         depth=jnp.where(good, depth, jnp.nan),
         work=jnp.where(good, work, jnp.nan),
         multipliers=jnp.where(found[:, None], claim.multipliers, jnp.nan),

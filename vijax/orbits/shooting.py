@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
+from vijax.orbits import contacts
 from vijax.runtime import ring_solve
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.ring_solve import Ring
@@ -60,70 +61,23 @@ class LinearisedEquations(NamedTuple):
         return self.ring.dense
 
 
-class _ContactEnd(NamedTuple):
-    """The end of a contact: penetration there over the contact's length, and w'; each in onset, speed and length."""
-
-    place: Float[Array, ""]
-    rate: Float[Array, ""]
-    place_slope: Float[Array, "3"]
-    rate_slope: Float[Array, "3"]
-
-
-def _contact(pair: ImpactPair, side, knot: Float[Array, "5"]) -> _ContactEnd:
-    """Compute a contact and its derivatives: all follow from the free response and the forcing at both ends.
-
-    An onset moved at the same length moves the whole motion, less the free motion of what the state at the onset gains.
-    Automatic derivatives would run a tangent of the closed form for every unknown, at five times the cost.
-    """
-    t, speed, stay, _, _ = knot
-
-    def rigid(wall: ImpactPair) -> _ContactEnd:
-        zero, one = jnp.zeros_like(t), jnp.ones_like(t)
-        return _ContactEnd(stay, -wall.r * speed, jnp.stack([zero, zero, one]), jnp.stack([zero, -wall.r, zero]))
-
-    def soft(wall: ImpactPair) -> _ContactEnd:
-        # A contact with a rigid wall beside a soft one has no length to divide by.
-        length = jnp.where(pair.hard(side), 0.5, stay) if pair.hard_wall else stay
-        return _soft_contact(wall, side, t, speed, length)
-
-    return pair.met(side, rigid, soft)
-
-
-def _soft_contact(pair: ImpactPair, side, t, speed, stay) -> _ContactEnd:
-    """Do what `_contact` does, where both walls are as soft as the one that is met."""
-    zero = jnp.zeros_like(t)
-    wall, force = flow.membrane(pair, rolled=True), flow.contact_force(pair.gamma, side, t)
-    w, rate = flow.oscillate(wall, force, zero, speed, stay)
-    h, slope = flow.free_response(wall, stay)
-    square, begin = wall.kappa * wall.kappa, force.c - force.g
-    push = force.at(stay) - wall.mu * rate - square * w
-    onset = rate - slope * speed - h * begin
-    rate_onset = push + square * h * speed - slope * (begin - wall.mu * speed)
-    return _ContactEnd(
-        w / stay,
-        rate,
-        jnp.stack([onset, h, rate - w / stay]) / stay,
-        jnp.stack([rate_onset, slope, push]),
-    )
-
-
 def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Float[Array, "3"], Float[Array, "3 5"]]:
     """Compute the equations of one contact and the flight after it to the wall `onward`, and their derivatives.
 
     `knot` ends with the next time and speed. Divided by the contact's length, and by the flight's where it returns to
     its wall: no trivial root at length zero.
     """
-    t, _, stay, next_t, next_speed = knot
-    contact = _contact(pair, side, knot)
-    leave, length, speed = t + stay, next_t - t - stay, side * contact.rate
-    rise, v = flow.flight(flow.flight_force(pair.gamma, leave), speed, length)
+    t, speed, stay, next_t, next_speed = knot
+    contact = contacts.end(pair, side, t, speed, stay)
+    leave, length, out = t + stay, next_t - t - stay, side * contact.rate
+    rise, v = flow.flight(flow.flight_force(pair.gamma, leave), out, length)
     # In (onset, speed, stay, next onset, next speed): how each end of the flight moves.
     unit = jnp.eye(5, dtype=knot.dtype)
     d_leave, d_next, d_next_speed = unit[0] + unit[2], unit[3], unit[4]
-    d_speed = side * jnp.pad(contact.rate_slope, (0, 2))
+    d_out = side * jnp.pad(contact.rate_slope, (0, 2))
     push = flow.acceleration(pair.gamma, leave)
-    d_rise = v * d_next + length * d_speed - (speed + length * push) * d_leave
-    d_v = flow.acceleration(pair.gamma, next_t) * d_next + d_speed - push * d_leave
+    d_rise = v * d_next + length * d_out - (out + length * push) * d_leave
+    d_v = flow.acceleration(pair.gamma, next_t) * d_next + d_out - push * d_leave
     back = side == onward
     place = jnp.where(back, rise / length, rise - onward * pair.d)
     d_place = jnp.where(back, (d_rise - rise / length * (d_next - d_leave)) / length, d_rise)
@@ -167,6 +121,17 @@ def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None
     side, wall, joined = joined_knots(sequence, knots, onward)
     pieces, _ = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
+
+
+def residuals(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Float[Array, "orbit"]:
+    """Find the largest violation of the equations by each of a batch, and by how much its contacts are uncertain."""
+    return jax.vmap(_residual)(pair, sequence, knots)
+
+
+def _residual(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, ""]:
+    side, _, joined = joined_knots(sequence, knots)
+    uncertain = jax.vmap(lambda side, knot: contacts.uncertainty(pair, side, *knot[:3]))(side, joined)
+    return jnp.maximum(jnp.abs(gap(pair, sequence, knots)).max(), jnp.where(sequence.real, uncertain, 0.0).max())
 
 
 def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: ImpactPair) -> LinearisedEquations:
@@ -219,7 +184,7 @@ def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
     """Say how each contact ends, and where the flight after it is to lead."""
     side, wall, joined = joined_knots(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
-    rate = jax.vmap(lambda side, knot: _contact(pair, side, knot).rate)(side, joined)
+    rate = jax.vmap(lambda side, knot: contacts.end(pair, side, *knot[:3]).rate)(side, joined)
     next_stay = knots[_following(sequence)[0], 2]
     return Departure(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
 
@@ -294,6 +259,6 @@ def newton(
     end = lax.while_loop(lambda d: d.going.any() & (d.iteration < max_iterations), advance, start)
     arrived = (end.missing < jnp.inf) & ((size(end.step) <= _LAST_STEP) | (end.missing < _FLOOR))
     knots = jnp.where(arrived[:, None, None], end.knots - end.step, end.knots)
-    residual = jnp.abs(jax.vmap(gap)(pair, sequence, knots)).max(axis=1)
+    residual = residuals(pair, sequence, knots)
     arrived = arrived & jax.vmap(possible)(pair, sequence, knots)
     return knots, jnp.where(arrived, residual, jnp.inf)

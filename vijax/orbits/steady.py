@@ -4,6 +4,7 @@ The orbit follows its parameters by the implicit function theorem on the shootin
 with every impact's own unknowns kept. Where that derivative means nothing, values and derivatives are NaN.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -12,14 +13,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax.engine.roots import implicit_root
 from vijax.model import energy, flow
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, check_device
+from vijax.model.membrane import Linear, MembraneLaw, check_law
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.model.sides import at
-from vijax.orbits import shooting
+from vijax.orbits import contacts, shooting
 from vijax.orbits.grazing import Between, Clearance
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.shooting import Knots, Sequence
@@ -27,6 +28,7 @@ from vijax.orbits.validity import Validity, validity
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
 from vijax.runtime.derivatives import differentiable, shared_slopes
+from vijax.runtime.pages import see
 
 
 class Steady(WithStatus):
@@ -85,7 +87,9 @@ def _follows_jvp(primals, tangents):
 
 
 @door
-def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -> Steady:
+def steady(
+    device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None, membrane: MembraneLaw | None = None
+) -> Steady:
     """Find the steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
 
     Args:
@@ -93,6 +97,7 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
         orbit: One element of a `periodic.Orbit` (`found[0]`) of the device or of a near one: its walls, and
             where Newton begins. Values come from `device`, not from `orbit.pair`.
         pair: d, kappa, r, gamma to move directly; those of the device unless given. Its wall is the orbit's.
+        membrane: Numbers of the membrane to move, of the orbit's kind; those of the orbit unless given.
 
     Returns:
         The record; NaN with a `status` where there is no attracting orbit.
@@ -101,13 +106,14 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None) -
         ValueError: Which argument, what must hold, what came.
     """
     _check(device, orbit, pair)
+    law = _law(orbit, pair, membrane)
     if orbit.knots.dtype != np.float64:
         raise ValueError(
             f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbits.periodic` found it"
         )
     # Numbers of one kind, however they are given: each kind would be a program of its own.
-    device, pair = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair))
-    return _near((device, pair), (orbit.sequence, orbit.knots), kind=orbit.pair.walls)
+    moved = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair, law))
+    return _near(moved, (orbit.sequence, orbit.knots), kind=orbit.pair.walls)
 
 
 class Found(NamedTuple):
@@ -124,12 +130,18 @@ class Found(NamedTuple):
     validity: Validity
 
 
-def _pair_of(moved: tuple[Harvester, ImpactPair | None], kind: Walls) -> ImpactPair:
-    device, pair = moved
-    return device.pair(kind) if pair is None else pair
+Moved = tuple[Harvester, ImpactPair | None, MembraneLaw | None]
+"""What a steady state is a function of: a device, its pair where that is moved directly, and the membrane."""
 
 
-def _found(moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], *, kind: Walls) -> Found:
+def _pair_of(moved: Moved, kind: Walls) -> ImpactPair:
+    device, pair, law = moved
+    pair = device.pair(kind) if pair is None else pair
+    r: Any = pair.r if law is None or law.restitution else None
+    return replace(pair, r=r, law=law)
+
+
+def _found(moved: Moved, about: tuple[Sequence, Knots], *, kind: Walls) -> Found:
     """Find the orbit near a guess."""
     (sequence, guess), pair = about, _pair_of(moved, kind)
     knots, residual = find(pair, sequence, jnp.where(sequence.real[:, None], guess, 0.0))
@@ -145,9 +157,7 @@ def _like_found(about: tuple[Sequence, Knots]) -> Found:
     return Found(guess, zero, Validity(status, zero, zero, motion))
 
 
-def _respond(
-    moved: tuple[Harvester, ImpactPair | None], about: tuple[Sequence, Knots], found: Found, *, kind: Walls
-) -> Steady:
+def _respond(moved: Moved, about: tuple[Sequence, Knots], found: Found, *, kind: Walls) -> Steady:
     """Compute what the orbit yields that was found."""
     return _response(moved[0], _pair_of(moved, kind), about[0], found)
 
@@ -166,9 +176,25 @@ def _check(device: Any, orbit: Any, pair: Any) -> None:
         )
     if jnp.ndim(orbit.knots) != 2:
         raise ValueError(f"orbit must be a single one; got knots of shape {jnp.shape(orbit.knots)}; take found[0]")
-    walls = [(one.rigid, one.hard_wall) for one in (orbit.pair if pair is None else check_pair(pair), orbit.pair)]
+    walls = [
+        (one.rigid, one.hard_wall)
+        for one in (orbit.pair if pair is None else check_pair(pair, any_law=True), orbit.pair)
+    ]
     if walls[0] != walls[1]:
         raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
+
+
+def _law(orbit: Orbit, pair: ImpactPair | None, membrane: Any) -> MembraneLaw | None:
+    """Take the membrane that is given, or that of the pair or the orbit; None is the linear one."""
+    if membrane is None:
+        own: Any = orbit.pair.law if pair is None or pair.law is None else pair.law
+        return own
+    given, known = (type(Linear() if law is None else law) for law in (check_law(membrane), orbit.pair.law))
+    if given is not known:
+        raise ValueError(
+            see("methods", f"membrane must be of the orbit's kind, {known.__name__}; got {given.__name__}")
+        )
+    return None if given is Linear else membrane
 
 
 def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Float[Array, ""]]:
@@ -241,13 +267,11 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
             depth = depth * device.omega / (flow.PI * at(device.omega0, side))
         return depth, energy.membrane_work_rigid(speed, wall.r)
 
-    def soft(wall: ImpactPair) -> tuple:
+    def soft(_: ImpactPair) -> tuple:
         departure = shooting.departures(pair, sequence, knots)
-        depth = shared_slopes(_depths(pair, departure.side, knots, deepest))
-        signed = departure.side * speed, -departure.side * shared_slopes(departure.speed)
-        return depth, shared_slopes(
-            energy.membrane_work(wall.kappa, wall.mu, pair.gamma, departure.side, t, stay, *signed)
-        )
+        out = -departure.side * shared_slopes(departure.speed)
+        each = jax.vmap(lambda side, *impact: contacts.given(pair.at(side), side, *impact))
+        return shared_slopes(tuple(each(departure.side, t, speed, stay, out, jnp.nan_to_num(deepest))))
 
     depth, work = pair.met(side, rigid, soft)
     depth = jnp.where(real, depth, 0.0) * device.length_unit
@@ -262,23 +286,3 @@ def image_energy(device: Harvester, sequence: Sequence, depth, harvested) -> Flo
     """
     there = energy.harvested_energy(device.at(-sequence.side), depth)
     return jnp.where(sequence.mirrored, there, harvested)
-
-
-def _depths(pair: ImpactPair, side, knots: Knots, deepest) -> Float[Array, "impact"]:
-    """Find the depth of each contact on a soft wall: that of its deepest turning point, which moves along."""
-
-    def one(side, knot, when):
-        t, speed, _ = knot
-        args = (
-            flow.membrane(pair.at(side), rolled=True),
-            flow.contact_force(pair.gamma, side, t),
-            jnp.zeros_like(t),
-            speed,
-        )
-        return flow.oscillate(*args, implicit_root(_rate, when, args))[0]
-
-    return jax.vmap(one)(side, knots, jnp.nan_to_num(deepest))
-
-
-def _rate(s, args):
-    return flow.oscillate(*args, s)[1]

@@ -1,0 +1,197 @@
+"""Orbits, steady states and branches with membranes of any law: the linear one written as a user's, and attractors."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vijax
+from vijax.model.records import Status
+from vijax.orbits import periodic
+
+PAIR = vijax.impact_pair(0.2, 40.0, 0.5, 0.05)
+LOSSY = vijax.impact_pair(0.2, 40.0, None, 0.05)
+DEVICE = vijax.Harvester()
+HERTZ = vijax.HuntCrossley(0.3)
+
+
+class Spring(vijax.MembraneLaw):
+    """The linear membrane, as a user would write it."""
+
+    def acceleration(self, pair, w, z):
+        """Push the ball out."""
+        return -(pair.kappa**2 * w + pair.mu * z)
+
+
+class Cubic(vijax.MembraneLaw):
+    """A membrane that stiffens."""
+
+    beta: float
+
+    def acceleration(self, pair, w, z):
+        """Push the ball out."""
+        return -(pair.kappa**2 * (w + self.beta * w**3) + pair.mu * z)
+
+
+@pytest.fixture(scope="module")
+def springs():
+    """The 1:1 orbit by closed forms, and by steps."""
+    return [vijax.find_orbits(PAIR, "LR", guesses=64, membrane=law) for law in (None, Spring())]
+
+
+@pytest.fixture(scope="module")
+def hertz():
+    """The 1:1 orbit of a membrane of Hunt and Crossley."""
+    return vijax.find_orbits(LOSSY, "LR", guesses=64, membrane=HERTZ)
+
+
+@pytest.fixture(scope="module")
+def cubic():
+    """The 1:1 orbit of a membrane that stiffens."""
+    return vijax.find_orbits(PAIR, "LR", guesses=64, membrane=Cubic(500.0))
+
+
+def test_a_spring_of_ones_own_has_the_orbits_of_the_linear_membrane(springs):
+    closed, stepped = springs
+    assert len(closed) == len(stepped) == 1
+    for name in ("knots", "depth", "work", "multipliers"):
+        np.testing.assert_allclose(getattr(stepped, name), getattr(closed, name), rtol=0, atol=1e-11, err_msg=name)
+    assert stepped.residual[0] < 1e-11
+    assert vijax.orbit_labels(stepped) == vijax.orbit_labels(closed)
+    np.testing.assert_allclose(vijax.orbit_power(stepped, DEVICE), vijax.orbit_power(closed, DEVICE), rtol=1e-11)
+    for one, other in zip(vijax.orbit_path(stepped), vijax.orbit_path(closed), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-11)
+    for one, other in zip(*(jax.tree.leaves(vijax.orbit_impacts(orbit)) for orbit in springs), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("transform", [jax.jacfwd, jax.grad])
+def test_its_steady_state_has_the_derivatives_of_the_linear_one(springs, transform):
+    slopes = [
+        transform(lambda pair, orbit=orbit: vijax.steady(DEVICE, orbit[0], pair=pair).P)(PAIR) for orbit in springs
+    ]
+    for name in ("d", "kappa", "r", "gamma"):
+        assert float(getattr(slopes[1], name)) == pytest.approx(float(getattr(slopes[0], name)), rel=1e-10)
+
+
+def test_its_second_derivatives_are_those_of_the_linear_one(springs):
+    curved = [
+        jax.jacfwd(jax.jacfwd(lambda k, orbit=orbit: vijax.steady(DEVICE, orbit[0], pair=replace(PAIR, kappa=k)).P))(
+            PAIR.kappa
+        )
+        for orbit in springs
+    ]
+    assert float(curved[1]) == pytest.approx(float(curved[0]), rel=1e-9)
+
+
+def test_the_orbit_of_hertz_is_the_attractor_that_ode_finds(hertz):
+    assert len(hertz) == 1
+    assert np.abs(hertz.multipliers).max() < 1
+    fine = {"method": "ode", "solver": "Dopri8", "rtol": 1e-11, "atol": 1e-13}
+    run = vijax.trajectory(LOSSY, 0.0, 0.1, 100, membrane=HERTZ, **fine)
+    last = slice(int(run.filled) - 2, int(run.filled))
+    found = vijax.orbit_impacts(hertz)
+    for name in ("t", "v_in", "v_out", "depth", "work", "duration"):
+        ends, known = (
+            np.sort(np.asarray(getattr(one, name)).ravel()[at]) for one, at in ((run.impacts, last), (found, ...))
+        )
+        np.testing.assert_allclose(ends, known, rtol=0, atol=2e-9, err_msg=name)
+
+
+def test_a_state_leads_to_the_same_orbit(hertz):
+    found = vijax.orbits_from_states(LOSSY, 0.0, 0.1, settle=100, membrane=HERTZ)
+    np.testing.assert_array_equal(found.status, Status.OK)
+    np.testing.assert_allclose(np.sort(found.knots[..., 1]), np.sort(hertz.knots[..., 1]), rtol=0, atol=1e-11)
+
+
+def test_derivatives_by_numbers_of_the_law_are_those_of_differences(cubic, hertz):
+    def stiffer(beta):
+        return vijax.steady(DEVICE, cubic[0], pair=PAIR, membrane=Cubic(beta)).P
+
+    def lossier(chi, exponent):
+        return vijax.steady(DEVICE, hertz[0], pair=LOSSY, membrane=vijax.HuntCrossley(chi, exponent)).P
+
+    def difference(of, x, h):
+        return (8 * (of(x + h) - of(x - h)) - (of(x + 2 * h) - of(x - 2 * h))) / (12 * h)
+
+    assert float(jax.grad(stiffer)(500.0)) == pytest.approx(float(difference(stiffer, 500.0, 20.0)), rel=1e-7)
+    by_chi, by_exponent = jax.grad(lossier, argnums=(0, 1))(0.3, 1.5)
+    assert float(by_chi) == pytest.approx(float(difference(lambda x: lossier(x, 1.5), 0.3, 0.01)), rel=1e-6)
+    assert float(by_exponent) == pytest.approx(float(difference(lambda x: lossier(0.3, x), 1.5, 0.01)), rel=1e-6)
+    # Left out, the membrane is the orbit's.
+    known = stiffer(500.0)
+    for pair in (PAIR, cubic[0].pair):
+        np.testing.assert_array_equal(vijax.steady(DEVICE, cubic[0], pair=pair).P, known)
+
+
+def test_walls_that_differ_have_a_law_each(springs):
+    """One law, whose kappa and r are those of either wall."""
+    uneven = vijax.impact_pair(0.25, vijax.Sides(30.0, 60.0), vijax.Sides(0.5, 0.4))
+    closed, stepped = (vijax.find_orbits(uneven, "LR", guesses=32, membrane=law) for law in (None, Spring()))
+    assert len(closed) == len(stepped) > 0
+    np.testing.assert_allclose(stepped.knots, closed.knots, rtol=0, atol=1e-11)
+    slopes = [
+        jax.jacfwd(lambda pair, orbit=orbit: vijax.steady(DEVICE, orbit[0], pair=pair).P)(uneven)
+        for orbit in (closed, stepped)
+    ]
+    for name in ("kappa", "r"):
+        for side in ("left", "right"):
+            one, other = (float(getattr(getattr(slope, name), side)) for slope in slopes)
+            assert other == pytest.approx(one, rel=1e-9)
+
+
+def test_contacts_that_steps_do_not_resolve_make_no_orbit():
+    """Of 13 swings in a contact of so few steps nothing is known."""
+    stiff = vijax.impact_pair(0.2, 40.0, 0.5, -0.9)
+    side, knots = np.array([[-1]], np.int32), np.array([[[0.5, 0.5, 1.0]]])
+    sequence, near = periodic.guessed(side, np.array([2.0]), np.array([False]), knots)
+    rows = jax.tree.map(lambda x: np.asarray(x)[None], replace(stiff, law=Spring()))
+    assert float(np.asarray(periodic.proven(rows, sequence, near).residual)[0]) > 1e-7
+    assert periodic.proven(rows, sequence, near).status[0] == Status.NO_ORBIT
+
+
+def test_a_ball_that_meets_a_wall_between_is_seen():
+    """Impacts on one wall know nothing of the other, which stands in the way of a narrow gap."""
+    wide = vijax.find_orbits(vijax.impact_pair(0.9, 40.0, 0.5), "L", guesses=64, membrane=Spring())
+    assert len(wide) == 1
+    narrow = replace(wide.pair, d=jnp.full(1, 0.02))
+    for pair in (narrow, replace(narrow, law=None)):
+        again = periodic.proven(pair, wide.sequence, wide.knots)
+        assert again.status[0] == Status.VIRTUAL
+        assert again.residual[0] < 1e-11
+
+
+@pytest.mark.long
+def test_a_branch_meets_what_that_of_the_linear_membrane_meets(springs):
+    met = []
+    for orbit in springs:
+        (branch,) = vijax.follow_orbits(orbit, "kappa", (15.0, 60.0))
+        met.append([(point.kind, float(point.value)) for point in branch.points])
+        assert branch.ends == ("low", "high") or branch.points
+    assert [kind for kind, _ in met[0]] == [kind for kind, _ in met[1]]
+    np.testing.assert_allclose(*([value for _, value in one] for one in met), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("membrane", "said"),
+    [
+        (vijax.Hyperelastic(1.5, 0.02), "membrane must be of the orbit's kind, Cubic; got Hyperelastic"),
+        (2.0, "membrane must be a vijax.HuntCrossley"),
+    ],
+)
+def test_a_membrane_of_another_kind_is_refused(cubic, membrane, said):
+    with pytest.raises(ValueError, match=said):
+        vijax.steady(DEVICE, cubic[0], membrane=membrane)
+
+
+def test_what_knows_linear_membranes_refuses_the_pair_of_an_orbit(cubic):
+    own = cubic[0].pair
+    for call in (
+        lambda: vijax.trajectory(own, 0.0, 0.1, 2),
+        lambda: vijax.find_orbits(own, "LR"),
+        lambda: vijax.orbits_from_states(own, 0.0, 0.1),
+    ):
+        with pytest.raises(ValueError, match="pair must have linear membranes here; got Cubic"):
+            call()
