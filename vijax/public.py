@@ -22,7 +22,8 @@ from vijax.fitting.fitted import ConstancyTest, Fit, Misfit
 from vijax.model.device import Harvester
 from vijax.model.energy import harvested_energy
 from vijax.model.excitation import Excitation, Harmonics, Noise, Record, Waveform
-from vijax.model.membrane import HuntCrossley, Hyperelastic, MembraneLaw
+from vijax.model.laws import HuntCrossley, Hyperelastic
+from vijax.model.membrane import MembraneLaw
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Impact, State, Status
 from vijax.model.sides import Sides

@@ -10,6 +10,8 @@ import pytest
 import vijax
 from vijax.model.records import Status
 from vijax.orbits import periodic
+from vijax.planes.sweep import plan
+from vijax.planes.sweep_settings import SweepSettings
 
 PAIR = vijax.impact_pair(0.2, 40.0, 0.5, 0.05)
 LOSSY = vijax.impact_pair(0.2, 40.0, None, 0.05)
@@ -67,7 +69,7 @@ def test_a_spring_of_ones_own_has_the_orbits_of_the_linear_membrane(springs):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("transform", [jax.jacfwd, jax.grad])
+@pytest.mark.parametrize("transform", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.long)])
 def test_its_steady_state_has_the_derivatives_of_the_linear_one(springs, transform):
     slopes = [
         transform(lambda pair, orbit=orbit: vijax.steady(DEVICE, orbit[0], pair=pair).P)(PAIR) for orbit in springs
@@ -76,6 +78,7 @@ def test_its_steady_state_has_the_derivatives_of_the_linear_one(springs, transfo
         assert float(getattr(slopes[1], name)) == pytest.approx(float(getattr(slopes[0], name)), rel=1e-10)
 
 
+@pytest.mark.long
 def test_its_second_derivatives_are_those_of_the_linear_one(springs):
     curved = [
         jax.jacfwd(jax.jacfwd(lambda k, orbit=orbit: vijax.steady(DEVICE, orbit[0], pair=replace(PAIR, kappa=k)).P))(
@@ -126,6 +129,7 @@ def test_derivatives_by_numbers_of_the_law_are_those_of_differences(cubic, hertz
         np.testing.assert_array_equal(vijax.steady(DEVICE, cubic[0], pair=pair).P, known)
 
 
+@pytest.mark.long
 def test_walls_that_differ_have_a_law_each(springs):
     """One law, whose kappa and r are those of either wall."""
     uneven = vijax.impact_pair(0.25, vijax.Sides(30.0, 60.0), vijax.Sides(0.5, 0.4))
@@ -195,3 +199,71 @@ def test_what_knows_linear_membranes_refuses_the_pair_of_an_orbit(cubic):
     ):
         with pytest.raises(ValueError, match="pair must have linear membranes here; got Cubic"):
             call()
+
+
+UNEVEN = vijax.Sides(Cubic(100.0), Cubic(2000.0))
+
+
+@pytest.fixture(scope="module")
+def uneven():
+    """The 1:1 orbit between two membranes that stiffen, one more than the other."""
+    return vijax.find_orbits(PAIR, "LR", guesses=64, membrane=UNEVEN)
+
+
+def test_walls_have_a_law_each(uneven):
+    fine = {"method": "ode", "solver": "Dopri8", "rtol": 1e-11, "atol": 1e-13}
+    run = vijax.trajectory(PAIR, 0.0, 0.1, 60, membrane=UNEVEN, **fine)
+    assert len(uneven) == 1
+    last = slice(int(run.filled) - 2, int(run.filled))
+    found = vijax.orbit_impacts(uneven)
+    for name in ("v_in", "depth", "duration"):
+        ends, known = (np.sort(np.ravel(leaf)) for leaf in (getattr(run.impacts, name)[last], getattr(found, name)))
+        np.testing.assert_allclose(ends, known, rtol=0, atol=2e-9, err_msg=name)
+
+
+def test_the_mirror_image_of_walls_with_laws_is_that_of_the_motion(uneven):
+    turned = vijax.find_orbits(
+        vijax.impact_pair(0.2, 40.0, 0.5, -0.05), "LR", guesses=64, membrane=vijax.Sides(UNEVEN.right, UNEVEN.left)
+    )
+    one, other = (np.asarray(vijax.orbit_impacts(orbit).depth)[0] for orbit in (uneven, turned))
+    sides = [np.asarray(orbit.sequence.side)[0] for orbit in (uneven, turned)]
+    np.testing.assert_allclose(one[np.argsort(sides[0])], other[np.argsort(-sides[1])], rtol=1e-10)
+
+
+@pytest.mark.long
+def test_each_wall_has_a_derivative(uneven):
+    def power(left, right):
+        law = vijax.Sides(Cubic(left), Cubic(right))
+        return vijax.steady(DEVICE, uneven[0], pair=PAIR, membrane=law).P
+
+    by_left, by_right = jax.grad(power, argnums=(0, 1))(100.0, 2000.0)
+    for mine, off in ((by_left, (1.0, 0.0)), (by_right, (0.0, 1.0))):
+        h = 10.0
+        one, other = (
+            power(*(x + sign * h * way for x, way in zip((100.0, 2000.0), off, strict=True))) for sign in (1, -1)
+        )
+        assert float(mine) == pytest.approx(float((one - other) / (2 * h)), rel=1e-5)
+
+
+def test_a_map_knows_the_law_of_each_wall(uneven):
+    found = vijax.sweep(d=0.2, kappa=40.0, r=0.5, gamma=0.05, method="ode", rtol=1e-10, atol=1e-12, membrane=UNEVEN)
+    assert found.attrs["membrane"] == "left Cubic with beta 100, right Cubic with beta 2000"
+    assert float(found.P) == pytest.approx(float(vijax.orbit_power(uneven, DEVICE)[0]), rel=1e-7)
+    again = vijax.sweep(d=0.2, kappa=40.0, r=0.5, gamma=0.05, method="rk4", steps=4000, membrane=UNEVEN)
+    assert float(again.P) == pytest.approx(float(found.P), rel=2e-3)
+
+
+def test_mirror_images_are_not_merged_between_walls_with_laws_of_their_own(uneven):
+    axes = {"d": [0.2, 0.3], "kappa": 40.0}
+    for law, same in ((UNEVEN, False), (UNEVEN.left, True)):
+        planned = plan(axes, None, DEVICE, SweepSettings(method="ode", membrane=law))
+        assert planned.mirrored == same
+    assert not bool(np.any(uneven.pair.symmetric))
+    level = replace(uneven.pair, gamma=0 * uneven.pair.gamma)
+    assert not bool(np.any(level.symmetric))
+    assert bool(np.all(replace(level, law=None, kappa=level.kappa.left, r=level.r.left).symmetric))
+
+
+def test_laws_of_two_kinds_are_refused():
+    with pytest.raises(ValueError, match="membrane must be of one kind on both sides"):
+        vijax.find_orbits(PAIR, "LR", membrane=vijax.Sides(Cubic(1.0), Spring()))

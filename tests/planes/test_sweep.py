@@ -15,7 +15,7 @@ import xarray as xr
 from tests.helpers import stand_in
 from vijax.batch import simulate
 from vijax.model.device import Harvester
-from vijax.model.membrane import HuntCrossley
+from vijax.model.laws import HuntCrossley
 from vijax.model.records import Status
 from vijax.planes import dataset
 from vijax.planes import sweep as sweeps

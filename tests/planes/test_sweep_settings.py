@@ -8,7 +8,7 @@ import pytest
 
 import vijax
 from vijax.engine.method_choice import record
-from vijax.model.membrane import HuntCrossley
+from vijax.model.laws import HuntCrossley
 from vijax.planes import basins, compare, orbit_diagram, sweep
 from vijax.planes.sweep_settings import DiagramSettings, SweepSettings
 

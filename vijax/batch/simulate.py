@@ -19,6 +19,7 @@ from vijax.engine import exact
 from vijax.engine.ground import ground_of
 from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device, electrical
+from vijax.model.membrane import one_of
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.runtime import checks, context, export_cache
 from vijax.runtime.arrays import AnyArray, present
@@ -80,7 +81,7 @@ def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, 
     if not isinstance(method, Method | None):
         raise ValueError(f"method must be a vijax.engine.method.Method, or None; got {checks.shown(method)}")
     # Whoever carries cells of a membrane that takes no restitution has NaN for r.
-    lossy = method is None or method.law.restitution
+    lossy = method is None or one_of(method.law).restitution
     nothing: Any = None
     checks.known("pair", check_pair(pair if lossy else dataclasses.replace(pair, r=nothing)))
     check_device(device)

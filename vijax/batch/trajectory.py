@@ -17,7 +17,7 @@ from vijax.engine.method import Method
 from vijax.engine.method_choice import choose
 from vijax.model.choices import MethodName, SolverName
 from vijax.model.excitation import Excitation, check_excitation
-from vijax.model.membrane import Linear, MembraneLaw, check_restitution
+from vijax.model.membrane import Laws, Linear, check_restitution
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
@@ -67,7 +67,7 @@ def trajectory(
     solver: SolverName | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    membrane: MembraneLaw | None = None,
+    membrane: Laws | None = None,
     steps: int | None = None,
     excitation: Excitation | None = None,
 ) -> Trajectory:

@@ -48,7 +48,8 @@ class _Membrane(Choice):
 
 def take_membrane(given: dict[str, Any]) -> Any:
     """Take name and numbers out of what a command was given, and make the membrane of them; None unless named."""
-    from vijax.model.membrane import HuntCrossley, Hyperelastic, Linear
+    from vijax.model.laws import HuntCrossley, Hyperelastic
+    from vijax.model.membrane import Linear
 
     name, numbers = given.pop("membrane"), {number: given.pop(number) for number in MEMBRANE_NUMBERS}
     if name not in (None, *MEMBRANES):

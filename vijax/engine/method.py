@@ -13,7 +13,8 @@ import jax
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
-from vijax.model.membrane import Linear, MembraneLaw
+from vijax.model import membrane
+from vijax.model.membrane import Laws, Linear
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
 from vijax.model.waves import Waves, sine
@@ -124,10 +125,10 @@ class Method(eqx.Module, Generic[C]):
     `if`, and what becomes of a motion that cannot go on is an impact of NaN.
 
     Attributes:
-        law: The membrane; the linear one unless given.
+        law: The membrane, or that of either wall; the linear one unless given.
     """
 
-    law: MembraneLaw = eqx.field(default_factory=Linear, kw_only=True)
+    law: Laws = eqx.field(default_factory=Linear, kw_only=True)
 
     def walls(self, pair: ImpactPair) -> Any:
         """Give what `step` is told of the walls of a cell; once, where it would compute it every time.
@@ -135,7 +136,7 @@ class Method(eqx.Module, Generic[C]):
         Args:
             pair: One cell (scalars).
         """
-        return self.law.walls(pair)
+        return membrane.walls(self.law, pair)
 
     @abstractmethod
     def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> C:

@@ -10,7 +10,7 @@ import numpy as np
 from vijax.engine.method import Method
 from vijax.model.choices import MethodName, SolverName
 from vijax.model.excitation import Excitation
-from vijax.model.membrane import Linear, check_law
+from vijax.model.membrane import Linear, check_laws, one_of, said
 from vijax.runtime import checks
 from vijax.runtime.pages import see
 
@@ -51,9 +51,11 @@ def choose(
     """
     checks.choice("method", method, OPTIONS)
     given = {name: value for name, value in options.items() if value is not None}
-    law = check_law(given.get("membrane", Linear()))
-    if method == "exact" and not isinstance(law, Linear):
-        raise ValueError(see("methods", f'membrane must be linear for method="exact"; got {law}; use method="ode"'))
+    law = check_laws(given.get("membrane", Linear()))
+    if method == "exact" and not isinstance(one_of(law), Linear):
+        raise ValueError(
+            see("methods", f'membrane must be linear for method="exact"; got {said(law)}; use method="ode"')
+        )
     for name in given:
         takers = [taker for taker, taken in OPTIONS.items() if name in taken]
         if method not in takers and name != "membrane":
@@ -103,7 +105,7 @@ def record(method: Method | None, excitation: Excitation | None = None) -> dict[
         return {}
     told = {field.name: getattr(method, field.name) for field in dataclasses.fields(method) if field.name != "law"}
     numbers = {name: np.asarray(value).item() for name, value in told.items() if value is not None}
-    return {"membrane": str(method.law)} | numbers
+    return {"membrane": said(method.law)} | numbers
 
 
 def _quoted(name: str) -> str:

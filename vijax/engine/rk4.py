@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Int
 
 from vijax.engine.method import HELD, ImpactOutcome, Method, decided, finished
 from vijax.model.flow import PI
-from vijax.model.membrane import Wall
+from vijax.model.membrane import Wall, one_of
 from vijax.model.pair import ImpactPair, Real
 from vijax.model.records import State
 from vijax.model.sides import Sides, at
@@ -64,7 +64,7 @@ class Rk4(Method[Rk4Carry]):
     @property
     def arithmetic(self) -> bool:
         """Say whether a step calls no library: it does not, if its membrane does not."""
-        return self.law.arithmetic
+        return one_of(self.law).arithmetic
 
     def most_steps(self, pair: ImpactPair, periods: int, max_impacts: int) -> int:
         """Say how many steps a recorded run takes."""

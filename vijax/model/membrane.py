@@ -1,7 +1,6 @@
 """Membrane laws: the acceleration that a wall gives to a ball which has entered it by w at rate w'."""
 
 import dataclasses
-import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -11,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax.model.pair import ImpactPair, Real
-from vijax.model.sides import Sides
+from vijax.model.pair import ImpactPair
+from vijax.model.sides import Sides, apart
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import Values
 from vijax.runtime.pages import see
@@ -78,10 +77,6 @@ class MembraneLaw(eqx.Module):
         """Give the law the numbers of a pair."""
         return _Bound(jax.tree.map(lambda x: jnp.asarray(x, pair.d.dtype), self), pair)
 
-    def walls(self, pair: ImpactPair) -> "Wall | Sides":
-        """Give the law the numbers of a pair; for each wall where they differ."""
-        return Sides(self.wall(pair.at(-1)), self.wall(pair.at(1))) if pair.unequal else self.wall(pair)
-
     def __str__(self) -> str:
         """Name the law and its numbers, as maps do in their attributes."""
         told = [f"{field.name} {_shown(getattr(self, field.name))}" for field in dataclasses.fields(self)]
@@ -103,7 +98,7 @@ class _Bound(eqx.Module):
         return self.law.acceleration(self.pair, w, z)
 
 
-class _Shipped(MembraneLaw):
+class ShippedLaw(MembraneLaw):
     """A law that vijax has: its `wall` computes once for a pair what need not be computed at every step."""
 
     arithmetic: ClassVar[bool] = True
@@ -128,7 +123,7 @@ class Spring(eqx.Module):
         return -(self.square * w + self.mu * z)
 
 
-class Linear(_Shipped):
+class Linear(ShippedLaw):
     """The paper's membrane, Eq. (38): its damping is calibrated so that a free contact has restitution r, Eq. (19)."""
 
     def wall(self, pair: ImpactPair) -> Spring:
@@ -145,159 +140,26 @@ class Linear(_Shipped):
         return "linear"
 
 
-class Hertz(eqx.Module):
-    """-kappa^2 w^n (1 + chi w') for w > 0, else 0."""
-
-    square: Values
-    chi: Values
-    exponent: Values
-
-    def __call__(self, w: Values, z: Values) -> Values:
-        """Compute the acceleration at penetration w and rate z."""
-        inside = w > 0  # a stage of a step may look beyond the exit
-        spring = jnp.where(inside, jnp.where(inside, w, 1.0) ** self.exponent, 0.0)
-        return -self.square * spring * (1 + self.chi * z)
+Laws = MembraneLaw | Sides[MembraneLaw]
+"""The law of both walls, or that of either: of one kind, with numbers of their own."""
 
 
-class HuntCrossley(_Shipped):
-    """Hunt and Crossley's membrane, w'' = -kappa^2 w^n (1 + chi w') + forcing: no restitution r is given to it.
-
-    The loss grows with the speed, so that the restitution is a result: -v_out/v_in is near 1 - 2 chi v_in/3 for slow
-    impacts, whatever n is.
-
-    Attributes:
-        chi: Damping over stiffness, in units of time over length (1/u'), >= 0.
-        exponent: n >= 1; 1.5 is Hertz's contact of a sphere.
-
-    Raises:
-        ValueError: A number that cannot be (traced values are not looked at).
-    """
-
-    chi: Real
-    exponent: Real = 1.5
-    restitution: ClassVar[bool] = False
-
-    def __check_init__(self):
-        for name, least in (("chi", 0), ("exponent", 1)):
-            value = getattr(self, name)
-            if checks.is_concrete(value):
-                must = f"one finite number of at least {least}"
-                checks.real(name, value, must, lambda x, least=least: least <= x < math.inf)
-
-    def wall(self, pair: ImpactPair) -> Hertz:
-        """Give the law the numbers of a pair."""
-        kappa = pair._soft_kappa()
-        return Hertz(kappa * kappa, jnp.asarray(self.chi, kappa.dtype), jnp.asarray(self.exponent, kappa.dtype))
-
-    def energy(self, pair: ImpactPair, w: Any) -> Any:
-        """Give what the membrane has stored at penetration w >= 0, per mass of the ball."""
-        return pair._soft_kappa() ** 2 * jnp.asarray(w) ** (self.exponent + 1) / (self.exponent + 1)
-
-    def __str__(self) -> str:
-        """Name it as `--membrane` does."""
-        return f"hunt-crossley with chi {float(self.chi):g}, exponent {float(self.exponent):g}"
+def one_of(law: Laws) -> MembraneLaw:
+    """Give the law of both walls, or that of the left one: what the class says is the same of both."""
+    return law.left if isinstance(law, Sides) else law
 
 
-_STRAIGHT = 1e-9  # the least part of their limit that is left to chains: beyond, the push is held there
+def walls(law: Laws, pair: ImpactPair) -> Wall | Sides:
+    """Give a law the numbers of a pair; for each wall where the walls differ."""
+    if not (pair.unequal or isinstance(law, Sides)):
+        return law.wall(pair)
+    both = apart(law)
+    return Sides(both.left.wall(pair.at(-1)), both.right.wall(pair.at(1)))
 
 
-class Cone(eqx.Module):
-    """The wall of a `Hyperelastic` membrane, a cone: -(kappa^2 w f(w) + mu w'), where f(0) = 1.
-
-    Attributes:
-        square, mu: Of the pair.
-        radius: Of the membrane.
-        rest: What is left at prestretch of how far the chains stretch, as a part of that.
-        slack: prestretch^-6, the part of the tension that thinning takes at w = 0.
-        spread: How much faster than (w/radius)^2 the chains are stretched, as a part of how far they do.
-    """
-
-    square: Values
-    mu: Values
-    radius: Values
-    rest: Values
-    slack: Values
-    spread: Values
-
-    def _stretched(self, w: Values) -> tuple[Values, Values]:
-        """Compute (w/radius)^2, and how far the chains are stretched beyond prestretch, as a part of what is left."""
-        more = (w / self.radius) ** 2
-        return more, self.spread * more * (1 - self.slack / (1 + more)) / self.rest
-
-    def __call__(self, w: Values, z: Values) -> Values:
-        """Compute the acceleration at penetration w and rate z."""
-        more, used = self._stretched(w)
-        tension = (1 - self.slack / (1 + more) ** 2) / (1 - self.slack)
-        # Beyond the limit nothing goes: a stage of a step that looks there is thrown back.
-        return -(self.square * w * tension / jnp.maximum(1 - used, _STRAIGHT) + self.mu * z)
-
-    def energy(self, w: Values) -> Values:
-        """Compute the stored energy, per mass of the ball."""
-        more, used = self._stretched(w)
-        some = used > 0
-        part = jnp.where(some, used, 0.5)
-        # -log(1 - x)/x, which is 1 without a limit.
-        growth = jnp.where(some, -jnp.log1p(-part) / part, 1.0)
-        linear = more * (1 - self.slack / (1 + more)) / (1 - self.slack)
-        return 0.5 * self.square * self.radius**2 * linear * growth
-
-
-class Hyperelastic(_Shipped):
-    """A stretched circular membrane of rubber, which the ball makes a cone of; a spring at small w, stiffer at large.
-
-    Its points move along the capsule alone, so that the hoops keep their prestretch L and the stretch along the cone is
-    L sqrt(1 + (w/radius)^2); the volume stays. The force is the derivative of the elastic energy. With that of Mooney
-    and Rivlin (Treloar, The Physics of Rubber Elasticity, 1975), of any ratio of its two constants,
-
-        w'' = -kappa^2 w (1 - L^-6 (1 + (w/radius)^2)^-2) / (1 - L^-6) - mu w' + forcing,
-
-    and with that of Gent (Rubber Chem. Technol. 69, 1996, 59-61) more, as its chains come to their limit:
-    J = L^2 (1 + (w/radius)^2) + L^2 + L^-4/(1 + (w/radius)^2) - 3 stays below `stretch_limit`.
-
-    kappa is the frequency at small w, and r the restitution of a free contact there. The ball is taken for a point.
-
-    Attributes:
-        prestretch: L > 1, of both directions, without the ball.
-        radius: Of the membrane, > 0, in units of displacement.
-        stretch_limit: Gent's J_m, > J at w = 0; inf for Mooney and Rivlin.
-
-    Raises:
-        ValueError: A number that cannot be (traced values are not looked at).
-    """
-
-    prestretch: Real
-    radius: Real
-    stretch_limit: Real = math.inf
-
-    def __check_init__(self):
-        for name, least in (("prestretch", 1), ("radius", 0)):
-            value = getattr(self, name)
-            if checks.is_concrete(value):
-                must = f"one finite number above {least}"
-                checks.real(name, value, must, lambda x, least=least: least < x < math.inf)
-        if checks.is_concrete((self.prestretch, self.stretch_limit)):
-            least = 2 * float(self.prestretch) ** 2 + float(self.prestretch) ** -4 - 3
-            must = f"one number above {least:.4g}, which this prestretch takes"
-            checks.real("stretch_limit", self.stretch_limit, must, lambda x: x > least)
-
-    def wall(self, pair: ImpactPair) -> Cone:
-        """Give the law the numbers of a pair."""
-        kappa = pair._soft_kappa()
-        square, radius, limit = (
-            jnp.asarray(x, kappa.dtype) for x in (self.prestretch**2, self.radius, self.stretch_limit)
-        )
-        slack = square**-3
-        rest = 1 - (2 * square + 1 / (square * square) - 3) / limit
-        return Cone(kappa * kappa, pair.mu, radius, rest, slack, square / limit)
-
-    def energy(self, pair: ImpactPair, w: Any) -> Any:
-        """Give what the membrane has stored at penetration w, per mass of the ball."""
-        return self.wall(pair).energy(jnp.asarray(w))
-
-    def __str__(self) -> str:
-        """Name it as `--membrane` does."""
-        limit = f", stretch_limit {float(self.stretch_limit):g}" if self.stretch_limit != math.inf else ""
-        return f"hyperelastic with prestretch {float(self.prestretch):g}, radius {float(self.radius):g}{limit}"
+def said(law: Laws) -> str:
+    """Name a law and its numbers, or those of both walls."""
+    return f"left {law.left}, right {law.right}" if isinstance(law, Sides) else str(law)
 
 
 _INSIDE = np.geomspace(1e-6, 0.1, 6)
@@ -309,17 +171,17 @@ def with_law(pair: ImpactPair, law: Any) -> ImpactPair:
 
     Args:
         pair: A checked pair; r is None with a membrane that takes none.
-        law: A membrane, or None.
+        law: A membrane, that of either wall as `Sides`, or None.
 
     Raises:
         ValueError: No membrane, or one that the pair cannot have.
     """
-    law = check_law(Linear() if law is None else law)
+    law = check_laws(Linear() if law is None else law)
     check_restitution(pair, law)
-    if isinstance(law, Linear):
+    if isinstance(one_of(law), Linear):
         return pair
     if pair.rigid or pair.hard_wall:
-        raise ValueError(see("methods", f"membrane must be left out with a rigid wall; got {law}"))
+        raise ValueError(see("methods", f"membrane must be left out with a rigid wall; got {said(law)}"))
     dtype, shape, own = jnp.result_type(float, pair.d), np.shape(pair.d), tiles.library((pair, law))
     wide = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), (*shape, *np.shape(x))), law)
     return dataclasses.replace(pair, law=wide)
@@ -329,16 +191,32 @@ def told(pair: ImpactPair) -> dict[str, str]:
     """Name the membrane of some pairs for attributes, one for all; nothing of the linear one."""
     if pair.law is None:
         return {}
-    return {"membrane": str(jax.tree.map(lambda x: np.asarray(x)[(0,) * np.ndim(pair.d)], pair.law))}
+    first: Any = jax.tree.map(lambda x: np.asarray(x)[(0,) * np.ndim(pair.d)], pair.law)
+    return {"membrane": said(first)}
 
 
-def check_restitution(pair: ImpactPair, law: MembraneLaw) -> None:
+def check_restitution(pair: ImpactPair, law: Laws) -> None:
     """Raise ValueError unless a pair has r where its membrane takes one, and None where it takes none."""
-    if (pair.r is None) == law.restitution:
+    if (pair.r is None) == one_of(law).restitution:
         raise ValueError(
             "r must be None with a membrane that takes none, as HuntCrossley, and a number with others; "
             f"got {checks.shown(pair.r)}"
         )
+
+
+def check_laws(law: Any) -> Laws:
+    """Raise ValueError unless it is a membrane as `check_law` asks for, or `Sides` of two of one kind."""
+    if not isinstance(law, Sides):
+        return check_law(law)
+    left, right = check_law(law.left), check_law(law.right)
+    if type(left) is not type(right):
+        raise ValueError(
+            see(
+                "methods",
+                f"membrane must be of one kind on both sides, with numbers of their own; got {said(law)}",
+            )
+        )
+    return law
 
 
 def check_law(law: Any) -> MembraneLaw:
@@ -350,11 +228,11 @@ def check_law(law: Any) -> MembraneLaw:
         raise ValueError(
             see(
                 "methods",
-                "membrane must be a vijax.HuntCrossley, a vijax.Hyperelastic, a vijax.MembraneLaw of your own, or left "
-                f"out for the linear one; got {checks.shown(law)}",
+                "membrane must be a vijax.HuntCrossley, a vijax.Hyperelastic, a vijax.MembraneLaw of your own, "
+                f"Sides of two of them, or left out for the linear one; got {checks.shown(law)}",
             )
         )
-    if isinstance(law, _Shipped):
+    if isinstance(law, ShippedLaw):
         return law
     d, kappa, r, gamma = map(jnp.asarray, _NOMINAL)
     nothing: Any = None

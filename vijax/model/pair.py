@@ -42,8 +42,8 @@ class ImpactPair(eqx.Module):
         law: The membrane of a periodic orbit, a `MembraneLaw`; None for the linear one, and wherever a method of its
             own knows it.
 
-    Of walls that differ in kappa or r both are `Sides`, a number for each wall; kappa of a rigid one beside a soft one
-    is None. It has no membrane: the depth of its impacts is 0, and nothing is harvested from them.
+    Of walls that differ in kappa, r or law these are `Sides`, of what each wall has; kappa of a rigid one beside a soft
+    one is None. It has no membrane: the depth of its impacts is 0, and nothing is harvested from them.
     """
 
     d: Float[AnyArray, "..."]
@@ -61,12 +61,13 @@ class ImpactPair(eqx.Module):
     @property
     def unequal(self) -> bool:
         """Say whether the two walls may differ, which is a static choice as `rigid` is."""
-        return isinstance(self.kappa, Sides) or isinstance(self.r, Sides)
+        return any(isinstance(own, Sides) for own in (self.kappa, self.r, self.law))
 
     @property
     def symmetric(self) -> Any:
         """Say in which cells the mirror image of a motion is one too, as gamma is 0 and the walls are equal."""
-        return (self.gamma == 0) & False if self.hard_wall else symmetric(quantities(self))
+        differ = self.hard_wall or isinstance(self.law, Sides)
+        return (self.gamma == 0) & False if differ else symmetric(quantities(self))
 
     def apart(self) -> "ImpactPair":
         """Give the pair in the form of walls that differ."""
@@ -82,7 +83,19 @@ class ImpactPair(eqx.Module):
         if self.hard_wall:
             # A number stands in for that of the rigid wall, whose form does not read it; see `met`.
             kappa = kappa.left if self.hard_wall > 0 else kappa.right
-        return replace(self, kappa=at(kappa, side), r=at(self.r, side))
+        return replace(self, kappa=at(kappa, side), r=at(self.r, side), law=self._law_at(side))
+
+    def _law_at(self, side: Any) -> Any:
+        """Give the law that the wall on a side has; its numbers may be arrays besides those of the cells."""
+        law: Any = self.law
+        if not isinstance(law, Sides):
+            return law
+
+        def of_wall(left: Any, right: Any) -> Any:
+            own = np.ndim(left) - np.ndim(self.d)
+            return jnp.where(jnp.reshape(side, np.shape(side) + (1,) * own) > 0, right, left)
+
+        return jax.tree.map(of_wall, law.left, law.right)
 
     @property
     def hard_wall(self) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax.batch.trajectory import trajectory
-from vijax.model.membrane import MembraneLaw, with_law
+from vijax.model.membrane import Laws, with_law
 from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
@@ -35,7 +35,7 @@ def from_state(
     *,
     period: int = 1,
     settle: int = 0,
-    membrane: MembraneLaw | None = None,
+    membrane: Laws | None = None,
 ) -> Orbit:
     """Find periodic orbits near states: each is flown once around to learn its impacts, then corrected by Newton.
 
@@ -90,7 +90,7 @@ def search(
     *,
     guesses: int = 2048,
     seed: int = 0,
-    membrane: MembraneLaw | None = None,
+    membrane: Laws | None = None,
 ) -> Orbit:
     """Search every orbit with a given impact sequence, stable or unstable, from random guesses.
 

@@ -93,7 +93,7 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit im
     Returns:
         Orbits in the order of the guesses, each with its `status`.
     """
-    checks.known("pair", check_pair(pair))
+    checks.known("pair", check_pair(pair, any_law=True))
     checks.instance("sequence", sequence, Sequence, "vijax.orbits.shooting.Sequence(...)")
     if np.shape(pair.d) != np.shape(sequence.side)[:1]:
         raise ValueError(f"pair must be one cell an orbit; got shape {np.shape(pair.d)}; impact_pair broadcasts")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from vijax.model import energy, flow
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, check_device
-from vijax.model.membrane import Linear, MembraneLaw, check_law
+from vijax.model.membrane import Laws, Linear, check_laws, one_of
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.model.sides import at
@@ -87,9 +87,7 @@ def _follows_jvp(primals, tangents):
 
 
 @door
-def steady(
-    device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None, membrane: MembraneLaw | None = None
-) -> Steady:
+def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None, membrane: Laws | None = None) -> Steady:
     """Find the steady state of a device near a known orbit; under jit, vmap, grad (both modes) and hessian.
 
     Args:
@@ -130,14 +128,14 @@ class Found(NamedTuple):
     validity: Validity
 
 
-Moved = tuple[Harvester, ImpactPair | None, MembraneLaw | None]
+Moved = tuple[Harvester, ImpactPair | None, Laws | None]
 """What a steady state is a function of: a device, its pair where that is moved directly, and the membrane."""
 
 
 def _pair_of(moved: Moved, kind: Walls) -> ImpactPair:
     device, pair, law = moved
     pair = device.pair(kind) if pair is None else pair
-    r: Any = pair.r if law is None or law.restitution else None
+    r: Any = pair.r if law is None or one_of(law).restitution else None
     return replace(pair, r=r, law=law)
 
 
@@ -184,12 +182,13 @@ def _check(device: Any, orbit: Any, pair: Any) -> None:
         raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
 
 
-def _law(orbit: Orbit, pair: ImpactPair | None, membrane: Any) -> MembraneLaw | None:
+def _law(orbit: Orbit, pair: ImpactPair | None, membrane: Any) -> Laws | None:
     """Take the membrane that is given, or that of the pair or the orbit; None is the linear one."""
     if membrane is None:
         own: Any = orbit.pair.law if pair is None or pair.law is None else pair.law
         return own
-    given, known = (type(Linear() if law is None else law) for law in (check_law(membrane), orbit.pair.law))
+    known_law: Any = Linear() if orbit.pair.law is None else orbit.pair.law
+    given, known = (type(one_of(law)) for law in (check_laws(membrane), known_law))
     if given is not known:
         raise ValueError(
             see("methods", f"membrane must be of the orbit's kind, {known.__name__}; got {given.__name__}")

@@ -20,7 +20,7 @@ from vijax.engine.method_choice import record
 from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.quantities import AXES
 from vijax.model.records import Status
-from vijax.model.sides import named
+from vijax.model.sides import Sides, named
 from vijax.planes.axes import Cells
 from vijax.planes.expected import NEEDS, ManyStarts
 from vijax.planes.outputs import VARIED, Found, Output, needs, table
@@ -61,6 +61,13 @@ class SweepPlan:
     def count(self) -> int:
         """Count the cells that are simulated, from one start or from many."""
         return self.cells.count
+
+    @property
+    def mirrored(self) -> bool:
+        """Say whether the mirror image of a motion is one too, wherever the pair does not say otherwise."""
+        excitation, law = self.settings.excitation, None if self.method is None else self.method.law
+        forced_alike = excitation is None or excitation.mirrored
+        return self.device.alike and forced_alike and not isinstance(law, Sides)
 
     @property
     def table(self) -> dict[str, Output]:

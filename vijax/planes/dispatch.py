@@ -162,7 +162,7 @@ def _summarise(
         u0, v0 = (of.flat(of.quantities[name], rows) for name in ("u0", "v0"))
         return _run(call, rows, count, place, (u0, v0), planned.needs)
     d = of.flat(of.quantities["d"], rows)
-    folded = ManyStarts(of.pair(rows[:count], planned.settings.wall).symmetric & planned.device.alike)
+    folded = ManyStarts(of.pair(rows[:count], planned.settings.wall).symmetric & planned.mirrored)
     # Where programs are compiled and no cell is run, one start does.
     for across, speed in start_places(planned.starts if count else 1).T:
         if stopped is not None and stopped.is_set():

@@ -14,7 +14,7 @@ import numpy as np
 from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
 from vijax.model.device import Harvester, one_device, with_constants
 from vijax.model.excitation import Excitation, Record
-from vijax.model.membrane import MembraneLaw
+from vijax.model.membrane import Laws, one_of
 from vijax.planes import cluster, dispatch, estimate, store_filling, tile_size, tiled_store
 from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, Cells, cells, check_axis
@@ -46,7 +46,7 @@ def sweep(
     solver: SolverName | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    membrane: MembraneLaw | None = None,
+    membrane: Laws | None = None,
     steps: int | None = None,
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
@@ -87,7 +87,8 @@ def sweep(
             paper's fixed steps without event location.
         solver: Of "ode": Tsit5 unless given; Bosh3, Dopri5, Dopri8, Kvaerno3, Kvaerno4 or Kvaerno5.
         rtol, atol: Of "ode": tolerances of position and velocity step by step, 1e-8 and 1e-10 unless given.
-        membrane: Of "ode" and "rk4": `HuntCrossley(chi)`, or a `MembraneLaw` of your own, for the linear membrane.
+        membrane: Of "ode" and "rk4": `HuntCrossley(chi)`, or a `MembraneLaw` of your own, for the linear membrane; of
+            walls with a law each `Sides` of two of one kind.
             `HuntCrossley` takes no r: the map's `restitution` is what came out.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
         outputs: The variables wanted, of those on the page of outputs; all but `asymmetry` and `lyapunov`
@@ -182,7 +183,7 @@ def plan(
     method = settings.integrator(_in_units(device, given, settings))
     if starts > 1:
         _check_spread(given, settings, refine)
-    lossy = method is None or method.law.restitution
+    lossy = method is None or one_of(method.law).restitution
     laid_out = cells(given, device, settings.wall, restitution=lossy)
     if starts > 1:
         named = {name: values for name, values in laid_out.quantities.items() if name not in ("u0", "v0")}
@@ -348,8 +349,7 @@ def _refined(planned: SweepPlan, tell: Callable[[int, int], None]) -> "xr.Datase
     of = planned.cells
     varied = [dim for dim in of.dynamic if of.sizes[dim] > 1]
     mesh = refinement.Mesh(tuple(of.given[dim].values for dim in varied), planned.refine)
-    alike = planned.device.alike and (planned.settings.excitation is None or planned.settings.excitation.mirrored)
-    level_ground = of.pair(np.arange(of.count), planned.settings.wall).symmetric & alike
+    level_ground = of.pair(np.arange(of.count), planned.settings.wall).symmetric & planned.mirrored
     asked = replace(planned, outputs=tuple(dict.fromkeys((*planned.outputs, *refinement.NEEDS))))
     found: Fields = {}
     computed = np.zeros(of.count, bool)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from vijax.engine.method import Method
     from vijax.model.device import Harvester
     from vijax.model.excitation import Excitation
-    from vijax.model.membrane import MembraneLaw
+    from vijax.model.membrane import Laws
 
 # Starts in every cell unless told otherwise: shares of random ones have a standard error of 0.0625 at most.
 STARTS = 64
@@ -49,7 +49,8 @@ class SweepSettings:
         solver: Of "ode", one of `SolverName`; Tsit5 if None.
         rtol, atol: Of "ode": tolerances of position and velocity step by step; 1e-8 and 1e-10 if None, in single
             precision 1e-4 and 1e-6.
-        membrane: Of "ode" and "rk4": a `HuntCrossley`, or a law of your own; the linear one if None.
+        membrane: Of "ode" and "rk4": a `HuntCrossley`, a law of your own, or `Sides` of two of a kind; the linear one
+            if None.
         steps: Of "rk4": steps per forcing period; 1000 if None.
         dtype: "float64", or "float32" with tolerances to match.
         excitation: What shakes the capsule, `Harmonics`, a `Record`, `Noise` or a sum; the sine if None.
@@ -66,7 +67,7 @@ class SweepSettings:
     solver: SolverName | None = None
     rtol: float | None = None
     atol: float | None = None
-    membrane: "MembraneLaw | None" = None
+    membrane: "Laws | None" = None
     steps: int | None = None
     dtype: Precision = "float64"
     excitation: "Excitation | None" = None

@@ -63,8 +63,9 @@ def label_map(dataset: "xr.Dataset") -> Figure:
 def of_labels(dataset: "xr.Dataset") -> "tuple[xr.Dataset, list[Category]]":
     """Turn labels into places among categories: the commonest by name, the others, and what is no orbit."""
     period = dataset["period"]
-    # Another excitation than the sine need not be its own opposite half a period later.
-    level = (symmetric(dataset) & ("excitation" not in dataset.attrs)).broadcast_like(period).transpose(*period.dims)
+    # Another excitation than the sine need not be its own opposite half a period later; walls may have laws each.
+    alike = "excitation" not in dataset.attrs and not dataset.attrs.get("membrane", "").startswith("left ")
+    level = (symmetric(dataset) & alike).broadcast_like(period).transpose(*period.dims)
     words = label(*(dataset[name].values for name in LABEL_NEEDS), merge_mirrors=level.values)
     codes, categories = _named(words, int(dataset.attrs["periods"]))
     drawn = dataset[["lyapunov"] if "lyapunov" in dataset else []].assign(
