@@ -152,6 +152,19 @@ def test_turning_points_are_those_of_the_search():
     assert not turns.lost
 
 
+@pytest.mark.parametrize("stay", [0.08, 0.3, 0.6, 1.0])
+def test_the_error_that_is_told_is_no_smaller_than_the_true_one(stay):
+    """Up to 13 swings in a contact, of which 32 steps lose five digits."""
+    of, stay = onset(vijax.impact_pair(0.2, 40.0, 0.9, -0.9), Linear()), jnp.asarray(stay)
+    wall = flow.membrane(vijax.impact_pair(0.2, 40.0, 0.9, -0.9))
+    w, z = flow.oscillate(wall, flow.contact_force(jnp.asarray(-0.9), of.side, of.t), 0.0, of.speed, stay)
+    there = ode_contact.held(of, stay)
+    off = max(abs(float(there.w - w)) / float(stay), abs(float(there.z - z)))
+    told = float(ode_contact.error(of, stay))
+    assert off <= 1.1 * told + 1e-14
+    assert told < 20 * off + 1e-14
+
+
 def test_a_contact_without_a_turning_point_is_lost():
     turns = ode_contact.turns(onset(SOFT, Linear()), jnp.asarray(0.001))
     assert turns.lost

@@ -41,6 +41,23 @@ def test_power_is_that_of_sweeps_from_the_same_starts(found):
     assert float(found["P"]) == pytest.approx(found["P_realisation"].values.mean())
 
 
+@pytest.mark.parametrize("wall", ["rigid", "rigid_right"])
+def test_rigid_walls_are_those_of_sweeps(wall):
+    """Power, depth and limit by the membrane that rigid walls are lent, or by the one wall that has one."""
+    from vijax.planes.start_places import start_places
+
+    found = response(DEVICE, NOISY, wall=wall, realisations=4, periods=40, transient=10)
+    assert found.attrs["wall"] == wall
+    across, fast = start_places(4)
+    start = {"u0": across * float(DEVICE.pair().d), "v0": 1.2 * fast}
+    told = {"device": DEVICE, "wall": wall, "until": "window", "periods": 40, "transient": 10, "excitation": NOISY}
+    for i in range(4):
+        cell = vijax.sweep(**told, u0=start["u0"][i], v0=start["v0"][i])
+        assert float(cell.P) == pytest.approx(float(found["P_realisation"][i]), rel=1e-9)
+        assert float(cell.max_penetration) <= float(found["max_penetration"]) * (1 + 1e-9)
+    assert float(found["time_share"].sum()) == pytest.approx(1)
+
+
 def test_the_error_is_how_far_other_seeds_are(found):
     others = [
         response(

@@ -76,7 +76,9 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
         work=impact.work if plan.deep else None,
         tangent=outcome.tangent,
     )
-    event = Event(lane_impact, waits | (out & ~quiet), quiet, permanent, jnp.zeros_like(waits))
+    # A rigid wall that has a contact of some length has held the ball.
+    stuck = waits & cell.pair.hard(lane_impact.side) & (impact.duration > 0)
+    event = Event(lane_impact, waits | (out & ~quiet), quiet, permanent, stuck)
     cell = add_event(plan, settings, cell, event)
     taken = method.taken(carry)
     if taken is not None:

@@ -31,7 +31,7 @@ def realisations(constants: tuple[str, ...], out: str | None, plot: str | None, 
     with process.door():
         store, picture = targets(out, plot, _FILES, overwrite)
         excitation = take_excitation(given)
-        _, made = at_one_point(take_axes(given, _DEVICE), device(constants))
+        _, made = at_one_point(take_axes(given, _DEVICE), device(constants), given["wall"])
         if picture is not None:
             from vijax.plots.style import check_format
 
@@ -77,7 +77,7 @@ def _sections() -> Sections:
     axes = {name: axis for name, axis in AXES.items() if name not in STARTS}
     defaults = {name: options.unless_physical(text) for name, text in _DEVICE.items()}
     return {
-        "Device": [*options.axis_options(axes, defaults), *options.device_options()],
+        "Device": [*options.axis_options(axes, defaults), *options.device_options(), options.wall_option()],
         "Excitation": excitation_options(),
         "Run": [
             click.Option(
@@ -94,6 +94,7 @@ def _sections() -> Sections:
 _EXAMPLES = (
     "--noise 0.05,32",
     "--noise 0.01,32 --kappa 3 --plot response.png",
+    "--noise 0.05,32 --wall rigid --r 0.6",
     "--s 8mm --omega0 150 --omega 5pi --noise 0.1,16 --periods 2000 --out long.zarr --plot long.png",
 )
 

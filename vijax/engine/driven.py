@@ -17,6 +17,7 @@ from jaxtyping import Array, Int
 
 from vijax.engine import taylor
 from vijax.engine.driven_events import NONE, Ahead, Decision, DrivenCarry, StepEnd, choose, land, look, residual
+from vijax.engine.driven_rigid import DrivenWall, Rebound, kept, let_go, rebound, walls_of, watched
 from vijax.engine.forcing import REACHED, Draws, Forcing
 from vijax.engine.method import HELD, ImpactOutcome, Method, decided, finished
 from vijax.engine.taylor import Oscillator, Push, Rates
@@ -47,7 +48,7 @@ class _Clock(NamedTuple):
 
 
 class Driven(Method[DrivenCarry]):
-    """The method of excitations that are not the sine; of linear membranes.
+    """The method of excitations that are not the sine; of linear membranes and rigid walls.
 
     Attributes:
         forcing: The excitation.
@@ -60,9 +61,9 @@ class Driven(Method[DrivenCarry]):
         """Say whether a step calls no library: it does not."""
         return True
 
-    def walls(self, pair: ImpactPair) -> Oscillator | Sides:
-        """Give the membrane of a pair; of each wall where they differ."""
-        return Sides(_spring(pair.at(-1)), _spring(pair.at(1))) if pair.unequal else _spring(pair)
+    def walls(self, pair: ImpactPair) -> DrivenWall | Sides:
+        """Give the wall of a pair; each wall where they differ."""
+        return walls_of(pair)
 
     def taken(self, m: DrivenCarry) -> Int[Array, ""]:
         """Count the steps so far."""
@@ -72,8 +73,9 @@ class Driven(Method[DrivenCarry]):
         """Say after how many steps a recorded run is stopped: those of a ball that a membrane holds all the time."""
         knots = int(self.forcing.knots) + 1
         inside = 0.0
-        if checks.is_concrete(pair.kappa):
-            inside = max(float(np.max(one)) for one in named("kappa", pair._soft_kappa()).values()) * 2 / taylor.REACH
+        kappas = [one for one in named("kappa", pair.kappa).values() if one is not None]
+        if kappas and checks.is_concrete(kappas):
+            inside = max(float(np.max(one)) for one in kappas) * 2 / taylor.REACH
         return (knots + int(inside) + 16) * (periods + HELD) + _PER_IMPACT * max_impacts
 
     def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> DrivenCarry:
@@ -118,10 +120,10 @@ class Driven(Method[DrivenCarry]):
         return jnp.where(rests, jnp.where(pushed, side, 0.0).astype(state.mode.dtype), state.mode)
 
     def step(
-        self, pair: ImpactPair, walls: Oscillator | Sides, m: DrivenCarry, *, recorded: bool = False
+        self, pair: ImpactPair, walls: DrivenWall | Sides, m: DrivenCarry, *, recorded: bool = False
     ) -> tuple[DrivenCarry, ImpactOutcome, Flag]:
         """Take one step: to a knot, to where something may happen, towards an event, or onto it."""
-        half, held = 0.5 * pair.d, m.mode != 0
+        half, held, rigid = 0.5 * pair.d, m.mode != 0, pair.rigid or bool(pair.hard_wall)
         side = jnp.where(m.mode < 0, -1.0, 1.0).astype(half.dtype)
         to_knot, to_period = self.forcing.gap - m.s, self._to_period(m)
         spring = _spring_of(walls, side, held, self.forcing.reach)
@@ -135,24 +137,36 @@ class Driven(Method[DrivenCarry]):
         now, later = share(taylor.rates(spring, push, m.x, m.z)), push.later(s)
         end = share(taylor.rates(spring, later, *taylor.moved(spring, push, m.x, m.z, s)))
         most = taylor.steepest(spring, self.forcing.bend, now, s)
-        ahead = look(held, m.work is not None, half, most, now, end, s)
+        rests = held & pair.hard(side) if rigid else None
+        if rests is not None:
+            now, end, most = watched(rests, push, later, self.forcing, (let_go(now, half, held), end, most))
+        sprung = held if rests is None else held & ~rests
+        ahead = look(held, sprung, m.work is not None, half, most, now, end, s)
         ahead = share(Ahead(ahead.clear, jnp.where(m.event != NONE, m.event, ahead.event)))
         f = share(residual(ahead.event, half, end))
         told = m, half, spring.kappa, ahead, end, f, s, self.forcing.gap
         choice = decided(lax.stop_gradient(share(choose(*told))))
-        landing = share(land(choice, half, side, s, end, f))
+        landing, met = land(choice, half, side, s, end, f), None
+        if rests is not None:
+            there = later.later(landing.delay)
+            met, landing = rebound(pair, walls, kept(landing, choice, rests), there, self.forcing.gap)
+        landing = share(landing)
         clock = share(self._clock(m, landing.length, to_knot, to_period, choice.goes))
         work, tangent = m.work, m.tangent
         if work is not None:
             done = _worked(push.derivatives(), later.derivatives(), now, end, s, landing.delay)
-            work = work + jnp.where(choice.goes & held, done, 0.0)
+            work = work + jnp.where(choice.goes & sprung, done, 0.0)
         if tangent is not None:
             carried = _spread(spring, push, later, m, s, landing.delay, _kick(walls, side, landing))
             tangent = tuple(jnp.where(choice.goes, new, old) for new, old in zip(carried, tangent, strict=True))
-        after = State(side * half, side * landing.there.z, clock.t, clock.n, jnp.zeros_like(m.mode))
-        outcome = finished(m, side, after, _given(m, after.v, work), tangent)
         m = replace(m, work=work, tangent=tangent, draws=self.forcing.drawn(m.draws, m.k, clock.k))
-        return _gone_on(m, choice, landing, clock), outcome, landing.exits & m.entered
+        ended = landing.exits & m.entered
+        if met is not None:
+            m = _hit(m, met, landing, clock, present(rests))
+            side, ended = jnp.where(met.bounces, landing.toward, side), ended | met.bounces
+        after = State(side * half, landing.z, clock.t, clock.n, jnp.zeros_like(m.mode))
+        outcome = finished(m, side, after, _given(m, after.v, m.work), m.tangent)
+        return _gone_on(m, choice, landing, clock, met), outcome, ended
 
     def ball(self, pair: ImpactPair, m: DrivenCarry) -> State:
         """Say where the ball of a carry is."""
@@ -187,14 +201,38 @@ class Driven(Method[DrivenCarry]):
         )
 
 
-def _gone_on(m: DrivenCarry, choice: Decision, landing: StepEnd, clock: _Clock) -> DrivenCarry:
+def _hit(m: DrivenCarry, met: Rebound, landing: StepEnd, clock: _Clock, rests: Flag) -> DrivenCarry:
+    """Put an impact at a rigid wall into the carry: onset and end are one, unless the ball stays."""
+    meets, tangent = met.bounces | met.sticks, m.tangent
+    if tangent is not None:
+        a, b, c, d = tangent
+        p, q, r, t = met.tangent
+        hit = (p * a + q * c, p * b + q * d, r * a + t * c, r * b + t * d)
+        # A ball that rested before the run forgets where that was.
+        lost = rests & landing.exits
+        tangent = tuple(jnp.where(lost, 0.0, jnp.where(meets, new, old)) for new, old in zip(hit, tangent, strict=True))
+    return replace(
+        m,
+        tangent=tangent,
+        onset_t=jnp.where(meets, clock.t, m.onset_t),
+        onset_n=jnp.where(meets, clock.n, m.onset_n),
+        v_in=jnp.where(meets, landing.there.z, m.v_in),
+        depth=jnp.where(meets, met.depth, m.depth),
+        work=None if m.work is None else jnp.where(meets, 0.0, m.work),
+    )
+
+
+def _gone_on(m: DrivenCarry, choice: Decision, landing: StepEnd, clock: _Clock, met: Rebound | None) -> DrivenCarry:
     """Make the carry after a step."""
     crossed, exits, there = landing.crossed, landing.exits, landing.there
+    leaves, enters = exits, crossed
+    if met is not None:
+        leaves, enters = exits | met.bounces, crossed & ~met.sticks
     tangent = m.tangent
     if tangent is not None:
         # A ball that leaves begins a new tangent map: that of an impact is from exit to exit.
         unit = _unit(jnp.zeros_like(m.x))
-        tangent = tuple(jnp.where(exits, one, value) for one, value in zip(unit, tangent, strict=True))
+        tangent = tuple(jnp.where(leaves, one, value) for one, value in zip(unit, tangent, strict=True))
     return replace(
         m,
         x=jnp.where(choice.goes, landing.x, m.x),
@@ -210,31 +248,26 @@ def _gone_on(m: DrivenCarry, choice: Decision, landing: StepEnd, clock: _Clock) 
         onset_n=jnp.where(crossed, clock.n, m.onset_n),
         entered=(m.entered | crossed) & ~exits,
         v_in=jnp.where(crossed, there.z, m.v_in),
-        depth=jnp.where(crossed, 0.0, jnp.where(landing.crest, jnp.maximum(m.depth, there.x), m.depth)),
+        depth=jnp.where(enters, 0.0, jnp.where(landing.crest, jnp.maximum(m.depth, there.x), m.depth)),
         work=None if m.work is None else jnp.where(crossed, 0.0, m.work),
-        left_t=jnp.where(exits, clock.t, m.left_t),
-        left_n=jnp.where(exits, clock.n, m.left_n),
+        left_t=jnp.where(leaves, clock.t, m.left_t),
+        left_n=jnp.where(leaves, clock.n, m.left_n),
         tangent=tangent,
         steps=m.steps + 1,
     )
 
 
-def _spring_of(walls: Oscillator | Sides, side: Scalar, held: Flag, reach: Scalar) -> Oscillator:
+def _spring_of(walls: DrivenWall | Sides, side: Scalar, held: Flag, reach: Scalar) -> Oscillator:
     """Give the membrane that the ball is in, or what stands for one in flight."""
     zero = jnp.zeros_like(side)
     flight = Oscillator(zero, zero, zero, zero + reach)
-    return Oscillator(*(jnp.where(held, own, free) for own, free in zip(at(walls, side), flight, strict=True)))
+    return Oscillator(*(jnp.where(held, own, free) for own, free in zip(at(walls, side).spring, flight, strict=True)))
 
 
-def _kick(walls: Oscillator | Sides, side: Scalar, landing: StepEnd) -> Scalar:
+def _kick(walls: DrivenWall | Sides, side: Scalar, landing: StepEnd) -> Scalar:
     """Find how much of du becomes du' at an event: the force jumps by the damping, on at the onset, off at the exit."""
-    onset, leaving = at(walls, landing.toward).mu, at(walls, side).mu
+    onset, leaving = at(walls, landing.toward).spring.mu, at(walls, side).spring.mu
     return jnp.where(landing.crossed, -onset, jnp.where(landing.exits, leaving, 0.0))
-
-
-def _spring(pair: ImpactPair) -> Oscillator:
-    kappa = pair._soft_kappa()
-    return Oscillator(kappa, kappa * kappa, pair.mu, taylor.REACH / kappa)
 
 
 def _worked(

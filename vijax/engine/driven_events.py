@@ -58,12 +58,17 @@ class Ahead(NamedTuple):
     event: Scalar
 
 
-def look(held: Flag, deep: bool, half: Scalar, most: Scalar, now: Rates, end: Rates, s: Scalar) -> Ahead:
-    """Tell what is certain of the next s, where nothing is being closed in on; `most` bounds the fourth derivative."""
-    # What may come down to 0: the gaps to both walls in flight, the penetration in contact.
-    gap = half - now.x, -now.z, -now.a, -now.j
+def look(held: Flag, sprung: Flag, deep: bool, half: Scalar, most: Scalar, now: Rates, end: Rates, s: Scalar) -> Ahead:
+    """Tell what is certain of the next s, where nothing is being closed in on; `most` bounds the fourth derivative.
+
+    Of a ball that is held, but not `sprung` by a membrane, what falls to 0 at its exit is not a penetration.
+    """
+    # What may come down to 0: the gaps to both walls in flight, the penetration in contact. A ball that flies back from
+    # a little beyond a wall, where a search has put it, is on the wall.
+    room, room_left = half - now.x, half + now.x
+    gap = jnp.where(now.z < 0, jnp.maximum(room, 0.0), room), -now.z, -now.a, -now.j
     first: Any = share(tuple(jnp.where(held, f, g) for f, g in zip(now, gap, strict=False)))
-    left = half + now.x, now.z, now.a, now.j
+    left = jnp.where(now.z > 0, jnp.maximum(room_left, 0.0), room_left), now.z, now.a, now.j
     open_first, open_left = taylor.above(first, most, s), held | taylor.above(left, most, s)
     open_first, open_left, falls = share((open_first, open_left, taylor.falling(first[1:], most, s)))
     # A gap that falls all the way makes the other one grow.
@@ -78,8 +83,8 @@ def look(held: Flag, deep: bool, half: Scalar, most: Scalar, now: Rates, end: Ra
         # Of a ball that has come to rest inside all but rounding is gone, of which nothing is certain.
         moves = s * (jnp.abs(now.z) + s * (jnp.abs(now.a) + s * (jnp.abs(now.j) + s * most)))
         rests = moves < _ROUNDING * jnp.finfo(s.dtype).eps * now.x
-        crest = held & clear & slows & ~rests & (now.z > 0) & (end.z <= 0)
-        clear = clear & (~held | slows | rises | falls | rests) & ~crest
+        crest = sprung & clear & slows & ~rests & (now.z > 0) & (end.z <= 0)
+        clear = clear & (~sprung | slows | rises | falls | rests) & ~crest
         event = jnp.where(crest, CREST, event)
     return Ahead(clear, event)
 

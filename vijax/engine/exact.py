@@ -43,7 +43,7 @@ def stick_speed(dtype: Any) -> float:
 
 # A ball counts as stuck once the rest of its chatter lasts less than this share of the time to its release. A larger
 # one holds balls that would still be bouncing then, a smaller one follows more bounces that nobody sees.
-_STICK_SHARE = 1e-3
+STICK_SHARE = 1e-3
 
 
 def _soft_contact(
@@ -101,7 +101,7 @@ def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, hel
     # Each bounce that is left is r times as fast as the last one, under a push that hardly changes meanwhile.
     out = pair.r * speed
     chatter = 2 * out / jnp.where(push > 0, push, 1.0) / jnp.maximum(1 - pair.r, jnp.finfo(t.dtype).tiny)
-    tired = (out < stick_speed(t.dtype)) & (push > 0) & (chatter < _STICK_SHARE * spell.end) & (pair.r < 1)
+    tired = (out < stick_speed(t.dtype)) & (push > 0) & (chatter < STICK_SHARE * spell.end) & (pair.r < 1)
     stuck = (tired | held) & spell.positive
     release = jnp.where(jnp.isfinite(spell.end), spell.end, 1.0)
     release = jnp.where(jnp.isfinite(spell.end), implicit_root(lambda s, f: f.at(s), release, force), spell.end)

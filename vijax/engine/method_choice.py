@@ -62,7 +62,7 @@ def choose(
             theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
             raise ValueError(see("methods", f"{name} must be left out unless method is {theirs}; got {got}"))
     if excitation is not None and not excitation.sine:
-        return _driven(method, wall, excitation)
+        return _driven(method, excitation)
     if method == "exact":
         return None
     if wall != "soft":
@@ -85,12 +85,10 @@ def choose(
     return Ode(solver, rtol, atol, law=law)
 
 
-def _driven(method: str, wall: str, excitation: Excitation) -> Method:
+def _driven(method: str, excitation: Excitation) -> Method:
     """Make the method of an excitation that is not the sine."""
     if method != "exact":
         raise ValueError(see("excitation", f'method must be "exact" with an excitation; got {checks.shown(method)}'))
-    if wall != "soft":
-        raise ValueError(see("excitation", f'wall must be "soft" with an excitation; got {wall!r}'))
     from vijax.engine.driven import Driven
     from vijax.engine.forcing import forcing
 

@@ -52,6 +52,10 @@ class Push(eqx.Module):
             bend, twist = bend - pace**2 * wave.c, twist + pace**3 * wave.q
         return value, rate, bend, twist
 
+    def fourth(self) -> Values:
+        """Compute its fourth derivative now."""
+        return sum(((wave.order * PI) ** 4 * wave.c for wave in self.waves), start=jnp.zeros_like(self.level))
+
 
 class Oscillator(NamedTuple):
     """The membrane that the ball is in: kappa, kappa^2 and mu, all 0 in flight; how far a series reaches there."""

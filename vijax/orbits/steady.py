@@ -135,8 +135,7 @@ Moved = tuple[Harvester, ImpactPair | None, Laws | None]
 def _pair_of(moved: Moved, kind: Walls) -> ImpactPair:
     device, pair, law = moved
     pair = device.pair(kind) if pair is None else pair
-    r: Any = pair.r if law is None or one_of(law).restitution else None
-    return replace(pair, r=r, law=law)
+    return replace(pair, law=law)
 
 
 def _found(moved: Moved, about: tuple[Sequence, Knots], *, kind: Walls) -> Found:

@@ -10,11 +10,13 @@ import numpy as np
 
 from vijax.batch.trajectory import trajectory
 from vijax.model import energy
-from vijax.model.device import Harvester, one_device
+from vijax.model.choices import Walls
+from vijax.model.device import Harvester, depth_unit, one_device
 from vijax.model.excitation import Excitation, Noise, Sum, check_excitation, instance
+from vijax.model.pair import WALLS
 from vijax.model.quantities import MEASURED
 from vijax.model.records import State, Status
-from vijax.model.sides import apart
+from vijax.model.sides import apart, at
 from vijax.planes import sweep
 from vijax.planes.basins import matched, plan_starts, started
 from vijax.planes.start_places import start_places
@@ -39,6 +41,7 @@ def response(
     device: Harvester | None = None,
     excitation: Excitation | None = None,
     *,
+    wall: Walls = "soft",
     realisations: int = 64,
     periods: int = 400,
     transient: int = 100,
@@ -58,8 +61,9 @@ def response(
     own. All errors are standard errors, from how realisations differ: they hold correlation within one.
 
     Args:
-        device: One device with soft walls; Tables I and II unless given.
+        device: One device; Tables I and II unless given.
         excitation: What shakes it; a `Record` is told in the device's units. The sine unless given.
+        wall: "soft", "rigid", "rigid_left" or "rigid_right", as in `sweep`.
         realisations: How many, at least 2.
         periods: Forcing periods that are measured, after `transient` of them.
         transient: Forcing periods to drop first.
@@ -85,9 +89,11 @@ def response(
     import xarray as xr  # here, as importing vijax must not load it
 
     device = one_device(device)
+    checks.choice("wall", wall, WALLS)
     asked = _Asked(
         device,
         None if excitation is None else instance(excitation).scaled(device),
+        wall,
         checks.whole("realisations", realisations, 2, MOST_STARTS),
         checks.whole("periods", periods, 1),
         checks.whole("transient", transient, 0),
@@ -107,7 +113,7 @@ def response(
         "title": "Response of a vibro-impact pair",
         "excitation": "sine" if excitation is None else f"{excitation}",
     }
-    attributes |= {name: getattr(asked, name) for name in ("realisations", "periods", "transient")}
+    attributes |= {name: getattr(asked, name) for name in ("wall", "realisations", "periods", "transient")}
     return xr.Dataset(found, attrs=attributes)
 
 
@@ -117,6 +123,7 @@ class _Asked:
 
     device: Harvester
     excitation: Excitation | None
+    wall: Walls
     realisations: int
     periods: int
     transient: int
@@ -146,7 +153,7 @@ class _Hits(NamedTuple):
 
 def _fly(asked: _Asked) -> _Hits:
     """Fly all realisations."""
-    pair, device = asked.device.pair(), asked.device
+    pair, device = asked.device.pair(asked.wall), asked.device
     across, fast = start_places(asked.realisations)
     start = across * float(pair.d), 2 * SPEED * fast
     run = trajectory(pair, *start, asked.transient + asked.periods, excitation=asked.excitation)
@@ -155,7 +162,8 @@ def _fly(asked: _Asked) -> _Hits:
     real = (np.arange(impacts.n.shape[1]) < np.asarray(run.filled)[:, None]) & ~np.isin(status, _FAILED)[:, None]
     of, index = np.nonzero(real & (impacts.n >= asked.transient))
     speed = np.abs(impacts.v_in[of, index]) * float(device.speed_unit)
-    depth = impacts.depth[of, index] * float(device.length_unit)
+    length = np.asarray(at(depth_unit(device, pair), impacts.side[of, index]))
+    depth = impacts.depth[of, index] * length
     return _Hits(states, status, of, impacts.n[of, index] - asked.transient, impacts.side[of, index], speed, depth)
 
 
@@ -238,7 +246,7 @@ def _quantiles(asked: _Asked, of: np.ndarray, values: np.ndarray) -> tuple[np.nd
 
 def _visits(asked: _Asked, quiet: Excitation, flown: _Hits) -> dict[str, Any]:
     """Find in which basin of the noiseless device each period begins, and how long a basin is kept to."""
-    planned = plan_starts({}, asked.device, SweepSettings(excitation=quiet))
+    planned = plan_starts({}, asked.device, SweepSettings(wall=asked.wall, excitation=quiet))
     u, v = (x[:, asked.transient :] for x in (flown.states.u, flown.states.v))
     table = matched(sweep.run(started(planned, *(_starts(x.ravel()) for x in (u, v)))))
     basin = table["basin"].values.reshape(u.shape)

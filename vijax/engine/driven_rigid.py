@@ -1,0 +1,132 @@
+"""What a rigid wall does to a driven motion: it throws the ball back, or holds it until the push turns.
+
+Nothing of a ball at rest moves, so its steps watch the push in place of a displacement, by the same certificates: the
+ball leaves where the push falls through 0.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from vijax.engine import taylor
+from vijax.engine.driven_events import Decision, StepEnd
+from vijax.engine.exact import STICK_SHARE, stick_speed
+from vijax.engine.forcing import Forcing
+from vijax.engine.taylor import Oscillator, Push, Rates
+from vijax.model import energy, flow
+from vijax.model.pair import ImpactPair
+from vijax.model.sides import Sides, at
+from vijax.runtime.arrays import Flag, Scalar, choose
+
+# Of a push where the ball is let go, what is left beside 1: less is rounding, and does not push it back.
+_NO_PUSH = 1e-13
+
+
+# A chatter ends at so many times the speed of the exact engine: displacements are counted from the middle of the gap,
+# and of a bounce of 1e-16 rounding leaves nothing.
+_SLOWER = 100
+
+
+class DrivenWall(NamedTuple):
+    """A wall of a driven motion: its membrane, all 0 of a rigid wall, and the restitution where walls are rigid."""
+
+    spring: Oscillator
+    r: Scalar | None
+
+
+def walls_of(pair: ImpactPair) -> DrivenWall | Sides:
+    """Give the wall of a pair; each wall where they differ."""
+    if pair.unequal:
+        return Sides(_wall(pair, -1), _wall(pair, 1))
+    return _wall(pair, 1)
+
+
+def _wall(pair: ImpactPair, side: int) -> DrivenWall:
+    here, own = pair.at(side), pair.r is not None and bool(pair.rigid or pair.hard_wall)
+    if pair.hard(side):
+        zero = jnp.zeros_like(pair.d)
+        return DrivenWall(Oscillator(zero, zero, zero, zero + jnp.inf), here.r)
+    kappa = here._soft_kappa()
+    spring = Oscillator(kappa, kappa * kappa, here.mu, taylor.REACH / kappa)
+    return DrivenWall(spring, here.r if own else None)
+
+
+def watched(
+    rests: Flag, push: Push, later: Push, forcing: Forcing, motion: tuple[Rates, Rates, Scalar]
+) -> tuple[Rates, Rates, Scalar]:
+    """Put the push in place of the penetration where the ball rests.
+
+    Args:
+        rests: Whether it does, on a rigid wall.
+        push, later: Of the step, at its beginning and at its end.
+        forcing: Whose push it is.
+        motion: Where the step begins and ends, and a bound of the fourth derivative.
+    """
+    now, end, most = motion
+    # No harmonic is faster than the one that limits how far a series reaches.
+    bound = forcing.bend * (taylor.REACH / forcing.reach) ** 2
+    begins, ends = (Rates(*of.derivatives(), of.fourth()) for of in (push, later))
+    return choose(rests, (begins, ends, bound + jnp.zeros_like(most)), (now, end, most))
+
+
+def let_go(now: Rates, half: Scalar, held: Flag) -> Rates:
+    """Take what is left of the push for nothing where a ball has just been let go: it is about to turn away."""
+    just = ~held & (now.z == 0) & (jnp.abs(now.x) == half) & (jnp.abs(now.a) < _NO_PUSH)
+    return now._replace(a=jnp.where(just, 0.0, now.a))
+
+
+class Rebound(NamedTuple):
+    """What becomes of a ball that meets a rigid wall.
+
+    Attributes:
+        bounces: It is thrown back at once.
+        sticks: It stays, as what is left of its bounces lasts no time.
+        depth: How deep a membrane that it is lent would be pressed.
+        tangent: Tangent map of the impact, row by row; 0 where it sticks, as the ball forgets how it came.
+    """
+
+    bounces: Flag
+    sticks: Flag
+    depth: Scalar
+    tangent: tuple[Scalar, ...]
+
+
+def rebound(
+    pair: ImpactPair, walls: DrivenWall | Sides, landing: StepEnd, push: Push, gap: Scalar
+) -> tuple[Rebound, StepEnd]:
+    """Find what a rigid wall does at the end of a step, and where the ball is then.
+
+    Args:
+        pair: One cell.
+        walls: Of `walls_of`.
+        landing: Where the step ends.
+        push: In flight, there.
+        gap: Time between two knots.
+
+    A chatter is a geometric series of bounces; what is left of it lasts 2 v/(a (1 - r)), as in `exact`.
+    """
+    toward, v_in = landing.toward, landing.there.z
+    meets = landing.crossed & pair.hard(toward)
+    r: Any = at(walls, toward).r
+    value, rate, *_ = (toward * of for of in push.derivatives())
+    out = r * jnp.maximum(toward * v_in, 0.0)
+    rest = 2 * out / jnp.where(value > 0, value, 1.0) / jnp.maximum(1 - r, jnp.finfo(out.dtype).tiny)
+    # Until the push may turn, by its slope, and no further than samples are known.
+    ahead = jnp.minimum(gap, value / jnp.where(rate < 0, -rate, value / gap))
+    slow = out < _SLOWER * stick_speed(out.dtype)
+    sticks = meets & slow & (value > 0) & (rest < STICK_SHARE * ahead) & (r < 1)
+    bounces = meets & ~sticks
+    wall = pair.at(toward)
+    deep = toward * v_in * (energy.rigid_depth(wall) if pair.rigid else jnp.zeros_like(out))
+    hit = flow.rigid_matrix(r, toward * value, jnp.where(meets, v_in, 1.0))
+    tangent = tuple(jnp.where(sticks, 0.0, entry) for entry in hit.ravel())
+    x = jnp.where(bounces, toward * 0.5 * pair.d, landing.x)
+    z = jnp.where(bounces, -toward * out, jnp.where(sticks, 0.0, landing.z))
+    landing = landing._replace(x=x, z=z, crossed=landing.crossed & ~bounces)
+    return Rebound(bounces, sticks, deep, tangent), landing
+
+
+def kept(landing: StepEnd, choice: Decision, rests: Flag) -> StepEnd:
+    """Keep a ball at rest where it is: what its step watched is no place of it."""
+    still = rests & choice.goes
+    return landing._replace(x=jnp.where(still & ~landing.exits, 0.0, landing.x), z=jnp.where(still, 0.0, landing.z))
