@@ -1,5 +1,6 @@
 """Settings every test runs under: strict dtype promotion, and property tests that CI draws the same way each time."""
 
+import ctypes
 import gc
 import os
 from pathlib import Path
@@ -41,6 +42,26 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 settings.register_profile("vijax", deadline=None, max_examples=50)
 settings.register_profile("vijax-ci", settings.get_profile("vijax"), derandomize=True, database=None, print_blob=True)
 settings.load_profile("vijax-ci" if os.environ.get("CI") else "vijax")
+
+
+# Bytes of a worker beyond which it forgets its programs: two of them, and what they start, share the memory of a small
+# machine, and what LLVM makes of thousands of programs is most of it. They are read from the folder again.
+MOST_MEMORY = 5e9
+
+
+def pytest_runtest_teardown(item, nextitem):
+    """Forget compiled programs between two files, where they have become too many."""
+    if nextitem is not None and nextitem.path != item.path and resident() > MOST_MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        # What is freed stays with the process unless glibc is told; other libraries of C give it back, or do not know.
+        getattr(ctypes.CDLL(None), "malloc_trim", int)(0)
+
+
+def resident() -> float:
+    """Say how many bytes this process has in memory; 0 where that is not told."""
+    told = Path("/proc/self/statm")
+    return float(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if told.exists() else 0.0
 
 
 def pytest_addoption(parser):

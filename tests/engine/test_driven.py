@@ -212,6 +212,33 @@ def test_a_rigid_wall_lets_go_of_a_ball_when_the_push_turns(side):
     np.testing.assert_allclose(ends, begin, rtol=1e-12)
 
 
+@pytest.mark.parametrize("start", [0.0999, 0.1])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_ball_rests_through_the_silence_of_a_record(side, start):
+    """A push, then none for a while, then a pull: the ball stays until that begins, and no impact is made up."""
+    quiet = np.concatenate([np.ones(12), np.zeros(20), -np.ones(32)])
+    given = Waveform(side * quiet, SAMPLES)
+    found = trajectory(impact_pair(0.2, None, 0.5), side * start, 0.0, 1, excitation=given)
+    assert found.status == Status.OK
+    hits = jax.tree.map(np.asarray, found.impacts)
+    there = np.flatnonzero((hits.side == -side) & np.isfinite(hits.v_in))
+    # Let go after 31 samples, by a pull that takes one more to grow to 1: it goes a sixth of its square meanwhile.
+    gap, begin = 2 / SAMPLES, 31 * 2 / SAMPLES
+    fall, speed = gap**2 / 6, gap / 2
+    met = begin + gap - speed + np.sqrt(speed**2 + 2 * (0.2 - fall))
+    np.testing.assert_allclose((2 * hits.n + hits.t)[there[0]], met, rtol=1e-7)
+    before = hits.v_in[: there[0]]
+    assert (np.abs(before) > 1e-8).all()
+    assert hits.duration[: there[0]].max(initial=0) > (0.7 if start < 0.1 else -1)
+
+
+def test_a_ball_at_rest_on_a_wall_in_silence_stays():
+    nothing = Waveform(np.zeros(SAMPLES), SAMPLES)
+    found = trajectory(impact_pair(0.2, None, 0.5), np.array([-0.1, 0.1]), 0.0, 2, excitation=nothing)
+    np.testing.assert_array_equal(found.filled, 0)
+    np.testing.assert_array_equal(found.states.u, [[-0.1] * 2, [0.1] * 2])
+
+
 def test_derivatives_at_rigid_walls_against_differences():
     pair, rough = impact_pair(0.2, None, 0.5), Waveform(ROUGH, SAMPLES)
 

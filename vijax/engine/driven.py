@@ -116,6 +116,9 @@ class Driven(Method[DrivenCarry]):
         side = jnp.where(state.u < 0, -1.0, 1.0).astype(state.u.dtype)
         value, rate, *_ = self.forcing.push(pair.gamma, k, since, state.t, draws).derivatives()
         pushed = side * jnp.where(value == 0, rate, value) > 0
+        if pair.rigid or pair.hard_wall:
+            # A rigid wall keeps a ball that nothing moves.
+            pushed = pushed | (pair.hard(side) & (value == 0) & (rate == 0))
         rests = (side * state.u == 0.5 * pair.d) & (state.v == 0)
         return jnp.where(rests, jnp.where(pushed, side, 0.0).astype(state.mode.dtype), state.mode)
 
