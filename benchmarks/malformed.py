@@ -301,7 +301,12 @@ CALLS: Table = {
     "steady": (
         vijax.steady,
         {"device": vijax.Harvester(), "orbit": an_orbit()[0]},
-        {"device": (*DEVICE, None), "orbit": (*ORBIT, an_orbit()), "pair": PAIR[:1] + PAIR[2:]},
+        {
+            "device": (*DEVICE, None),
+            "orbit": (*ORBIT, an_orbit()),
+            "pair": PAIR[:1] + PAIR[2:],
+            "membrane": (3, "linear", vijax.HuntCrossley, vijax.HuntCrossley(0.3)),
+        },
     ),
     "impact_pair": (
         vijax.impact_pair,
@@ -309,7 +314,7 @@ CALLS: Table = {
         {
             "d": (*NUMBERS, 0, -0.1, None),
             "kappa": (0, INF, "stiff", [], True),
-            "r": (0, 1.5, NAN, [], "half", None),
+            "r": (0, 1.5, NAN, [], "half", vijax.Sides(0.5, None)),
             "gamma": (NAN, INF, [], "level", None),
         },
     ),

@@ -113,7 +113,7 @@ def test_settings_of_a_program_change_no_derivative(plain_slopes, setting):
 
 def test_a_door_looks_like_its_function():
     assert vijax.steady.__doc__.startswith("Find the steady state of a device")
-    assert list(inspect.signature(vijax.steady).parameters) == ["device", "orbit", "pair"]
+    assert list(inspect.signature(vijax.steady).parameters) == ["device", "orbit", "pair", "membrane"]
 
 
 def test_an_orbit_in_single_precision_is_refused():
