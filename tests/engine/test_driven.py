@@ -166,6 +166,10 @@ def test_the_sine_at_rigid_walls(wall):
         for found in (exact, ours):
             hits = jax.tree.map(lambda x, index=index: np.asarray(x[index]), found.impacts)
             fast = np.abs(hits.v_in) > 1e-6
+            # Nothing is pressed, and nothing given, while a ball rests.
+            rested = hits.duration > 0 if wall == "rigid" else np.zeros_like(fast)
+            assert hits.depth[rested].max(initial=0) < 1e-6
+            assert np.abs(hits.work[rested]).max(initial=0) < 1e-12
             rest = np.cumsum(np.where(hits.duration > 0, hits.duration, 0.0))
             names = ("side", "v_in", "v_out", "depth", "work")
             both.append(np.stack([2 * hits.n + hits.t, rest, *(getattr(hits, name) for name in names)])[:, fast])
@@ -178,7 +182,8 @@ def test_the_sine_at_rigid_walls(wall):
 
 def test_attractors_at_rigid_walls_are_those_of_the_sine():
     """Newton puts balls a little beyond a wall on its way; the first cell was wrong when such met the wall at once."""
-    told = {"d": [0.06521739130434782, 0.19, 0.3, 0.4], "r": [0.3, 0.7454545454545456], "gamma": 0.2, "wall": "rigid"}
+    told = {"d": [0.06521739130434782, 0.19, 0.3, 0.4], "r": [0.3, 0.7454545454545456], "gamma": [-0.2, 0.2]}
+    told |= {"wall": "rigid", "outputs": ["P", "period", "impacts_left", "impacts_right", "lyapunov", "status"]}
     sine, ours = vijax.sweep(**told), vijax.sweep(**told, excitation=SINE)
     np.testing.assert_array_equal(ours.status, sine.status)
     periodic = (sine.period > 0) & (sine.status == Status.OK)
@@ -187,6 +192,8 @@ def test_attractors_at_rigid_walls_are_those_of_the_sine():
     for name in ("period", "impacts_left", "impacts_right"):
         np.testing.assert_array_equal(ours[name].values[periodic], sine[name].values[periodic])
     np.testing.assert_allclose(ours.P.values[periodic], sine.P.values[periodic], rtol=1e-10)
+    grows = [found.lyapunov.values[periodic] for found in (ours, sine)]
+    np.testing.assert_allclose(*grows, rtol=1e-6)
     stuck = (sine.status == Status.STICKING).values
     np.testing.assert_allclose(ours.P.values[stuck], sine.P.values[stuck], rtol=1e-6)
 

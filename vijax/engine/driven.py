@@ -17,7 +17,7 @@ from jaxtyping import Array, Int
 
 from vijax.engine import taylor
 from vijax.engine.driven_events import NONE, Ahead, Decision, DrivenCarry, StepEnd, choose, land, look, residual
-from vijax.engine.driven_rigid import DrivenWall, Rebound, kept, let_go, rebound, walls_of, watched
+from vijax.engine.driven_rigid import DrivenWall, Rebound, kept, rebound, walls_of, watched
 from vijax.engine.forcing import REACHED, Draws, Forcing
 from vijax.engine.method import HELD, ImpactOutcome, Method, decided, finished
 from vijax.engine.taylor import Oscillator, Push, Rates
@@ -142,7 +142,7 @@ class Driven(Method[DrivenCarry]):
         most = taylor.steepest(spring, self.forcing.bend, now, s)
         rests = held & pair.hard(side) if rigid else None
         if rests is not None:
-            now, end, most = watched(rests, push, later, self.forcing, (let_go(now, half, held), end, most))
+            now, end, most = watched(rests, push, later, self.forcing, (now, end, most))
         sprung = held if rests is None else held & ~rests
         ahead = look(held, sprung, m.work is not None, half, most, now, end, s)
         ahead = share(Ahead(ahead.clear, jnp.where(m.event != NONE, m.event, ahead.event)))

@@ -18,8 +18,8 @@ from vijax.model.pair import ImpactPair
 from vijax.model.sides import Sides, at
 from vijax.runtime.arrays import Flag, Scalar, choose
 
-# A push, beside 1, that is as good as none: a ball at rest stays under it, in the silence of a record, and one that was
-# let go is not pushed back by it.
+# A pull, beside 1, that is as good as none: a ball at rest stays under it, in the silence of a record, and one that is
+# let go is pulled by as much for certain.
 _NO_PUSH = 1e-13
 # A chatter ends at so many times the speed of the exact engine: displacements are counted from the middle of the gap,
 # and of a bounce of 1e-16 rounding leaves nothing.
@@ -73,12 +73,6 @@ def _of_push(push: Push) -> Rates:
     return Rates(value + _NO_PUSH, rate, bend, twist, push.fourth())
 
 
-def let_go(now: Rates, half: Scalar, held: Flag) -> Rates:
-    """Take what is left of the push for nothing where a ball has just been let go: it is about to turn away."""
-    just = ~held & (now.z == 0) & (jnp.abs(now.x) == half) & (jnp.abs(now.a) < 2 * _NO_PUSH)
-    return now._replace(a=jnp.where(just, 0.0, now.a))
-
-
 class Rebound(NamedTuple):
     """What becomes of a ball that meets a rigid wall.
 
@@ -118,8 +112,7 @@ def rebound(
     # Until the push may turn, by its slope, and no further than samples are known.
     ahead = jnp.minimum(gap, value / jnp.where(rate < 0, -rate, value / gap))
     slow = out < _SLOWER * stick_speed(out.dtype)
-    tired = slow & (value > 0) & (rest < STICK_SHARE * ahead) & (r < 1)
-    sticks = meets & (tired | ((out == 0) & (value >= -_NO_PUSH)))
+    sticks = meets & slow & (value > 0) & (rest < STICK_SHARE * ahead) & (r < 1)
     bounces = meets & ~sticks
     wall = pair.at(toward)
     deep = toward * v_in * (energy.rigid_depth(wall) if pair.rigid else jnp.zeros_like(out))
