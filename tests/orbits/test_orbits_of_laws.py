@@ -275,3 +275,10 @@ def test_mirror_images_are_not_merged_between_walls_with_laws_of_their_own(uneve
 def test_laws_of_two_kinds_are_refused():
     with pytest.raises(ValueError, match="membrane must be of one kind on both sides"):
         vijax.find_orbits(PAIR, "LR", membrane=vijax.Sides(Cubic(1.0), Spring()))
+
+
+def test_what_a_contact_loses_is_the_determinant_of_its_tangent_map():
+    onset = [jnp.asarray(x) for x in (1.0, 0.3, 0.7, 0.08)]
+    lost = [float(contacts.loss(replace(PAIR, law=law), *onset)) for law in (None, Spring())]
+    assert lost[1] == pytest.approx(lost[0], rel=1e-10)
+    assert lost[0] == pytest.approx(float(jnp.exp(-PAIR.mu * 0.08)), rel=1e-14)
