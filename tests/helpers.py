@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import vijax
 from vijax.batch import simulate
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
@@ -35,3 +36,21 @@ def no_cell_runs() -> Iterator[None]:
 def cases(every: Iterable[str], long: tuple[str, ...]) -> list[Any]:
     """List the cases of a test by name, some of them marked long."""
     return [pytest.param(one, marks=pytest.mark.long) if one in long else one for one in every]
+
+
+class Plain(vijax.MembraneLaw):
+    """The linear membrane, by hand."""
+
+    def acceleration(self, pair, w, z):
+        """Spring and damper."""
+        return -(pair.kappa**2 * w + pair.mu * z)
+
+
+class Cubic(vijax.MembraneLaw):
+    """One that stiffens."""
+
+    beta: float
+
+    def acceleration(self, pair, w, z):
+        """A cubic spring."""
+        return -(pair.kappa**2 * (w + self.beta * w**3) + pair.mu * z)

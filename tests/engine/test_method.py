@@ -12,6 +12,7 @@ from jaxtyping import Array
 from scipy.integrate import solve_ivp
 
 import vijax
+from tests.helpers import Cubic, Plain
 from vijax import Harvester, HuntCrossley, sweep
 from vijax.batch.simulate import Scale, summarise
 from vijax.engine.method import HELD, ImpactOutcome, Method
@@ -300,24 +301,6 @@ def test_hunt_crossley_maps():
 
 
 # --- a law of one's own -----------------------------------------------------------------------------------------------
-
-
-class Plain(vijax.MembraneLaw):
-    """The linear membrane, by hand."""
-
-    def acceleration(self, pair, w, z):
-        """Spring and damper."""
-        return -(pair.kappa**2 * w + pair.mu * z)
-
-
-class Cubic(vijax.MembraneLaw):
-    """One that stiffens."""
-
-    beta: float
-
-    def acceleration(self, pair, w, z):
-        """A cubic spring."""
-        return -(pair.kappa**2 * (w + self.beta * w**3) + pair.mu * z)
 
 
 class Elastic(vijax.MembraneLaw):

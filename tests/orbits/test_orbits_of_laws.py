@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vijax
+from tests.helpers import Cubic, Plain
 from vijax.model.records import Status
 from vijax.orbits import contacts, periodic, shooting
 from vijax.planes.sweep import plan
@@ -19,28 +20,10 @@ DEVICE = vijax.Harvester()
 HERTZ = vijax.HuntCrossley(0.3)
 
 
-class Spring(vijax.MembraneLaw):
-    """The linear membrane, as a user would write it."""
-
-    def acceleration(self, pair, w, z):
-        """Push the ball out."""
-        return -(pair.kappa**2 * w + pair.mu * z)
-
-
-class Cubic(vijax.MembraneLaw):
-    """A membrane that stiffens."""
-
-    beta: float
-
-    def acceleration(self, pair, w, z):
-        """Push the ball out."""
-        return -(pair.kappa**2 * (w + self.beta * w**3) + pair.mu * z)
-
-
 @pytest.fixture(scope="module")
 def springs():
     """The 1:1 orbit by closed forms, and by steps."""
-    return [vijax.find_orbits(PAIR, "LR", guesses=64, membrane=law) for law in (None, Spring())]
+    return [vijax.find_orbits(PAIR, "LR", guesses=64, membrane=law) for law in (None, Plain())]
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +116,7 @@ def test_derivatives_by_numbers_of_the_law_are_those_of_differences(cubic, hertz
 def test_walls_that_differ_have_a_law_each(springs):
     """One law, whose kappa and r are those of either wall."""
     uneven = vijax.impact_pair(0.25, vijax.Sides(30.0, 60.0), vijax.Sides(0.5, 0.4))
-    closed, stepped = (vijax.find_orbits(uneven, "LR", guesses=32, membrane=law) for law in (None, Spring()))
+    closed, stepped = (vijax.find_orbits(uneven, "LR", guesses=32, membrane=law) for law in (None, Plain()))
     assert len(closed) == len(stepped) > 0
     np.testing.assert_allclose(stepped.knots, closed.knots, rtol=0, atol=1e-11)
     slopes = [
@@ -151,7 +134,7 @@ def test_contacts_that_steps_do_not_resolve_make_no_orbit():
     stiff = vijax.impact_pair(0.2, 40.0, 0.5, -0.9)
     side, knots = np.array([[-1]], np.int32), np.array([[[0.5, 0.5, 1.0]]])
     sequence, near = periodic.guessed(side, np.array([2.0]), np.array([False]), knots)
-    rows = jax.tree.map(lambda x: np.asarray(x)[None], replace(stiff, law=Spring()))
+    rows = jax.tree.map(lambda x: np.asarray(x)[None], replace(stiff, law=Plain()))
     assert float(np.asarray(periodic.proven(rows, sequence, near).residual)[0]) > 1e-7
     assert periodic.proven(rows, sequence, near).status[0] == Status.NO_ORBIT
 
@@ -166,7 +149,7 @@ def test_what_is_uncertain_of_a_contact_is_part_of_the_residual(springs, monkeyp
 
 def test_a_ball_that_meets_a_wall_between_is_seen():
     """Impacts on one wall know nothing of the other, which stands in the way of a narrow gap."""
-    wide = vijax.find_orbits(vijax.impact_pair(0.9, 40.0, 0.5), "L", guesses=64, membrane=Spring())
+    wide = vijax.find_orbits(vijax.impact_pair(0.9, 40.0, 0.5), "L", guesses=64, membrane=Plain())
     assert len(wide) == 1
     narrow = replace(wide.pair, d=jnp.full(1, 0.02))
     for pair in (narrow, replace(narrow, law=None)):
@@ -274,11 +257,11 @@ def test_mirror_images_are_not_merged_between_walls_with_laws_of_their_own(uneve
 
 def test_laws_of_two_kinds_are_refused():
     with pytest.raises(ValueError, match="membrane must be of one kind on both sides"):
-        vijax.find_orbits(PAIR, "LR", membrane=vijax.Sides(Cubic(1.0), Spring()))
+        vijax.find_orbits(PAIR, "LR", membrane=vijax.Sides(Cubic(1.0), Plain()))
 
 
 def test_what_a_contact_loses_is_the_determinant_of_its_tangent_map():
     onset = [jnp.asarray(x) for x in (1.0, 0.3, 0.7, 0.08)]
-    lost = [float(contacts.loss(replace(PAIR, law=law), *onset)) for law in (None, Spring())]
+    lost = [float(contacts.loss(replace(PAIR, law=law), *onset)) for law in (None, Plain())]
     assert lost[1] == pytest.approx(lost[0], rel=1e-10)
     assert lost[0] == pytest.approx(float(jnp.exp(-PAIR.mu * 0.08)), rel=1e-14)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Int
 
 from vijax.engine import taylor
 from vijax.engine.driven_events import NONE, Ahead, Decision, DrivenCarry, StepEnd, choose, land, look, residual
-from vijax.engine.driven_rigid import DrivenWall, Rebound, kept, rebound, walls_of, watched
+from vijax.engine.driven_rigid import DrivenWall, Rebound, hit, kept, rebound, walls_of, watched
 from vijax.engine.forcing import REACHED, Draws, Forcing
 from vijax.engine.method import HELD, ImpactOutcome, Method, decided, finished
 from vijax.engine.taylor import Oscillator, Push, Rates
@@ -165,7 +165,7 @@ class Driven(Method[DrivenCarry]):
         m = replace(m, work=work, tangent=tangent, draws=self.forcing.drawn(m.draws, m.k, clock.k))
         ended = landing.exits & m.entered
         if met is not None:
-            m = _hit(m, met, landing, clock, present(rests))
+            m = hit(m, met, landing, (clock.t, clock.n), present(rests))
             side, ended = jnp.where(met.bounces, landing.toward, side), ended | met.bounces
         after = State(side * half, landing.z, clock.t, clock.n, jnp.zeros_like(m.mode))
         outcome = finished(m, side, after, _given(m, after.v, m.work), m.tangent)
@@ -202,27 +202,6 @@ class Driven(Method[DrivenCarry]):
             n=m.n + over.astype(m.n.dtype),
             t=jnp.maximum(2 - left, 0.0),
         )
-
-
-def _hit(m: DrivenCarry, met: Rebound, landing: StepEnd, clock: _Clock, rests: Flag) -> DrivenCarry:
-    """Put an impact at a rigid wall into the carry: onset and end are one, unless the ball stays."""
-    meets, tangent = met.bounces | met.sticks, m.tangent
-    if tangent is not None:
-        a, b, c, d = tangent
-        p, q, r, t = met.tangent
-        hit = (p * a + q * c, p * b + q * d, r * a + t * c, r * b + t * d)
-        # A ball that rested before the run forgets where that was.
-        lost = rests & landing.exits
-        tangent = tuple(jnp.where(lost, 0.0, jnp.where(meets, new, old)) for new, old in zip(hit, tangent, strict=True))
-    return replace(
-        m,
-        tangent=tangent,
-        onset_t=jnp.where(meets, clock.t, m.onset_t),
-        onset_n=jnp.where(meets, clock.n, m.onset_n),
-        v_in=jnp.where(meets, landing.there.z, m.v_in),
-        depth=jnp.where(meets, met.depth, m.depth),
-        work=None if m.work is None else jnp.where(meets, 0.0, m.work),
-    )
 
 
 def _gone_on(m: DrivenCarry, choice: Decision, landing: StepEnd, clock: _Clock, met: Rebound | None) -> DrivenCarry:

@@ -4,12 +4,13 @@ Nothing of a ball at rest moves, so its steps watch the push in place of a displ
 ball leaves where the push falls through 0.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from vijax.engine import taylor
-from vijax.engine.driven_events import Decision, StepEnd
+from vijax.engine.driven_events import Decision, DrivenCarry, StepEnd
 from vijax.engine.exact import STICK_SHARE, stick_speed
 from vijax.engine.forcing import Forcing
 from vijax.engine.taylor import Oscillator, Push, Rates
@@ -41,13 +42,13 @@ def walls_of(pair: ImpactPair) -> DrivenWall | Sides:
 
 
 def _wall(pair: ImpactPair, side: int) -> DrivenWall:
-    here, own = pair.at(side), pair.r is not None and bool(pair.rigid or pair.hard_wall)
+    here = pair.at(side)
     if pair.hard(side):
         zero = jnp.zeros_like(pair.d)
         return DrivenWall(Oscillator(zero, zero, zero, zero + jnp.inf), here.r)
     kappa = here._soft_kappa()
     spring = Oscillator(kappa, kappa * kappa, here.mu, taylor.REACH / kappa)
-    return DrivenWall(spring, here.r if own else None)
+    return DrivenWall(spring, here.r if pair.hard_wall else None)
 
 
 def watched(
@@ -128,3 +129,30 @@ def kept(landing: StepEnd, choice: Decision, rests: Flag) -> StepEnd:
     """Keep a ball at rest where it is: what its step watched is no place of it."""
     still = rests & choice.goes
     return landing._replace(x=jnp.where(still & ~landing.exits, 0.0, landing.x), z=jnp.where(still, 0.0, landing.z))
+
+
+def hit(m: DrivenCarry, met: Rebound, landing: StepEnd, when: tuple[Scalar, Any], rests: Flag) -> DrivenCarry:
+    """Put an impact at a rigid wall into the carry: onset and end are one, unless the ball stays.
+
+    `when` is the phase and the period of the step's end.
+    """
+    t, n = when
+    meets, tangent = met.bounces | met.sticks, m.tangent
+    if tangent is not None:
+        a, b, c, d = tangent
+        p, q, r, s = met.tangent
+        over = (p * a + q * c, p * b + q * d, r * a + s * c, r * b + s * d)
+        # A ball that rested before the run forgets where that was.
+        lost = rests & landing.exits
+        tangent = tuple(
+            jnp.where(lost, 0.0, jnp.where(meets, new, old)) for new, old in zip(over, tangent, strict=True)
+        )
+    return replace(
+        m,
+        tangent=tangent,
+        onset_t=jnp.where(meets, t, m.onset_t),
+        onset_n=jnp.where(meets, n, m.onset_n),
+        v_in=jnp.where(meets, landing.there.z, m.v_in),
+        depth=jnp.where(meets, met.depth, m.depth),
+        work=None if m.work is None else jnp.where(meets, 0.0, m.work),
+    )
