@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from vijax import plots, sweep
@@ -153,6 +153,8 @@ def test_a_tongue_that_only_a_neighbour_met_is_followed():
 
 
 @given(seed=st.integers(0, 10**6), levels=st.integers(1, 3), shape=st.tuples(*[st.integers(33, 50)] * 2))
+@example(seed=1, levels=2, shape=(35, 34))  # narrow blocks at the ends, whose corners only their neighbours ask for
+@example(seed=53, levels=3, shape=(35, 34))
 @settings(max_examples=15)
 def test_nothing_computed_contradicts_what_is_filled(seed, levels, shape):
     """Brute force over all blocks of all levels: either they are computed to the last cell, or they are of one kind."""
@@ -186,9 +188,7 @@ def test_nothing_computed_contradicts_what_is_filled(seed, levels, shape):
             x, y = ((ranks - ranks[0]) / (ranks[-1] - ranks[0]) for ranks in (np.arange(a, b + 1), np.arange(c, d + 1)))
             logs = np.log(power[ends])
             guess = np.stack([1 - x, x]).T @ logs @ np.stack([1 - y, y])
-            # A narrow block at the end of an axis may have corners that only its neighbours asked for: it was judged as
-            # a part of the block around it.
-            assert (abs(guess - np.log(power[inside]))[known[inside]] <= 2 * refine.TOLERANCE).all()
+            assert (abs(guess - np.log(power[inside]))[known[inside]] <= refine.TOLERANCE).all()
 
 
 def test_status_alone_makes_a_border():

@@ -149,6 +149,11 @@ def rounds(mesh: Mesh, found: Found, level_ground: np.ndarray) -> Iterator[Cells
             # Blocks that a missed one is split into may miss too, and nothing has been computed in them yet.
             if level - 1 in fronts:
                 fronts[level - 1].mark(new[missed])
+        for level, front in fronts.items():
+            # What lies in these was computed before their corners were.
+            past = front.surrounded(known)
+            unlike, missed = _surprises(mesh, found, level_ground, past, level)
+            front.mark(past[unlike | missed])
         wanted = np.zeros(known.size, bool)
         # The finest first: children are looked at a round later, when their corners are known.
         for level, front in fronts.items():
@@ -174,6 +179,24 @@ class _Front:
         sides = [self.mesh.blocks(axis, self.level, rank) for axis, rank in enumerate(self.mesh.ranks_of(cells))]
         for block in itertools.product(*sides):
             self.bad[block] = True
+
+    def surrounded(self, known: np.ndarray) -> Cells:
+        """Take blocks as there whose corners are known though none was split into them; give the known cells in them.
+
+        So it is with blocks at the end of an axis that are too narrow to have a point within: others asked for theirs.
+        """
+        size = self.there.shape
+        corners = (
+            tuple(slice(i, i + n) for i, n in zip(place, size, strict=True))
+            for place in itertools.product((0, 1), repeat=len(size))
+        )
+        blocks = np.all([known[self.points[corner]] for corner in corners], axis=0) & ~self.there
+        self.there |= blocks
+        if not blocks.any():
+            return np.empty(0, int)
+        cells = np.flatnonzero(known)
+        sides = [self.mesh.blocks(axis, self.level, rank) for axis, rank in enumerate(self.mesh.ranks_of(cells))]
+        return cells[np.any([blocks[block] for block in itertools.product(*sides)], axis=0)]
 
     def split(self, found: Found, level_ground: np.ndarray) -> np.ndarray:
         """Find the blocks to split now: those on a border and their neighbours, and those that a cell contradicts."""
