@@ -160,7 +160,7 @@ def orbits() -> Iterator[Figure]:
 
 
 def kernels() -> Iterator[Figure]:
-    """Count the kernels of a trip, and what a step moves and computes: of the optimised program of a level plane."""
+    """Say how a level plane is compiled, what it holds, and what a step moves and computes if it is stored."""
     import jax
 
     from vijax.batch import cell_program, lanes, rows, simulate
@@ -190,9 +190,8 @@ def kernels() -> Iterator[Figure]:
     memory = made.memory_analysis()
     held = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
     yield f"memory of a tile of {cells:,} cells", held / 2**20, "MiB"
-    if jax.default_backend() != "cpu" and (counted := kernels_of_a_trip(made.as_text())):
-        yield "kernels of a trip of all lanes", counted[0], "kernels"
-        yield "copies of a trip", counted[1], "copies"
+    held = made.as_text().count('custom_call_target="__gpu$xla.gpu.triton"')
+    yield "kernels in which lanes stay in registers", held, "kernels"
     first = jax.ShapeDtypeStruct((width, table.shape[1]), kind)
     lane = jax.eval_shape(lambda first, settings: cell_program.program(plan, settings).load(first), first, settings)
     one_step = jax.jit(lambda cell, settings: cell_program.program(plan, settings).step(cell))
@@ -201,21 +200,6 @@ def kernels() -> Iterator[Figure]:
         most, told = _PEAK[name]
         yield f"{name} of a step of a lane, by XLA", costs[name] / width, "a step"
         yield f"time of a step of a lane at {told}", 1e9 * costs[name] / width / most, "ns"
-
-
-def kernels_of_a_trip(program: str) -> tuple[int, int] | None:
-    """Count fusions and copies in the loop that takes all lanes some steps, in an accelerator's program; else None.
-
-    It is the one whose trips XLA knows and in which the most is done.
-    """
-    bodies = re.findall(r'body=%([\w.-]+)[^\n]*"known_trip_count"', program)
-    counts = []
-    for body in bodies:
-        text = re.search(rf"^%{re.escape(body)} [^\n]*{{\n(.*?)^}}", program, re.M | re.S)
-        if text:
-            found = re.findall(r"calls=|\bcopy\(", text[1])
-            counts.append((len(text[1]), found.count("calls="), found.count("copy(")))
-    return max(counts)[1:] if counts else None
 
 
 def tests(seconds: float) -> Iterator[Figure]:

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Array, Bool, Float
 
-from vijax.batch import lanes
-from vijax.runtime import tiles
+from vijax.batch import lane_rounds, lanes
+from vijax.runtime import registers, tiles
 
 Lane = Float[Array, "lane"]
 
@@ -95,14 +95,14 @@ def review(toy):
     )
 
 
-PROGRAM = lanes.Program(
+PROGRAM = lane_rounds.Program(
     load=load,
     step=step,
     review=review,
     stopped=lambda toy: toy.left <= 0,
     done=lambda toy: toy.done,
     unload=lambda toy: jnp.stack([toy.name, toy.hash, toy.careful], axis=1),
-    service=lanes.Service(
+    service=lane_rounds.Service(
         declined=lambda toy: toy.declined,
         hard=lambda toy: toy.hard,
         request=lambda toy: toy,
@@ -166,6 +166,22 @@ def test_an_accelerator_is_given_no_kernels_and_the_same_results(monkeypatch):
 
     assert "xla_cpu" not in as_there.lower(jnp.asarray(cells)).as_text()
     assert np.array_equal(as_there(jnp.asarray(cells)), [plain(row) for row in cells])
+
+
+def test_lanes_that_stay_in_registers_give_the_same_results(monkeypatch):
+    """Its kernels are interpreted here: lanes are stepped and reviewed block by block, and served all together."""
+    cells = draw(600, [EASY, DECLINES, HARD])
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    blocks, stay = [], registers.stay
+
+    def interpreted(work, at):
+        blocks.append(at.cell.size // registers.LANES)
+        return stay(work, at, interpret=True)
+
+    monkeypatch.setattr(lane_rounds.registers, "stay", interpreted)
+    found = jax.jit(lambda cells: lanes.run(PROGRAM, cells, jnp.asarray(600, jnp.int32), OUTPUTS, 256))(cells)
+    assert blocks == [2]
+    assert np.array_equal(found, [plain(row) for row in cells])
 
 
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 599, 600])

@@ -14,7 +14,8 @@ from vijax.model import quantities, variables
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.orbits.parameter import MOVED
-from vijax.planes.axes import Axes, Parameters, cells, parse_axis
+from vijax.planes.axes import Axes, Parameters, parse_axis
+from vijax.planes.cells import cells
 from vijax.planes.orbit_diagram import plan
 from vijax.plots import branch_diagrams, orbit_diagrams
 

@@ -19,7 +19,8 @@ from vijax.model.laws import HuntCrossley
 from vijax.model.records import Status
 from vijax.planes import dataset
 from vijax.planes import sweep as sweeps
-from vijax.planes.axes import cells, parse_axis
+from vijax.planes.axes import parse_axis
+from vijax.planes.cells import cells
 from vijax.planes.sweep import load, save, sweep
 
 LONG = 40  # periods: enough for the 1:1 orbits of these tests

@@ -12,7 +12,7 @@ from vijax.model.device import told_device
 from vijax.model.pair import pair_of
 from vijax.orbits.map_borders import device_of
 from vijax.planes import sweep as sweeps
-from vijax.planes.axes import cells
+from vijax.planes.cells import cells
 
 D, KAPPA = np.array([0.2, 0.25]), np.array([30.0, 60.0, 90.0])
 NUMBERS = "P", "period", "impacts_left", "impacts_right", "max_penetration", "energy_ratio", "contact_time", "status"

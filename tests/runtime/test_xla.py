@@ -99,7 +99,7 @@ def test_xla_is_asked_for_no_option_that_it_does_not_know(version, known, monkey
 
 
 @ON_CPU
-@pytest.mark.parametrize(("lanes", "whole"), [(1, 64), (64, 64), (65, 128), (512, 512)])
+@pytest.mark.parametrize(("lanes", "whole"), [(1, 1), (32, 32), (64, 64), (65, 128), (512, 512)])
 def test_lanes_come_in_whole_blocks(lanes, whole):
     assert whole_blocks(lanes) == whole
 

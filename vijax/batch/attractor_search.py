@@ -12,7 +12,7 @@ from vijax.batch.recurrence import LATE_PERIOD, MAX_PERIOD, grain, late_recurren
 from vijax.batch.verdict import Correction, Verdict, correction, judge
 from vijax.engine.impact import Ball, LaneImpact
 from vijax.model.records import Status
-from vijax.runtime.arrays import choose, present
+from vijax.runtime.arrays import choose, nearest, present
 from vijax.runtime.xla import share
 
 # A late cell, whose periods are spent without a verdict, is followed for such a share of them, to see whether it comes
@@ -54,7 +54,7 @@ def recur(settings: Settings, cell: Cell, impact: LaneImpact, kept: Mask, count:
     if c is None:
         return None, jnp.zeros_like(kept)
     lag = (impact.onset_n - c.anchor_n) + 0.5 * (impact.onset_t - c.anchor_t)  # counted in forcing periods
-    period = jnp.round(lag)
+    period = nearest(lag)
     near = (2 * jnp.abs(lag - period) + jnp.abs(impact.v_in - c.anchor_v) < c.tolerance) & (period >= 1)
     found = kept & ~c.tracing & near & (period <= jnp.where(c.late, LATE_PERIOD, MAX_PERIOD))
     fresh = kept & ~c.tracing & ~found & (count >= c.next_anchor)

@@ -3,6 +3,8 @@
 Where an attractor is sought, the search decides too: `attractor_search.review`.
 """
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Int
 
@@ -55,7 +57,7 @@ def ended(cell: Cell, event: Event, count: Lane, end: Lane) -> tuple[Int[AnyArra
 def growth(cell: Cell) -> Lane:
     """Give the growth of the tangent map over the window so far, in powers of e."""
     a, b, c, d = present(cell.tangent)
-    return jnp.log(jnp.abs(a) + jnp.abs(b) + jnp.abs(c) + jnp.abs(d)) + present(cell.exponent) * jnp.log(TANGENT_SCALE)
+    return jnp.log(jnp.abs(a) + jnp.abs(b) + jnp.abs(c) + jnp.abs(d)) + present(cell.exponent) * math.log(TANGENT_SCALE)
 
 
 def chaotic(cell: Cell) -> Mask:

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from vijax.batch import advance, chain, lanes, rows, solver_steps
+from vijax.batch import advance, chain, lane_rounds, rows, solver_steps
 from vijax.batch.attractor_search import blank_candidate, review
 from vijax.batch.cell import Cell, Entry, Plan, Settings, blank_tally
 from vijax.batch.summary import unload
@@ -66,10 +66,10 @@ def entry_shapes(plan: Plan, dtype: Any) -> Entry:
     return Entry(pair, length=one, speed=one, u=one, v=one, t=one if plan.chained else None, device=device)
 
 
-def program(plan: Plan, settings: Settings) -> lanes.Program:
+def program(plan: Plan, settings: Settings) -> lane_rounds.Program:
     """Make what lanes are told of a cell."""
     entry, method = entry_shapes(plan, settings.periods.dtype), settings.method
-    cells = lanes.Program(
+    cells = lane_rounds.Program(
         load=lambda table: load(plan, settings, rows.unpack(table, entry)),
         step=partial(advance.step, plan, settings),
         review=partial(review, plan, settings),
@@ -83,9 +83,10 @@ def program(plan: Plan, settings: Settings) -> lanes.Program:
             review=partial(solver_steps.review_steps, method, plan, settings),
             steps=solver_steps.STEPS,
             arithmetic=method.arithmetic,
+            numbers=False,
         )
     return cells._replace(
-        service=lanes.Service(
+        service=lane_rounds.Service(
             declined=lambda cell: cell.declined,
             hard=lambda cell: cell.hard,
             request=partial(advance.request, plan, settings),

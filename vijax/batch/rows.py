@@ -23,7 +23,7 @@ def pack(record: Any, leading: int = 1) -> Float[Array, "... column"]:
     """
     leaves = jax.tree.leaves(record)
     kind = next(leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating))
-    flat = [leaf.reshape(*leaf.shape[:leading], -1).astype(kind) for leaf in leaves]
+    flat = [leaf.reshape(*leaf.shape[:leading], -1).astype(kind, copy=False) for leaf in leaves]
     return jnp.concatenate(flat, axis=-1)
 
 

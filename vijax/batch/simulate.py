@@ -56,11 +56,12 @@ def compiled(plan: Plan, width: int) -> export_cache.TracedProgram:
 
 @lru_cache(maxsize=32)
 def _compiled_most(plan: Plan, width: int, few: int) -> export_cache.TracedProgram:
-    """Compile the program of a plan that ends when so few cells are left; see `stragglers`."""
+    """Compile the program of a plan that ends when so few cells are left (see `stragglers`), with columns as rows."""
 
     def tile(cells, count, settings):
         outputs = rows.width(shapes(plan, cells.dtype))
-        return lanes.run_most(program(plan, settings), cells, count, outputs, width, few)
+        results, left = lanes.run_most(program(plan, settings), cells, count, outputs, width, few)
+        return results.T, left
 
     return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width} {few}")
 
@@ -108,6 +109,7 @@ def summarise(
     outputs: frozenset[str] = frozenset({"P"}),
     method: Method | None = None,
     count: int | None = None,
+    padded: int | None = None,
     on: jax.Device | None = None,
 ) -> Summary:
     """Run a tile of cells from phase 0, each until its attractor is certain or its window is over, in one jitted call.
@@ -122,7 +124,8 @@ def summarise(
         transient: Periods before the window ("window" only).
         outputs: Names of `Summary` fields that must be there; what only others need is not computed.
         method: The stepping method (`method_choice.choose` makes it); None for the exact engine.
-        count: How many cells are real, the rest being padding; all unless given.
+        count: How many cells are real, the rest being padding; all unless given. With 0 the program is compiled.
+        padded: How many rows the compiled call has, the first cell filling it up; as many as cells unless given.
         on: The device that runs them; JAX's default unless given.
 
     Returns:
@@ -156,29 +159,45 @@ def summarise(
         # Not what decides the motion, or what is admissible: a device with a limit needs no other program.
         device=jax.tree.map(lambda x: jnp.asarray(x, dtype), electrical(device)),
         method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
-        length_variant=scale.length_variant.astype(dtype),
-        speed_variant=scale.speed_variant.astype(dtype),
+        length_variant=jnp.asarray(scale.length_variant, dtype),
+        speed_variant=jnp.asarray(scale.speed_variant, dtype),
     )
-    given = cells, jnp.asarray(count, jnp.int32), settings
-    given = given if on is None else jax.device_put(given, on)
-    return _run(plan, *given)
+    if more := checks.whole("padded", cells.shape[0] if padded is None else padded, cells.shape[0]) - cells.shape[0]:
+        cells = jnp.concatenate([cells, jnp.broadcast_to(cells[:1], (more, cells.shape[1]))])
+    number = jnp.asarray(count, jnp.int32)
+    if on is not None:
+        cells, number, settings = jax.device_put((cells, number, settings), on)
+    return _run(plan, cells, number, settings, read=count > 0)
 
 
-def _run(plan: Plan, cells: Float[AnyArray, "cell in"], count: Int[AnyArray, ""], settings: Settings) -> Summary:
-    """Make the summary of a tile, of NumPy's arrays."""
+def _run(
+    plan: Plan,
+    cells: Float[AnyArray, "cell in"],
+    count: Int[AnyArray, ""],
+    settings: Settings,
+    read: bool = True,
+) -> Summary:
+    """Make the summary of a tile, of NumPy's arrays; an empty one where it is not read."""
     width, like = lanes.width_of(cells.shape[0]), shapes(plan, cells.dtype)
+    nothing = np.zeros((0, rows.width(like)), cells.dtype)
     # What a lane of a method carries need not be a row of numbers.
     few = stragglers.most() if settings.method is None else 0
     if not few:
-        return rows.unpack(np.asarray(compiled(plan, width)(cells, count, settings)), like)
+        table = jax.block_until_ready(compiled(plan, width)(cells, count, settings))
+        return rows.unpack(np.asarray(table) if read else nothing, like)
     with context.pool(1) as beside:
         ready = beside.submit(stragglers.prepare, plan, settings)  # compiled while the other program is
-        table, left = jax.tree.map(np.asarray, _compiled_most(plan, width, few)(cells, count, settings))
+        columns, left = _compiled_most(plan, width, few)(cells, count, settings)
         ready.result()
-    found, real = rows.unpack(table, like), left.cell >= 0
-    rest = rows.unpack(stragglers.finish(plan, settings, left.lanes[real]), like)
+        if not read:
+            return rows.unpack(nothing, like)
+        cell, lane = np.asarray(left.cell), np.asarray(left.lanes)
+        real = cell >= 0
+        last = beside.submit(stragglers.finish, plan, settings, lane[real])
+        found = rows.unpack(np.asarray(columns).T, like)  # copied from the accelerator while the cores fly
+        rest = rows.unpack(last.result(), like)
     for field, values in zip(jax.tree.leaves(found), jax.tree.leaves(rest), strict=True):
-        field[left.cell[real]] = values
+        field[cell[real]] = values
     return found
 
 

@@ -20,6 +20,8 @@ from vijax.runtime import context, export_cache, tiles, xla
 # Cells that a core takes over. With half as many an H100 works a twentieth of a second longer for 1024 x 1024 cells,
 # and the 16 cores of its host are done no sooner.
 _EACH = 512
+# Lanes of a core: with 64 the last cells, which have the most impacts to go, would be waited for longer.
+_LANES = 32
 
 
 def most() -> int:
@@ -50,7 +52,7 @@ def _compiled(plan: Plan) -> export_cache.TracedProgram:
     def finish(table, count, settings):
         kind = table.dtype
         cells = lanes.resumed(cell_program.program(plan, settings), _entry(plan, kind))
-        return lanes.run(cells, table, count, rows.width(shapes(plan, kind)), lanes.width_of(_EACH))
+        return lanes.run(cells, table, count, rows.width(shapes(plan, kind)), _LANES)
 
     return export_cache.TracedProgram(finish, f"{finish.__qualname__} {plan}")
 

@@ -1,5 +1,6 @@
 """What a finished round says of its candidate: Newton's correction of where it began, and whether that is the orbit."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -97,7 +98,7 @@ def judge(settings: Settings, cell: Cell, newton: Correction, judged: Mask) -> V
 
 def correction(cell: Cell, method: Method | None) -> Correction:
     """Compute Newton's correction of the round's start, by the tangent map of the round."""
-    c, grown = present(cell.candidate), jnp.exp(present(cell.exponent) * jnp.log(TANGENT_SCALE))
+    c, grown = present(cell.candidate), jnp.exp(present(cell.exponent) * math.log(TANGENT_SCALE))
     p, q, r, s = (entry * grown for entry in present(cell.tangent))
     # The round ended at an exit; fly on (or back) to the phase at which it began.
     rest = 2 * (c.base.n + c.laps * c.period - cell.ball.n) + (c.base.t - cell.ball.t)

@@ -83,7 +83,7 @@ def at_one_point(
     """Find the pair that the axes give, each by one number, and the device that has it."""
     from vijax.model.device import realised
     from vijax.model.pair import WALLS
-    from vijax.planes.axes import cells
+    from vijax.planes.cells import cells
     from vijax.runtime import checks
 
     for name, values in axes.items():

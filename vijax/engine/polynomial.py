@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.model.flow import PI, horner
-from vijax.runtime.arrays import Lane
+from vijax.runtime.arrays import Lane, nearest
 from vijax.runtime.xla import once, shared
 
 # Sine and cosine hold up to so many radians: a quarter turn is 1.571, and contacts are looked at a little beyond. A
@@ -92,7 +92,7 @@ def long_decay(x: Lane) -> Lane:
 @once
 def phase(t: Lane) -> tuple[Lane, Lane]:
     """Compute sin(pi t) and cos(pi t) for t in [0, 2]."""
-    quadrant = jnp.round(2 * t)
+    quadrant = nearest(2 * t)
     sine, cosine = sine_cosine(PI * (t - 0.5 * quadrant))
     odd, back = (quadrant == 1) | (quadrant == 3), (quadrant == 2) | (quadrant == 3)
     sine, cosine = jnp.where(odd, cosine, sine), jnp.where(odd, -sine, cosine)

@@ -11,7 +11,7 @@ from vijax.model.device import Harvester, realised, told_device
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import AXES, START, START_REACH, of_both_walls, synonyms
 from vijax.model.sides import field_of
-from vijax.planes.axes import cells
+from vijax.planes.cells import cells
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots.cells import edges
 from vijax.plots.style import LABEL_NEEDS

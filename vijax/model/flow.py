@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from vijax.model.pair import ImpactPair
 from vijax.model.restitution import calibrated
-from vijax.runtime.arrays import Values
+from vijax.runtime.arrays import Values, nearest
 from vijax.runtime.xla import once, share, shared
 
 PI = math.pi
@@ -100,7 +100,7 @@ def half_turn(s: Float[Array, "..."]) -> tuple[Float[Array, "..."], ...]:
     Args:
         s: Half turns, any finite number; reduced by quadrants, so that sin(pi k/2) and cos(pi k/2) are exact.
     """
-    quadrant = jnp.round(2 * s)
+    quadrant = nearest(2 * s)
     x = PI * (s - 0.5 * quadrant)
     square = x * x
     versine = square * horner(_VERSINE, square)

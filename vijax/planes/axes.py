@@ -1,29 +1,24 @@
-"""Axes of a sweep: text -> values -> the quantities that the dynamics and the energies of every cell depend on.
+"""Axes of a sweep: text -> values.
 
-This is the door of `sweep.sweep` and of the scripts: whatever can be wrong with an axis is found here.
+This is the door of `sweep.sweep` and of the scripts: whatever can be wrong with an axis is found here, what can be with
+several together in `cells`.
 """
 
 import errno
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
 from vijax.model import units
-from vijax.model.choices import Walls
-from vijax.model.device import WALLS_OWN, Harvester
-from vijax.model.pair import RIGID_ON, ImpactPair, pair_of
-from vijax.model.quantities import AXES, SIDES, START, START_REACH, check, of_both_walls, synonyms, whole
-from vijax.model.sides import Sides
+from vijax.model.quantities import check
 from vijax.model.units import Given
 from vijax.runtime import checks
 from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 
 class Parameters(TypedDict, total=False):
@@ -59,9 +54,6 @@ class Axes(Parameters, total=False):
 _FORMS = "a number, a comma list, LO:HI:N, LO:HI:N:log or @FILE"
 # The most values of an axis: the largest planes have some 10^6 a side, and more are taken for a slip of the finger.
 _MOST_VALUES = 10**7
-# The most cells of a plane, whose store would be some 80 TB then.
-_MOST_CELLS = 10**12
-_BYTES = 8  # Of a number, as quantities of cells are held.
 # Bytes of the largest file of an axis that is read: 32 characters a value are more than any number needs.
 _MOST_TEXT = 32 * _MOST_VALUES
 
@@ -164,225 +156,3 @@ def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarra
     array = array.astype(np.float64)
     check(quantity or name, array, name)
     return array
-
-
-@dataclass(frozen=True)
-class Cells:
-    """The cells of a sweep: which dimensions the dynamics see, and what each cell and each variant of it is.
-
-    Attributes:
-        given: The axes as they were given.
-        sizes: Length of every dimension, in the order given.
-        dynamic: Dimensions that the dynamics depend on: one simulation for each of their points.
-        variant: The other dimensions, which enter the energies alone.
-        quantities: d, kappa, r, gamma, u0, v0, omega [rad/s] and A [m/s^2], each over the dimensions it depends on;
-            where the walls may differ, kappa_left, kappa_right, r_left and r_right.
-        length: Metres per unit of displacement (rigid wall: of speed over omega0, the engine's depth).
-        speed: Metres per second per unit of velocity.
-    """
-
-    given: "dict[str, xr.Variable]"
-    sizes: dict[str, int]
-    dynamic: tuple[str, ...]
-    variant: tuple[str, ...]
-    quantities: "dict[str, xr.Variable]"
-    length: "xr.Variable"
-    speed: "xr.Variable"
-
-    @property
-    def pair_names(self) -> tuple[str, ...]:
-        """Name the quantities of the pair."""
-        return tuple(name for name in self.quantities if whole(name) in ("d", "kappa", "r", "gamma"))
-
-    @property
-    def unequal(self) -> bool:
-        """Say whether the walls may differ."""
-        return "r_left" in self.quantities
-
-    def pair(self, index: np.ndarray, wall: Walls) -> ImpactPair:
-        """Make the pair of the cells with the given flat indices, of NumPy's arrays."""
-        return pair_of({name: self.flat(self.quantities[name], index) for name in self.pair_names}, wall)
-
-    @property
-    def count(self) -> int:
-        """Count the simulations."""
-        return math.prod(self.sizes[dim] for dim in self.dynamic)
-
-    def flat(self, quantity: "xr.Variable", index: np.ndarray) -> np.ndarray:
-        """Take a quantity's values in the cells with the given flat indices; variants at their first point."""
-        first = quantity.isel({dim: 0 for dim in self.variant if dim in quantity.dims})
-        if not first.dims:
-            return np.broadcast_to(first.values, index.shape)
-        # A quantity is never laid out over all dimensions at once, as a plane may be larger than memory.
-        places = np.unravel_index(index, [self.sizes[dim] for dim in self.dynamic])
-        place = dict(zip(self.dynamic, places, strict=True))
-        return np.broadcast_to(first.values[tuple(place[str(dim)] for dim in first.dims)], index.shape)
-
-    def cut(self, block: Mapping[str, slice]) -> "Cells":
-        """Cut a block out of the cells, the other dimensions whole."""
-
-        def within(variable: "xr.Variable") -> "xr.Variable":
-            return variable.isel({dim: part for dim, part in block.items() if dim in variable.dims})
-
-        return replace(
-            self,
-            given={name: within(values) for name, values in self.given.items()},
-            sizes={dim: len(range(size)[block.get(dim, slice(None))]) for dim, size in self.sizes.items()},
-            quantities={name: within(values) for name, values in self.quantities.items()},
-            length=within(self.length),
-            speed=within(self.speed),
-        )
-
-    def factors(self, scale: "xr.Variable") -> np.ndarray:
-        """Find by which factors variants change a scale: the same in every cell, as scales are products over axes."""
-        first = scale.isel({dim: 0 for dim in self.dynamic if dim in scale.dims})
-        full = first.set_dims({dim: self.sizes[dim] for dim in self.variant}).transpose(*self.variant)
-        return np.ravel(full.values / full.values.flat[0])
-
-
-def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: bool = True) -> Cells:
-    """Lay out the cells of a sweep over the given axes; a quantity that no axis gives is the device's.
-
-    Without `restitution`, of a membrane whose loss is not told by r, there is no axis r, and r is NaN.
-
-    Raises:
-        ValueError: If a value is not allowed, two axes give one quantity, or a start lies outside a rigid gap.
-        TypeError: If there is no axis of a given name.
-    """
-    import xarray as xr  # here, as importing vijax must not load it
-
-    for name in given:
-        if name not in AXES:
-            raise TypeError(f"there is no axis {name!r}; the axes are {', '.join(AXES)}")
-    for several in dict.fromkeys(map(synonyms, AXES)):
-        rivals = [name for name in several if name in given]
-        if len(rivals) > 1:
-            raise ValueError(f"{' and '.join(rivals)} give the same quantity; give one of them")
-    for name in given:
-        both = of_both_walls(name)
-        for rival in synonyms(both) if both else ():
-            if rival in given:
-                raise ValueError(f"{rival} and {name} give the same quantity; give one for both walls, or one for each")
-        if whole(name) == "r" and not restitution:
-            raise ValueError(
-                f"{name} must be left out with a membrane that has no restitution; got {checks.shown(given[name])}"
-            )
-    arrays = {name: check_axis(name, values) for name, values in given.items()}
-    values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
-    sizes = {name: array.size for name, array in arrays.items() if array.ndim}
-    _check_sizes(sizes)
-    quantities = _quantities(values, device, wall, xr)
-    if not restitution:
-        quantities |= {name: xr.Variable((), np.nan) for name in quantities if whole(name) == "r"}
-    if wall != "soft":
-        _check_start(quantities["d"], quantities["u0"], wall)
-    stiff = [name for name in quantities if whole(name) == "kappa"]
-    energies = {"omega", "A", *(stiff if wall == "rigid" else ())}
-    motion = [quantity for name, quantity in quantities.items() if name not in energies]
-    dynamic = tuple(dim for dim in sizes if any(dim in quantity.dims for quantity in motion))
-    length = quantities["A"] * math.pi**2 / quantities["omega"] ** 2
-    return Cells(
-        given=values,
-        sizes=sizes,
-        dynamic=dynamic,
-        variant=tuple(dim for dim in sizes if dim not in dynamic),
-        quantities=quantities,
-        length=length / quantities[stiff[0]] if wall == "rigid" else length,
-        speed=quantities["A"] * math.pi / quantities["omega"],
-    )
-
-
-def _check_sizes(sizes: dict[str, int]) -> None:
-    """Raise unless there is room for the quantities that follow from several axes, and for the indices of cells."""
-    stiff = [(f"omega0_{side}", f"k_{side}", "omega") for side in SIDES]
-    for rows in (("s", "omega", "A"), ("omega0", "k", "omega"), *stiff, ("beta", "A")):
-        along = [name for name in rows if name in sizes]
-        checks.fits(along, _BYTES * math.prod(sizes[name] for name in along), "the quantities of cells")
-    if (count := math.prod(sizes.values())) > _MOST_CELLS:
-        names = checks.joined(name for name, size in sizes.items() if size > 1)
-        raise ValueError(
-            f"{names} must make at most {_MOST_CELLS:.0e} cells; got {count:.1e}; cut the plane into several"
-        )
-
-
-def _quantities(values: "dict[str, xr.Variable]", device: Harvester, wall: str, xr: Any) -> "dict[str, xr.Variable]":
-    def own(name: str) -> "xr.Variable":
-        if name in values:
-            return values[name]
-        return xr.Variable((), check_axis(name, getattr(device, name)))
-
-    omega, amplitude, beta = own("omega"), own("A"), own("beta")
-    d = values["d"] if "d" in values else own("s") * omega**2 / (amplitude * math.pi**2)
-    # A level tube has gamma = 0 whatever A is: dividing would make an energy-only axis a dynamic one.
-    tilt = float(device.g) * np.sin(beta)
-    gamma = values["gamma"] if "gamma" in values else (tilt / amplitude if tilt.values.any() else tilt)
-    return {
-        "d": d,
-        **_of_walls(values, device, omega, wall, xr),
-        "gamma": gamma,
-        "u0": values["u0"] if "u0" in values else np.minimum(START[0], START_REACH * d),
-        "v0": values["v0"] if "v0" in values else xr.Variable((), START[1]),
-        "omega": omega,
-        "A": amplitude,
-    }
-
-
-def _of_walls(
-    values: "dict[str, xr.Variable]", device: Harvester, omega: "xr.Variable", wall: str, xr: Any
-) -> "dict[str, xr.Variable]":
-    """Give kappa and r: of both walls, or of each where anything may differ."""
-    if wall == "rigid":
-        _check_rigid(values, device)
-    if wall in RIGID_ON:
-        _check_rigid_side(values, wall)
-    unequal = device.unequal or wall in RIGID_ON or any(map(of_both_walls, values))
-    table = {}
-    for side, end in ((-1, "_left"), (1, "_right")) if unequal else ((1, ""),):
-        own = device.at(side)
-
-        def given(name: str, end: str = end) -> "xr.Variable | None":
-            return values.get(name + end, values.get(name))
-
-        def constant(name: str, value: Any, end: str = end) -> "xr.Variable":
-            return xr.Variable((), check_axis(name + end, value, name))
-
-        r, kappa, omega0, k = (given(name) for name in ("r", "kappa", "omega0", "k"))
-        if kappa is None:
-            natural = np.sqrt(k / float(device.m_b)) if k is not None else omega0
-            kappa = (constant("omega0", own.omega0) if natural is None else natural) * math.pi / omega
-        table["kappa" + end] = xr.Variable((), np.inf) if end and wall == f"rigid{end}" else kappa
-        table["r" + end] = constant("r", own.r) if r is None else r
-    return dict(sorted(table.items()))
-
-
-def _check_rigid_side(values: "dict[str, xr.Variable]", wall: str) -> None:
-    """Raise ValueError where a rigid wall beside a soft one is given a membrane, which it has not."""
-    side = wall.removeprefix("rigid_")
-    for name in values:
-        if name.endswith(f"_{side}") and of_both_walls(name) in synonyms("kappa"):
-            raise ValueError(
-                f'{name} must be left out with wall="{wall}", whose {side} wall has no membrane; '
-                f"got {checks.shown(values[name].values)}"
-            )
-
-
-def _check_rigid(values: "dict[str, xr.Variable]", device: Harvester) -> None:
-    """Raise ValueError where two rigid walls are given two membranes: they are lent the depth of one."""
-    for name in values:
-        if of_both_walls(name) not in ("", "r"):
-            raise ValueError(
-                f"{name} must be left out of rigid walls, which are lent the depth of one membrane; "
-                f"got {checks.shown(values[name].values)}; give {of_both_walls(name)}"
-            )
-    for name in WALLS_OWN:
-        if name != "r" and isinstance(getattr(device, name), Sides):
-            raise ValueError(f"device.{name} must be one number for rigid walls, lent one membrane; got Sides")
-
-
-def _check_start(d: "xr.Variable", u0: "xr.Variable", wall: str) -> None:
-    beyond = {"rigid_left": -u0, "rigid_right": u0}.get(wall, abs(u0))
-    room = 0.5 * d - beyond
-    first = np.argmin(room.values >= 0)
-    if room.values.flat[first] < 0:
-        got = [float((0 * room + value).values.flat[first]) for value in (u0, d)]
-        raise ValueError(f"u0 must lie in the gap of a rigid wall, |u0| <= d/2; got {got[0]:g} where d = {got[1]:g}")

@@ -19,7 +19,8 @@ from vijax.model.pair import symmetric
 from vijax.model.units import Given
 from vijax.planes import sweep
 from vijax.planes.attractor_marks import ENDED, INVARIANTS, SAME, invariants, kinds
-from vijax.planes.axes import Parameters, cells, check_axis
+from vijax.planes.axes import Parameters, check_axis
+from vijax.planes.cells import cells
 from vijax.planes.dataset import DEFAULT, SweepPlan
 from vijax.planes.start_places import start_places
 from vijax.planes.sweep_settings import MOST_STARTS, SPEED, START_POINTS, STARTS, SweepSettings

@@ -21,7 +21,7 @@ from vijax.model.device import CONSTANTS, Harvester
 from vijax.model.quantities import AXES
 from vijax.model.records import Status
 from vijax.model.sides import Sides, named
-from vijax.planes.axes import Cells
+from vijax.planes.cells import Cells
 from vijax.planes.expected import NEEDS, ManyStarts
 from vijax.planes.outputs import VARIED, Found, Output, needs, table
 from vijax.planes.sweep_settings import SweepSettings

@@ -8,14 +8,14 @@ import threading
 import time
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vijax.batch import simulate
 from vijax.planes import tile_size
+from vijax.planes.cells import Places
 from vijax.planes.dataset import SweepPlan
 from vijax.planes.expected import NEEDS, ManyStarts
 from vijax.planes.start_places import start_places
@@ -141,8 +141,12 @@ def perform(call: Call, place: jax.Device, stopped: threading.Event | None = Non
 
 def prepare(call: Call, place: jax.Device) -> None:
     """Compile what a call needs, without running a cell. Threads that ask for the same wait for one, by `jax.jit`."""
+    of = call.planned.cells
     for part in _kinds(call):
-        _summarise(call, call.cells[part], 0, place)
+        # The steepest cell stands for all: which program they have depends on it, and on how many they are.
+        cells = call.cells[part]
+        steepest = np.argmax(np.abs(of.flat(of.quantities["gamma"], cells)))
+        _summarise(call, cells[steepest : steepest + 1], 0, place)
 
 
 def _kinds(call: Call) -> list[np.ndarray]:
@@ -157,12 +161,14 @@ def _summarise(
 ) -> Fields:
     """Compute fields for the first `count` of these cells, from the one start of each or from many."""
     planned = call.planned
-    of, rows = planned.cells, np.resize(index, call.rows)
+    # Where no cell is run, one is laid out; and JAX would compile the padding of every number of cells.
+    of = planned.cells
+    rows = of.places(np.resize(index, call.rows) if count else index)
     if planned.starts == 1:
         u0, v0 = (of.flat(of.quantities[name], rows) for name in ("u0", "v0"))
         return _run(call, rows, count, place, (u0, v0), planned.needs)
     d = of.flat(of.quantities["d"], rows)
-    folded = ManyStarts(of.pair(rows[:count], planned.settings.wall).symmetric & planned.mirrored)
+    folded = ManyStarts(of.pair(index[:count], planned.settings.wall).symmetric & planned.mirrored)
     # Where programs are compiled and no cell is run, one start does.
     for across, speed in start_places(planned.starts if count else 1).T:
         if stopped is not None and stopped.is_set():
@@ -175,26 +181,28 @@ def _summarise(
 
 def _run(
     call: Call,
-    rows: np.ndarray,
+    rows: Places,
     count: int,
     place: jax.Device,
-    start: tuple[np.ndarray, np.ndarray],
+    start: tuple[Any, Any],
     needs: frozenset[str],
 ) -> Fields:
     """Compute fields of `Summary` from a start of every cell, padded so that one program serves all."""
     planned = call.planned
     of, settings = planned.cells, planned.settings
 
-    def column(quantity: "xr.Variable") -> jax.Array:
-        return jnp.asarray(of.flat(quantity, rows).astype(settings.dtype))
+    # Arrays stay NumPy's until they are packed: they are checked first, here and not on a device.
+    kind = np.dtype(settings.dtype)
 
-    def factors(scale: "xr.Variable") -> jax.Array:
-        own = of.factors(scale).astype(settings.dtype)
-        return jnp.asarray(np.resize(own, padded(own.size)))
+    def column(quantity: "xr.Variable") -> Any:
+        return of.flat(quantity, rows).astype(kind, copy=False)
 
-    kind = jnp.dtype(settings.dtype)
-    pair = jax.tree.map(lambda x: jnp.asarray(x.astype(kind)), of.pair(rows, settings.wall))
-    u0, v0 = (jnp.asarray(values.astype(settings.dtype)) for values in start)
+    def factors(scale: "xr.Variable") -> Any:
+        own = of.factors(scale).astype(kind)
+        return np.resize(own, padded(own.size))
+
+    pair = jax.tree.map(lambda x: x.astype(kind, copy=False), of.pair(rows, settings.wall))
+    u0, v0 = (values.astype(kind, copy=False) for values in start)
     summary = simulate.summarise(
         pair,
         u0,
@@ -212,6 +220,7 @@ def _run(
         outputs=needs,
         method=planned.method,
         count=count,
+        padded=call.rows,
         on=place,
     )
     variants = of.factors(of.length).size

@@ -26,7 +26,8 @@ from vijax.model.records import State, Status
 from vijax.model.sides import named
 from vijax.model.units import Given
 from vijax.planes import estimate
-from vijax.planes.axes import Axes, cells, check_axis
+from vijax.planes.axes import Axes, check_axis
+from vijax.planes.cells import cells
 from vijax.planes.dataset import SweepPlan, coordinates, flagged, provenance, warn_if_held
 from vijax.planes.outputs import OUTPUTS
 from vijax.planes.sweep_settings import DiagramSettings

@@ -10,7 +10,7 @@ import numpy as np
 from vijax.model.device import Harvester
 from vijax.model.quantities import MEASURED
 from vijax.model.sides import Sides, named
-from vijax.planes.axes import Cells
+from vijax.planes.cells import Cells
 
 if TYPE_CHECKING:
     import xarray as xr

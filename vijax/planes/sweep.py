@@ -17,7 +17,8 @@ from vijax.model.excitation import Excitation, Record
 from vijax.model.membrane import Laws, one_of
 from vijax.planes import cluster, dispatch, estimate, store_filling, tile_size, tiled_store
 from vijax.planes import refine as refinement
-from vijax.planes.axes import Axes, Cells, cells, check_axis
+from vijax.planes.axes import Axes, check_axis
+from vijax.planes.cells import Cells, cells
 from vijax.planes.dataset import DEFAULT, SweepPlan, label, warn_if_held
 from vijax.planes.dispatch import Fields
 from vijax.planes.outputs import ON_REQUEST, table

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vijax.planes import inventory, store_metadata, tile_size
-from vijax.planes.axes import Cells
+from vijax.planes.cells import Cells
 from vijax.planes.dataset import SweepPlan, made_by
 from vijax.planes.store import check_place, check_store, encoded, view
 from vijax.runtime.files import beside, replacing, replacing_folder, write_json

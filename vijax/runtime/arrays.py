@@ -40,3 +40,8 @@ def present(value: T | None) -> T:
 def choose(mask: Bool[Array, "lane"], new: T, old: T) -> T:
     """Take `new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
+
+
+def nearest(x: Values) -> Values:
+    """Find the nearest whole number, the one above where two are as near: kernels for a GPU know no other rounding."""
+    return jnp.floor(x + 0.5)

@@ -36,6 +36,8 @@ TRACED_BY = (
 )
 _PACKAGE = Path(__file__).parents[1]
 _DIGEST = hashlib.sha256
+# Kernels of `registers` may be kept, though no other JAX is sure to read them: a program is kept for one alone.
+KERNEL = export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
 
 
 class _Traced(NamedTuple):
@@ -111,7 +113,7 @@ def _trace(flat: Callable[..., Any], platform: str, leaves: list[Any]) -> _Trace
         trees.append(tree)
         return results
 
-    program = export.export(jax.jit(listed), platforms=[platform])(*leaves)
+    program = export.export(jax.jit(listed), platforms=[platform], disabled_checks=[KERNEL])(*leaves)
     return _Traced(program, jax.tree.unflatten(trees[0], range(trees[0].num_leaves)))
 
 

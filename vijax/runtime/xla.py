@@ -168,6 +168,11 @@ def repeat(work: Callable[[T], T], most: int, goes_on: Callable[[T], Bool[Array,
     """
     if not on_cpu():
         return lax.fori_loop(0, most, lambda _, state: work(state), state, unroll=_UNROLLED)
+    return up_to(work, most, goes_on, state)
+
+
+def up_to(work: Callable[[T], T], most: int, goes_on: Callable[[T], Bool[Array, ""]], state: T) -> T:
+    """Do `work` up to so many times while `goes_on`."""
 
     def again(carry: tuple[Any, T]) -> tuple[Any, T]:
         return carry[0] + 1, work(carry[1])
@@ -219,8 +224,8 @@ def _summed(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
 
 
 def whole_blocks(count: int) -> int:
-    """Round lanes up to what `in_blocks` parts evenly."""
-    return -(-count // _BLOCK) * _BLOCK if _in_kernels() else count
+    """Round lanes up to what `in_blocks` parts evenly; fewer than one block stay as they are."""
+    return -(-count // _BLOCK) * _BLOCK if _in_kernels() and count > _BLOCK else count
 
 
 def in_blocks(work: Callable[[T], T], lanes: T) -> T:
