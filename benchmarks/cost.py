@@ -21,6 +21,11 @@ Printout for 128 x 128 cells and 100 periods, two quiet cores:
     soft, starts       0.0746 us per cell-period
     rigid, starts      0.0514 us per cell-period     0.69 times soft, starts (0.66 to 0.84)
     rigid map          0.0225 us per cell-period     0.32 times P (0.30 to 0.39)
+
+and for 64 x 64 cells and 50 periods, on another day, when P took 0.1858:
+
+    P, ode            12.0431 us per cell-period    64.93 times P (52.41 to 66.16)
+    P, ode, friction  14.2031 us per cell-period     1.18 times P, ode (1.18 to 1.18)
 """
 
 import argparse
@@ -42,6 +47,7 @@ from benchmarks.speed import HERE, U0, V0, R, Row, axes
 FREQUENCIES = 8
 LEVEL, INCLINED = 0.0, (0.1, 0.5)
 STIFF = 400.0
+FRICTION = 0.1
 SPEEDS = 0.6  # starts of the second plane reach from minus to plus it
 
 
@@ -69,6 +75,8 @@ def contenders(side: int, periods: int) -> dict[str, Contender]:
         "gamma = 0 given": Contender(partial(plane, gamma=LEVEL, outputs=counts), "counts"),
         **{f"gamma = {slope}": Contender(partial(plane, gamma=slope, outputs=counts), "counts") for slope in INCLINED},
         **{f"P, gamma = {slope}": Contender(partial(plane, gamma=slope, outputs=power), "P") for slope in INCLINED},
+        "P, ode": Contender(partial(plane, method="ode", outputs=power), "P"),
+        "P, ode, friction": Contender(partial(plane, method="ode", friction=FRICTION, outputs=power), "P, ode"),
         "soft, starts": Contender(partial(starts, outputs=power), None),
         "rigid, starts": Contender(partial(starts, wall="rigid", outputs=power), "soft, starts"),
         # All kappa of a rigid wall are one simulation, so its whole map is.

@@ -61,7 +61,8 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
     out = idle & (carry.mode == 0) & (late >= (QUIET if cell.candidate is not None else 0))
     # A forcing that does not repeat leaves no ball alone for ever.
     mean = mean_velocity(method.waves(cell.ball.t), cell.ball.v)
-    quiet = out & neutral(cell.pair, mean) & method.repeats
+    alone = neutral(cell.pair, mean) & method.repeats
+    quiet = out & (alone | jax.vmap(method.rests)(cell.pair, carry))
     permanent = idle & (carry.mode != 0) & (late >= QUIET)
     lane_impact = LaneImpact(
         onset_t=impact.t,

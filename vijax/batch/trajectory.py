@@ -68,6 +68,7 @@ def trajectory(
     rtol: float | None = None,
     atol: float | None = None,
     membrane: Laws | None = None,
+    friction: float | None = None,
     steps: int | None = None,
     excitation: Excitation | None = None,
 ) -> Trajectory:
@@ -80,7 +81,7 @@ def trajectory(
         t0: Time of the start, in [0, 2 periods).
         max_impacts: Room for impacts; 16 a period and 16 more unless given.
         method: "exact", "ode" or "rk4", as in `sweep`; or a `vijax.engine.method.Method`.
-        solver, rtol, atol, membrane, steps: As in `sweep`. The pair's r is None with a membrane
+        solver, rtol, atol, membrane, friction, steps: As in `sweep`. The pair's r is None with a membrane
             that takes none, as `HuntCrossley`.
         excitation: What shakes the capsule, as in `sweep`, in the units of the pair: `record.waveform(device)` for a
             `Record`. The sine unless given.
@@ -93,7 +94,7 @@ def trajectory(
     Raises:
         ValueError: Which argument, what must hold, what came.
     """
-    options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "steps": steps}
+    options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "friction": friction, "steps": steps}
     periods = checks.whole("periods", periods, 1)
     told = _told(check_pair(pair), method, options, check_excitation(excitation, periods))
     room = _most(periods) if max_impacts is None else checks.whole("max_impacts", max_impacts, 1)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from vijax.batch.cell import TANGENT_SCALE, Candidate, Cell, Lane, Mask, Settings
 from vijax.batch.recurrence import grain, recurrence, settled
-from vijax.engine.method import Method, waves_of
+from vijax.engine.method import Method, braked_by, waves_of
 from vijax.model.waves import drift
 from vijax.runtime.arrays import present
 
@@ -102,7 +102,8 @@ def correction(cell: Cell, method: Method | None) -> Correction:
     p, q, r, s = (entry * grown for entry in present(cell.tangent))
     # The round ended at an exit; fly on (or back) to the phase at which it began.
     rest = 2 * (c.base.n + c.laps * c.period - cell.ball.n) + (c.base.t - cell.ball.t)
-    rise, v = drift(waves_of(method, cell.ball.t), cell.pair.gamma, cell.ball.v, rest)
+    gamma = braked_by(method, cell.pair.gamma, cell.ball.v)
+    rise, v = drift(waves_of(method, cell.ball.t), gamma, cell.ball.v, rest)
     # Times the flight's matrix, entry by entry: an accelerator has nothing slower than many products of small matrices.
     p, q = p + rest * r, q + rest * s
     miss_u, miss_v = cell.ball.u + rise - c.base.u, v - c.base.v

@@ -13,7 +13,7 @@ from vijax.cli.membranes import MEMBRANE_NUMBERS
 from vijax.cli.page import Page, Sections
 from vijax.planes.sweep_settings import SweepSettings
 
-_METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "steps", "membrane", *MEMBRANE_NUMBERS)
+_METHOD_OPTIONS = ("method", "solver", "rtol", "atol", "friction", "steps", "membrane", *MEMBRANE_NUMBERS)
 
 
 def map_or_difference(compare: str | None, tolerance: str | None, **given: Any) -> None:

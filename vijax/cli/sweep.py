@@ -249,11 +249,13 @@ def _method_options() -> list[click.Parameter]:
     solvers = get_args(SolverName)
     listed = f"of ode: {', '.join(solvers)} [Tsit5]"
     above = Real("a finite number above 0", min=0, min_open=True)
+    least = Real("a finite number of at least 0", min=0)
     return [
         options.setting("method", "engine"),
         click.Option(["--solver"], type=Choice(solvers), metavar="NAME", help=listed),
         options.setting("rtol", "of ode: relative tolerance of a step [1e-8]", float),
         options.setting("atol", "of ode: absolute tolerance of a step [1e-10]", above),
+        options.setting("friction", "of ode: dry friction along the capsule, over the forcing's amplitude [0]", least),
         options.setting("steps", "of rk4: steps per forcing period [1000]", Whole(8)),
         *membranes.membrane_options("of ode and rk4"),
     ]

@@ -10,6 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
@@ -167,6 +168,14 @@ class Method(eqx.Module, Generic[C]):
     def ball(self, pair: ImpactPair, carry: C) -> State:
         """Say where the ball of a carry is."""
 
+    def rests(self, pair: ImpactPair, carry: C) -> Flag:
+        """Say whether the ball of a carry will never move again, in flight."""
+        return jnp.zeros(jnp.shape(pair.d), bool)
+
+    def braked(self, gamma: Any, v: Any) -> Any:
+        """Give what gravity would be to a ball in flight at velocity v if what brakes it were a part of it."""
+        return gamma
+
     def waves(self, t: Any) -> Waves:
         """Give the harmonics of the forcing from phase t on; of any shape."""
         return sine(t)
@@ -193,6 +202,11 @@ class Method(eqx.Module, Generic[C]):
     def most_steps(self, pair: ImpactPair, periods: int, max_impacts: int) -> int:
         """Say after how many steps a recorded run of some cells is stopped."""
         return _PER_IMPACT * (periods + max_impacts)
+
+
+def braked_by(method: Method | None, gamma: Any, v: Any) -> Any:
+    """Give the gravity of a ball in flight with what brakes it; nothing does without a method."""
+    return gamma if method is None else method.braked(gamma, v)
 
 
 def waves_of(method: Method | None, t: Any) -> Waves:

@@ -17,7 +17,7 @@ from vijax.runtime.pages import see
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 OPTIONS: dict[MethodName, tuple[str, ...]] = {
     "exact": (),
-    "ode": ("solver", "rtol", "atol", "membrane"),
+    "ode": ("solver", "rtol", "atol", "membrane", "friction"),
     "rk4": ("steps", "membrane"),
 }
 _DEFAULTS = {"float64": (1e-8, 1e-10), "float32": (1e-4, 1e-6)}  # rtol, atol
@@ -41,7 +41,7 @@ def choose(
 
     Args:
         method: "exact", "ode" or "rk4".
-        options: Of solver, rtol, atol, membrane and steps those given; None counts as not given.
+        options: Of solver, rtol, atol, membrane, friction and steps those given; None counts as not given.
         wall: "soft" or "rigid".
         dtype: "float64" or "float32": the defaults of the tolerances, and the least that they may be.
         excitation: The sine unless given; no `Record`, which knows no units of a pair.
@@ -80,9 +80,11 @@ def choose(
     must = f"a finite number of at least {least:.1e}"
     rtol = checks.real("rtol", given.get("rtol", rtol), must, lambda x: least <= x < math.inf)
     atol = checks.real("atol", given.get("atol", atol), "a finite number above 0", lambda x: 0 < x < math.inf)
+    must = "a finite number of at least 0"
+    friction = checks.real("friction", given.get("friction", 0.0), must, lambda x: 0 <= x < math.inf)
     from vijax.engine.ode import Ode
 
-    return Ode(solver, rtol, atol, law=law)
+    return Ode(solver, rtol, atol, friction=friction or None, law=law)
 
 
 def _driven(method: str, excitation: Excitation) -> Method:

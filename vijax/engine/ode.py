@@ -18,7 +18,8 @@ from jaxtyping import Array, Int
 
 from vijax.engine.dense_output import SolverState, dense_output
 from vijax.engine.method import ImpactOutcome, Method, decided, finished
-from vijax.engine.ode_events import LONGEST, OdeCarry, Sight, Trial, land, look, meet
+from vijax.engine.ode_events import LONGEST, Landing, OdeCarry, Sight, Trial, land, look, meet
+from vijax.engine.ode_friction import Grip, grip, onward, rubbed
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair, Real
@@ -35,11 +36,15 @@ _VANISHING = 4  # roundings: a shorter step does not advance time
 
 
 class FieldArguments(eqx.Module):
-    """What a smooth spell of the motion depends on: the wall it is at, and its side (0: flight)."""
+    """What a smooth spell of the motion depends on: the wall it is at, and its side (0: flight).
+
+    Friction that brakes the ball is a part of gamma; `slides` says whether it moves at all, None without friction.
+    """
 
     gamma: Scalar
     mode: Int[Array, ""]
     wall: Wall
+    slides: Any = None
 
 
 def _field(t: Any, y: SolverState, spell: FieldArguments) -> SolverState:
@@ -53,7 +58,8 @@ def _field(t: Any, y: SolverState, spell: FieldArguments) -> SolverState:
         a, b, c, d = y.tangent
         rows = [jax.jvp(spell.wall, (y.x, y.z), column)[1] for column in ((a, c), (b, d))]
         tangent = (c, d, *(jnp.where(held, row, 0.0) for row in rows))
-    return SolverState(y.z, force + pull, work, tangent)
+    slope = SolverState(y.z, force + pull, work, tangent)
+    return slope if spell.slides is None else jax.tree.map(lambda x: jnp.where(spell.slides, x, 0.0), slope)
 
 
 equation_38 = diffrax.ODETerm(_field)
@@ -78,12 +84,14 @@ class Ode(Method[OdeCarry]):
         solver: One of `method_choice.SOLVERS`.
         rtol, atol: Tolerances of position and velocity, step by step.
         dt: A constant step instead, for measuring orders of convergence.
+        friction: Of the capsule, over the forcing's amplitude; None without.
     """
 
     solver: str = eqx.field(static=True)
     rtol: Real
     atol: Real
     dt: Real | None = None
+    friction: Real | None = None
 
     @property
     def arithmetic(self) -> bool:
@@ -135,19 +143,22 @@ class Ode(Method[OdeCarry]):
             left_t=state.t,
             left_n=state.n,
             steps=whole,
+            slip=None if self.friction is None else self._sets_off(pair, state, x),
         )
+
+    def _sets_off(self, pair: ImpactPair, state: State, x: Scalar) -> Scalar:
+        """Say which way a ball slides at the start; 0 if it sticks."""
+        friction: Any = self.friction
+        wall = at(self.walls(pair), state.mode.astype(x.dtype))
+        drive = jnp.cos(PI * state.t) + _push(pair, wall, state.mode, x)
+        return jnp.where(state.v == 0, onward(drive, friction), jnp.sign(state.v))
 
     def step(
         self, pair: ImpactPair, walls: Wall | Sides, m: OdeCarry, *, recorded: bool = False
     ) -> tuple[OdeCarry, ImpactOutcome, Flag]:
         """Try one step of the solver; one that vanishes beside the time, or is not finite, makes an impact of NaN."""
-        half, held = 0.5 * pair.d, m.mode != 0
-        side = jnp.where(held, m.mode.astype(half.dtype), lax.stop_gradient(m.aim))
-        wall = at(walls, side)
-        trial = _try(self, _solver(self, recorded), m, FieldArguments(pair.gamma, m.mode, wall), recorded)
-        sight = look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0))
-        # Nearly all that follows reads both: without `share` XLA would compute them again for each reader.
-        landing, sight = share((land(m, half, trial), sight))
+        half = 0.5 * pair.d
+        side, wall, grasp, trial, sight, landing = self._attempt(pair, walls, m, recorded)
         shut = landing.onset | landing.exits
         # A step on whose way something happens is not taken but tried again, up to there. One that was cut for an event
         # and has met it is taken as it is: what its dense output shows there is that same event.
@@ -186,8 +197,43 @@ class Ode(Method[OdeCarry]):
             left_t=jnp.where(landing.exits, t, m.left_t),
             left_n=jnp.where(landing.exits, n, m.left_n),
             steps=m.steps + 1,
+            slip=m.slip,
         )
+        if grasp is not None:
+            friction: Any = self.friction
+            drive = jnp.cos(PI * t) + _push(pair, wall, m.mode, new.y.x)
+            new = rubbed(m, new, trial, landing.crest, grasp, drive, friction)
         return new, outcome, (landing.exits & m.entered) | lost
+
+    def _attempt(
+        self, pair: ImpactPair, walls: Wall | Sides, m: OdeCarry, recorded: bool
+    ) -> tuple[Scalar, Wall, Grip | None, Trial, Sight, Landing]:
+        """Try a step: at which side and wall, the grip on the ball (None without friction), and what the step shows."""
+        half, held = 0.5 * pair.d, m.mode != 0
+        side = jnp.where(held, m.mode.astype(half.dtype), jnp.sign(lax.stop_gradient(m.aim)))
+        wall, grasp, way = at(walls, side), None, None
+        spell = FieldArguments(pair.gamma, m.mode, wall)
+        if m.slip is not None:
+            friction: Any = self.friction
+            spell = FieldArguments(pair.gamma + friction * m.slip, m.mode, wall, m.slip != 0)
+            grasp = grip(m.t, _push(pair, wall, m.mode, m.y.x), friction)
+            way = jnp.where(held, side, 1.0) * m.slip
+        trial = _try(self, _solver(self, recorded), m, spell, recorded, grasp)
+        sight = look(trial.dense, held, half, m.y.work is not None, m.cut & (m.aim == 0), way)
+        # Nearly all that follows reads both: without `share` XLA would compute them again for each reader.
+        landing, sight = share((land(m, half, trial), sight))
+        return side, wall, grasp, trial, sight, landing
+
+    def braked(self, gamma: Any, v: Any) -> Any:
+        """Give what gravity would be to a ball in flight at velocity v if friction were a part of it."""
+        return gamma if self.friction is None else gamma + self.friction * jnp.sign(v)
+
+    def rests(self, pair: ImpactPair, m: OdeCarry) -> Flag:
+        """Say whether friction holds the ball of a carry in flight for ever."""
+        if m.slip is None:
+            return jnp.zeros_like(m.cut)
+        friction: Any = self.friction
+        return (m.mode == 0) & (m.slip == 0) & jnp.isinf(grip(m.t, -pair.gamma, friction).wait)
 
     def ball(self, pair: ImpactPair, m: OdeCarry) -> State:
         """Say where the ball of a carry is."""
@@ -195,6 +241,11 @@ class Ode(Method[OdeCarry]):
         held = m.mode != 0
         u = jnp.where(held, side * (0.5 * pair.d + m.y.x), m.y.x)
         return State(u, jnp.where(held, side * m.y.z, m.y.z), m.t, m.n, m.mode)
+
+
+def _push(pair: ImpactPair, wall: Wall, mode: Int[Array, ""], x: Scalar) -> Scalar:
+    """Compute what drives a ball at rest besides the forcing, in the direction of the displacement."""
+    return jnp.where(mode != 0, mode.astype(x.dtype) * wall(x, jnp.zeros_like(x)), 0.0) - pair.gamma
 
 
 def _solver(engine: Ode, recorded: bool) -> Solver:
@@ -223,9 +274,18 @@ def _control(engine: Ode, order: Any, t0: Scalar, t1: Scalar, y0: SolverState, y
     return keep, jnp.where(jnp.isfinite(h), h, 0.2 * (t1 - t0))
 
 
-def _try(engine: Ode, solver: Solver, m: OdeCarry, spell: FieldArguments, recorded: bool) -> Trial:
-    """Try one step of the solver, at most to the end of the period if it is recorded."""
+def _try(
+    engine: Ode,
+    solver: Solver,
+    m: OdeCarry,
+    spell: FieldArguments,
+    recorded: bool,
+    held: Grip | None,
+) -> Trial:
+    """Try one step of the solver, at most to the end of the period if it is recorded, and of the grip on a ball."""
     h = jnp.minimum(lax.stop_gradient(m.h), LONGEST)
+    if held is not None:
+        h = jnp.where(spell.slides, h, jnp.minimum(h, held.wait))
     t = m.t + h
     if recorded:
         # The states at phase 0 are asked for: no step goes past one, and it ends there exactly, which a sum might miss.

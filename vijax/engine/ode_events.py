@@ -19,7 +19,7 @@ from vijax.runtime.arrays import Flag, Scalar
 LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
 _CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step
 _ATTEMPTS = 6  # repeats after which a crossing is taken as it is: rounding holds it from closing
-_CREST = 2.0  # an aim that is no wall: the deepest point of a contact
+_CREST = 2.0  # an aim that is no wall, times the way that leads there: the deepest point of a contact, a turning
 
 
 class OdeCarry(eqx.Module):
@@ -33,7 +33,7 @@ class OdeCarry(eqx.Module):
     full: Scalar  # step to go on with after one that was cut short
     other: Scalar  # step to go on with after the next change of mode
     cut: Flag  # this step was cut short, to end at an event or before a second turning
-    aim: Scalar  # the event it was cut for: a wall in the direction -1 or +1, or a crest; 0 for none
+    aim: Scalar  # the event it was cut for: a wall in the direction -1 or +1, or a turning; 0 for none
     attempts: Int[Array, ""]
     onset_t: Scalar
     onset_n: Int[Array, ""]
@@ -43,6 +43,7 @@ class OdeCarry(eqx.Module):
     left_t: Scalar  # when the ball left a wall last
     left_n: Int[Array, ""]
     steps: Int[Array, ""]
+    slip: Scalar | None = None  # the way in which the ball slides, -1 or +1; 0: it sticks; None without friction
 
 
 class Trial(eqx.Module):
@@ -65,18 +66,19 @@ class Sight(eqx.Module):
     aim: Scalar
 
 
-def look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) -> Sight:
+def look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag, way: Scalar | None = None) -> Sight:
     """Find the first wall crossing of a step, the crest of a contact before it, or a second turning of the velocity.
 
     A velocity that changes sign between the ends turns once; the position is monotone up to there and from there on,
     so each crossing is bracketed, and of two the earlier is found. Where the acceleration changes sign (at most once,
     as a step is at most LONGEST) the velocity is extreme: if it has changed sign there and back, the step is cut at
-    that place, and the next look sees one turning at a time (`untwisted`: it was cut so).
+    that place, and the next look sees one turning at a time (`untwisted`: it was cut so). With friction the ball moves
+    one `way`, and every turning is an event.
     """
     one, zero = jnp.ones_like(half), jnp.zeros_like(half)
     z0, z1, bend0, bend1 = dense.c1, dense.rate(one), dense.c2, dense.bend(one)
     # From rest the ball goes where its velocity at the end of the step points, for it turns at most once within one.
-    heading = jnp.where(z0 == 0, jnp.sign(z1), jnp.sign(z0))
+    heading = jnp.where(z0 == 0, jnp.sign(z1), jnp.sign(z0)) if way is None else way
     turns = heading * z1 < 0
     turning = root(lambda s: (-heading * dense.rate(s), -heading * dense.bend(s)), zero, one)
     rising = jnp.sign(bend1)
@@ -92,10 +94,12 @@ def look(dense: Dense, held: Flag, half: Scalar, deep: bool, untwisted: Flag) ->
     low, high = jnp.where(first, 0.0, middle), jnp.where(first, middle, 1.0)
     crossing = root(lambda s: (aim * dense.place(s) - wall, aim * dense.rate(s)), low, high)
     crest = turns & held & (heading > 0) if deep else jnp.zeros_like(turns)
+    if way is not None:
+        crest = turns & ~first
     return Sight(
         twice | crest | first | second,
         jnp.where(twice, extreme, jnp.where(crest, turning, crossing)),
-        jnp.where(twice, 0.0, jnp.where(crest, _CREST, aim)),
+        jnp.where(twice, 0.0, jnp.where(crest, _CREST * heading, aim)),
     )
 
 
@@ -124,7 +128,7 @@ def land(m: OdeCarry, half: Scalar, trial: Trial) -> Landing:
     root = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     both = speed + root
     real = ((square >= 0) | (gap > 0)) & ((root > 0) | (drive > 0))
-    tops = (aim == _CREST) & (push < 0)
+    tops = (jnp.abs(aim) == _CREST) & (drive < 0)
     delay = jnp.where(tops, -z / jnp.where(tops, push, -1.0), -2 * gap / jnp.where(both > 0, both, jnp.inf))
     near = trial.passes & ((jnp.abs(delay) <= _CLOSED * trial.h) | (m.attempts >= _ATTEMPTS))
     met, crest = decided((near & real & (jnp.abs(aim) == 1), near & tops))

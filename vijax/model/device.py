@@ -139,6 +139,17 @@ class Harvester(eqx.Module):
         """Compute metres per second per unit of u', A pi/omega."""
         return self.A * (math.pi / self.omega)
 
+    @door
+    def friction(self, coefficient: Real) -> Real:
+        """Compute the dry friction of the ball on the capsule over the forcing's amplitude, f g cos(beta)/A.
+
+        Args:
+            coefficient: f, of friction at rest and sliding, at least 0.
+        """
+        if is_concrete(coefficient) and not np.all(np.isfinite(coefficient) & (np.asarray(coefficient) >= 0)):
+            raise ValueError(f"coefficient must be a finite number of at least 0; got {checks.shown(coefficient)}")
+        return coefficient * self.g * jnp.cos(self.beta) / self.A
+
     @property
     def depth_limit(self) -> Own:
         """Compute the largest admissible penetration [m]."""

@@ -48,6 +48,7 @@ def sweep(
     rtol: float | None = None,
     atol: float | None = None,
     membrane: Laws | None = None,
+    friction: float | None = None,
     steps: int | None = None,
     outputs: Iterable[str] | None = None,
     device: Harvester | None = None,
@@ -91,6 +92,8 @@ def sweep(
         membrane: Of "ode" and "rk4": `HuntCrossley(chi)`, or a `MembraneLaw` of your own, for the linear membrane; of
             walls with a law each `Sides` of two of one kind.
             `HuntCrossley` takes no r: the map's `restitution` is what came out.
+        friction: Of "ode": dry friction of ball and capsule, over the amplitude of the forcing as gamma is;
+            `Harvester.friction` has that of a coefficient. The ball may stick. None unless given.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
         outputs: The variables wanted, of those on the page of outputs; all but `asymmetry` and `lyapunov`
             unless given. What is not wanted is not computed. `status` always comes.
@@ -148,6 +151,7 @@ def sweep(
         rtol=rtol,
         atol=atol,
         membrane=membrane,
+        friction=friction,
         steps=steps,
         dtype=dtype,
         excitation=excitation,

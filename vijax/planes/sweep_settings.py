@@ -24,7 +24,7 @@ START_POINTS = 256
 SPEED = 0.6
 
 # Settings that methods are told, each its own ones.
-_OPTIONS = ("solver", "rtol", "atol", "membrane", "steps")
+_OPTIONS = ("solver", "rtol", "atol", "membrane", "friction", "steps")
 # What `engine.method_choice.record` tells of a run.
 _TOLD_ELSEWHERE = (*_OPTIONS, "excitation")
 # Settings that an orbit diagram reads, in the order of its attributes.
@@ -51,6 +51,7 @@ class SweepSettings:
             precision 1e-4 and 1e-6.
         membrane: Of "ode" and "rk4": a `HuntCrossley`, a law of your own, or `Sides` of two of a kind; the linear one
             if None.
+        friction: Of "ode": dry friction along the capsule over the forcing's amplitude; none if None.
         steps: Of "rk4": steps per forcing period; 1000 if None.
         dtype: "float64", or "float32" with tolerances to match.
         excitation: What shakes the capsule, `Harmonics`, a `Record`, `Noise` or a sum; the sine if None.
@@ -68,6 +69,7 @@ class SweepSettings:
     rtol: float | None = None
     atol: float | None = None
     membrane: "Laws | None" = None
+    friction: float | None = None
     steps: int | None = None
     dtype: Precision = "float64"
     excitation: "Excitation | None" = None

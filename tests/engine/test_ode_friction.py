@@ -1,0 +1,189 @@
+"""Dry friction: impacts against closed forms event by event, sticking, tangent maps, labels, derivatives, refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+import vijax
+from tests.engine.friction_reference import Law, follow
+from vijax.engine.ode import Ode
+from vijax.engine.ode_friction import grip
+from vijax.model.records import State, Status
+
+# d, kappa, r, gamma, friction, u0, v0, and how the ball turns in 6 periods: back, or sticking.
+CASES = {
+    "sticks once": (0.2, 12.0, 0.5, 0.0, 0.1, 0.01, -0.4, 1),
+    "from rest": (0.3, 40.0, 0.6, 0.2, 0.3, 0.0, 0.0, 0),
+    "stiff": (0.25, 20.0, 0.7, 0.05, 0.5, 0.02, 0.3, 0),
+    "sticks each time": (0.35, 30.0, 0.5, 0.0, 0.7, 0.05, 0.2, 11),
+    "soft": (0.1, 4.0, 0.5, 0.0, 0.4, 0.02, 0.3, 0),
+}
+PERIODS = 6
+
+
+def exactly(friction):
+    return Ode("Dopri8", 1e-12, 1e-14, friction=friction)
+
+
+def impacts_of(found):
+    """Give impacts as the reference does."""
+    i = jax.tree.map(lambda x: np.asarray(x)[: int(found.filled)], found.impacts)
+    return np.stack([2 * i.n + i.t, i.side, i.v_in, i.v_out, i.depth, i.duration], axis=1)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_impacts_are_those_of_closed_forms(name):
+    d, kappa, r, gamma, friction, u0, v0, sticks = CASES[name]
+    pair = vijax.impact_pair(d, kappa, r, gamma)
+    seen = follow(Law(d, kappa, float(pair.mu), gamma, friction), u0, v0, 2 * PERIODS)
+    assert seen.turnings.count(0) == sticks
+    found = vijax.trajectory(pair, u0, v0, PERIODS, method=exactly(friction))
+    assert found.status == Status.OK
+    np.testing.assert_allclose(impacts_of(found), seen.impacts, atol=1e-11)
+
+
+def test_a_ball_may_rest_within_a_membrane():
+    """Its spring is 4w: friction 1.3 holds the ball for ever up to w = 0.075; from deeper it creeps there."""
+    pair = vijax.impact_pair(0.2, 2.0, 0.5)
+    shallow, deep = (vijax.trajectory(pair, u0, 0.0, 4, t0=0.5, method=exactly(1.3)) for u0 in (0.16, 0.25))
+    np.testing.assert_array_equal(shallow.states.u, 0.16)
+    assert (np.diff(deep.states.u) < 0).all()
+    assert (np.asarray(deep.states.u) > 0.175).all()
+    for found in (shallow, deep):
+        assert found.status == Status.PERMANENT_CONTACT
+
+
+@given(t=st.floats(0, 2), push=st.floats(-2.5, 2.5), friction=st.floats(0, 2.5))
+def test_the_grip_ends_when_the_drive_exceeds_friction(t, push, friction):
+    drive = lambda s: np.cos(np.pi * s) + push  # noqa: E731
+    assume(abs(drive(t)) <= friction)
+    assume(abs(abs(push) + friction - 1) > 1e-6)  # not so that it is only touched
+    held = grip(jnp.asarray(t), jnp.asarray(push), jnp.asarray(friction))
+    until = min(float(held.wait), 2.0)
+    inside = np.linspace(t, t + until, 400)[1:-1]
+    assert (np.abs(drive(inside)) <= friction + 1e-12).all()
+    if np.isinf(held.wait):
+        assert (np.abs(drive(np.linspace(0, 2, 400))) <= friction + 1e-12).all()
+    else:
+        assert abs(drive(t + until + 1e-9)) > friction - 1e-12
+        assert np.sign(drive(t + until)) == held.way
+
+
+def impact_after(pair, friction, u, v, number):
+    """Give the ball at a number of exits, with the tangent map to it."""
+    method = exactly(friction)
+    walls = method.walls(pair)
+    whole = jnp.asarray(0, jnp.int32)
+    carry = method.start(
+        pair, State(jnp.asarray(u), jnp.asarray(v), jnp.asarray(0.0), whole, whole), deep=True, tangent=True
+    )
+    step = jax.jit(lambda carry: method.step(pair, walls, carry))
+    whole_map, stuck = np.eye(2), 0
+    while number and carry.n < 10:
+        before = carry
+        carry, outcome, ended = step(carry)
+        stuck += bool((before.slip != 0) & (carry.slip == 0))
+        if ended:
+            number -= 1
+            whole_map = np.reshape(outcome.tangent, (2, 2)) @ whole_map
+    return outcome.after, whole_map, stuck
+
+
+@pytest.mark.parametrize(("d", "friction", "sticks"), [(0.095, 0.05, 0), (0.095, 0.3, 2), (0.2, 0.1, 1)])
+def test_tangent_maps_are_differences_of_motions(d, friction, sticks):
+    pair, start, h = vijax.impact_pair(d, 12.0, 0.5), np.array([0.01, -0.4]), 1e-6
+    ball, found, stuck = impact_after(pair, friction, *start, 3)
+    assert stuck == sticks
+    columns = []
+    for nudge in h * np.eye(2):
+        ends = []
+        for sign in (1, -1):
+            after, _, _ = impact_after(pair, friction, *(start + sign * nudge), 3)
+            # Back in flight to the time at which the one between them leaves the wall.
+            s = float(ball.t - after.t) + 2 * int(ball.n - after.n)
+            gain = np.cos(np.pi * float(after.t)) - friction * np.sign(float(after.v))
+            ends.append(np.array([after.u + after.v * s + gain * s * s / 2, after.v + gain * s]))
+        columns.append((ends[0] - ends[1]) / (2 * h))
+    np.testing.assert_allclose(found, np.stack(columns, axis=1), atol=2e-6 * np.abs(found).max() + 1e-8)
+
+
+PLANE = {"d": [0.08, 0.2, 0.3], "kappa": [10.0, 60.0], "r": 0.5, "method": "ode"}
+
+
+def test_orbits_that_are_found_are_what_the_motion_comes_to():
+    found = vijax.sweep(**PLANE, friction=0.3, outputs=("P", "period"))
+    assert (found.period == 1).all()
+    later = vijax.sweep(**PLANE, friction=0.3, outputs=("P",), until="window", transient=600, periods=20)
+    np.testing.assert_allclose(found.P, later.P, rtol=1e-5)
+    assert found.attrs["friction"] == 0.3
+
+
+def test_friction_that_holds_the_ball_leaves_no_impact_and_none_is_none():
+    held = vijax.sweep(**PLANE, friction=1.5, u0=0.0, v0=0.05, outputs=("P", "period"))
+    assert (held.status == Status.NO_IMPACT).all()
+    assert (held.P == 0).all()
+    free, plain = (vijax.sweep(**PLANE, friction=friction, outputs=("P",)) for friction in (0.0, None))
+    np.testing.assert_array_equal(free.P, plain.P)
+    assert "friction" not in free.attrs
+
+
+def test_friction_takes_what_slides_and_mirror_images_stay_such():
+    pair = vijax.impact_pair(0.2, 12.0, 0.5, 0.1)
+    one = vijax.trajectory(pair, 0.03, 0.2, PERIODS, method=exactly(0.2))
+    other = vijax.trajectory(vijax.impact_pair(0.2, 12.0, 0.5, -0.1), -0.03, -0.2, PERIODS, t0=1.0, method=exactly(0.2))
+    many = min(int(one.filled), int(other.filled)) - 1
+    assert many > 5
+    a, b = impacts_of(one)[:many], impacts_of(other)[:many]
+    np.testing.assert_allclose(b, a * [1, -1, -1, -1, 1, 1] + [1, 0, 0, 0, 0, 0], atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["sticks once", "sticks each time"])
+def test_derivatives_are_those_of_differences(name):
+    d, kappa, r, gamma, friction, u0, v0, _ = CASES[name]
+
+    def first(x):
+        d, kappa, r, gamma, friction, u0, v0 = x
+        found = vijax.trajectory(vijax.ImpactPair(d, kappa, r, gamma), u0, v0, 4, method=exactly(friction))
+        last = 2 if name == "sticks once" else 0
+        i = found.impacts
+        return jnp.stack([i.t[last], i.v_in[last], i.depth[last], i.v_out[last]])
+
+    x = jnp.array([d, kappa, r, gamma, friction, u0, v0])
+    forward, reverse = jax.jacfwd(first)(x), jax.jacrev(first)(x)
+    h = 1e-6
+    differences = np.stack([(first(x + h * e) - first(x - h * e)) / (2 * h) for e in np.eye(7)], axis=1)
+    np.testing.assert_allclose(forward, differences, atol=1e-6 * np.abs(differences).max())
+    np.testing.assert_allclose(reverse, forward, atol=1e-11 * np.abs(differences).max())
+
+
+def test_a_membrane_of_any_law_may_have_friction_beside_it():
+    pair = vijax.impact_pair(0.2, 12.0, None)
+    told = {"method": "ode", "membrane": vijax.HuntCrossley(chi=0.3)}
+    slow, fast = (vijax.trajectory(pair, 0.01, -0.4, 4, **told, friction=friction) for friction in (0.2, None))
+    assert int(slow.filled) > 3
+    assert float(slow.impacts.v_in[0]) != float(fast.impacts.v_in[0])
+
+
+def test_the_friction_of_a_coefficient_is_that_of_the_weight_on_the_capsule():
+    device = vijax.Harvester(beta=0.3, A=5.0)
+    np.testing.assert_allclose(device.friction(0.1), 0.1 * 9.8 * np.cos(0.3) / 5.0, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"coefficient must be a finite number of at least 0; got -0\.1"):
+        device.friction(-0.1)
+
+
+@pytest.mark.parametrize(
+    ("told", "must"),
+    [
+        ({"method": "exact", "friction": 0.1}, 'friction must be left out unless method is "ode"; got 0.1'),
+        ({"method": "ode", "friction": -0.1}, "friction must be a finite number of at least 0; got -0.1"),
+        ({"method": "ode", "friction": np.inf}, "friction must be a finite number of at least 0; got inf"),
+    ],
+)
+def test_friction_that_cannot_be_is_refused(told, must):
+    with pytest.raises(ValueError, match=must):
+        vijax.sweep(d=0.2, kappa=12.0, **told)
+    with pytest.raises(ValueError, match=must):
+        vijax.trajectory(vijax.impact_pair(0.2, 12.0, 0.5), 0.0, 0.3, 2, **told)
