@@ -47,6 +47,15 @@ def test_restarting_from_a_stroboscopic_state_goes_on_the_same():
     assert np.all(np.asarray(whole.status) == Status.OK)
 
 
+def test_starts_may_be_lists():
+    pair = impact_pair(0.2, 12.0, 0.5)
+    listed = vijax.trajectory(pair, [0.0, 0.01], (0.3, 0.4), 2, t0=[0.0, 0.5])
+    arrays = vijax.trajectory(pair, np.array([0.0, 0.01]), np.array([0.3, 0.4]), 2, t0=np.array([0.0, 0.5]))
+    jax.tree.map(np.testing.assert_array_equal, listed, arrays)
+    with pytest.raises(ValueError, match="v0 must be a real number or an array of them; got"):
+        vijax.trajectory(pair, 0.0, [0.3, "fast"], 2)
+
+
 def test_too_few_impacts_are_said():
     pair = impact_pair(0.2, 40.0, 0.5)
     short = vijax.trajectory(pair, 0.02, 0.3, 4, max_impacts=2)

@@ -1,7 +1,7 @@
 """The motion of single starts, impact by impact: recorded, sampled at phase 0, differentiable both ways."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -41,26 +41,28 @@ def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any], excitation:
     return method
 
 
-def _check_starts(pair: ImpactPair, periods: int, starts: Mapping[str, Any]) -> None:
-    """Raise ValueError unless the ball can start so; traced starts pass unseen."""
+def _check_starts(pair: ImpactPair, periods: int, starts: dict[str, Any]) -> tuple[Any, ...]:
+    """Give the starts, lists as arrays; raise ValueError unless the ball can start so. Traced ones pass unseen."""
     for name, start in starts.items():
         if checks.is_concrete(start):
-            checks.finite(name, start)
+            array = checks.finite(name, start)
+            starts = starts | {name: array if isinstance(start, list | tuple) else start}
     check_start(pair, "u0", starts["u0"])
     if checks.is_concrete(starts["t0"]):
         t0 = np.asarray(starts["t0"])
         good = (t0 >= 0) & (t0 < 2 * periods)
         if not good.all():
             raise ValueError(f"t0 must lie in [0, 2 periods), here [0, {2 * periods}); got {checks.first(t0, good)}")
+    return tuple(starts.values())
 
 
 @door
 def trajectory(
     pair: ImpactPair,
-    u0: ArrayLike,
-    v0: ArrayLike,
+    u0: ArrayLike | Sequence[float],
+    v0: ArrayLike | Sequence[float],
     periods: int,
-    t0: ArrayLike = 0.0,
+    t0: ArrayLike | Sequence[float] = 0.0,
     *,
     max_impacts: int | None = None,
     method: MethodName | Method = "exact",
@@ -98,7 +100,7 @@ def trajectory(
     periods = checks.whole("periods", periods, 1)
     told = _told(check_pair(pair), method, options, check_excitation(excitation, periods))
     room = _most(periods) if max_impacts is None else checks.whole("max_impacts", max_impacts, 1)
-    _check_starts(pair, periods, {"u0": u0, "v0": v0, "t0": t0})
+    u0, v0, t0 = _check_starts(pair, periods, {"u0": u0, "v0": v0, "t0": t0})
     count = math.prod(checks.shapes(u0=u0, v0=v0, t0=t0, pair=pair.d))
     checks.fits(("periods", "max_impacts"), count * (room * _IMPACT + periods * _STATE), "impacts and states")
     found, shape = _followed(told, pair, (u0, v0, t0), periods, max_impacts)

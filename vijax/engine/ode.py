@@ -280,12 +280,12 @@ def _try(
     m: OdeCarry,
     spell: FieldArguments,
     recorded: bool,
-    held: Grip | None,
+    grasp: Grip | None,
 ) -> Trial:
     """Try one step of the solver, at most to the end of the period if it is recorded, and of the grip on a ball."""
     h = jnp.minimum(lax.stop_gradient(m.h), LONGEST)
-    if held is not None:
-        h = jnp.where(spell.slides, h, jnp.minimum(h, held.wait))
+    if grasp is not None:
+        h = jnp.where(spell.slides, h, jnp.minimum(h, grasp.wait))
     t = m.t + h
     if recorded:
         # The states at phase 0 are asked for: no step goes past one, and it ends there exactly, which a sum might miss.

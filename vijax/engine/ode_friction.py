@@ -70,7 +70,7 @@ def _until(ahead: Scalar) -> Scalar:
 
 
 def rubbed(
-    m: OdeCarry, new: OdeCarry, trial: Trial, turns: Flag, held: Grip, drive: Scalar, friction: Real
+    m: OdeCarry, new: OdeCarry, trial: Trial, turns: Flag, grasp: Grip, drive: Scalar, friction: Real
 ) -> OdeCarry:
     """Give a carry after a step the way in which its ball slides then.
 
@@ -78,13 +78,13 @@ def rubbed(
         m, new: The carry before the step and after it.
         trial: The step.
         turns: Whether the ball has come to rest at its end.
-        held: The grip before it.
+        grasp: The grip before it.
         drive: What accelerates a ball at rest at the end of the step, but for friction.
         friction: The friction.
     """
     before = present(m.slip)
-    torn = (before == 0) & trial.passes & (trial.h >= held.wait)
-    after = jnp.where(turns, onward(drive, friction), jnp.where(torn, held.way, before))
+    torn = (before == 0) & trial.passes & (trial.h >= grasp.wait)
+    after = jnp.where(turns, onward(drive, friction), jnp.where(torn, grasp.way, before))
     y = new.y
     if y.tangent is not None:
         # The saltation of a turning: a ball that sticks forgets how fast its neighbour is.

@@ -9,8 +9,8 @@ any accelerator, runs the same arithmetic without it.
 
 The mark is XLA's own and documented nowhere. Should an XLA stumble over it, set `VIJAX_KERNELS=0` in the environment
 before vijax is imported: `kernel`, `share`, `in_blocks` and `put` then say nothing that XLA's compiler for CPUs alone
-knows, as on an accelerator. Results agree to rounding (periodic cells to 1e-12), and planes take three to five times as
-long.
+knows, as on an accelerator, and lanes do not stay in a GPU's registers (`registers`). Results agree to rounding
+(periodic cells to 1e-12), and planes take three to five times as long.
 """
 
 import os
