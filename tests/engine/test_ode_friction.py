@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 import vijax
 from tests.engine.friction_reference import Law, follow
+from vijax.engine.dense_output import Dense
 from vijax.engine.ode import Ode
+from vijax.engine.ode_events import look
 from vijax.engine.ode_friction import grip
 from vijax.model.records import State, Status
 
@@ -70,6 +72,43 @@ def test_the_grip_ends_when_the_drive_exceeds_friction(t, push, friction):
     else:
         assert abs(drive(t + until + 1e-9)) > friction - 1e-12
         assert np.sign(drive(t + until)) == held.way
+
+
+def test_a_moment_of_release_that_rounding_has_past_is_now():
+    level, friction = 0.37, 0.2
+    past = np.nextafter(np.arccos(level) / np.pi, 1.0)
+    held = grip(jnp.asarray(past), jnp.asarray(-level - friction), jnp.asarray(friction))
+    assert held.wait < 1e-15
+    assert held.way == -1
+
+
+def test_a_ball_that_sets_off_and_turns_within_a_step_is_seen():
+    one = jnp.asarray(1.0)
+    dense = Dense(*(x * one for x in (0.0, 0.0, 0.05, -0.05, 0.0, 0.0)))  # at rest, there, and back from 2/3 on
+    seen = look(dense, one < 0, one, False, one < 0, one)
+    assert seen.seen
+    np.testing.assert_allclose(seen.theta, 2 / 3, atol=1e-3)
+    assert seen.aim == 2.0
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.5])
+def test_no_motion_is_lost(friction):
+    """Two solvers count the same impacts of 300 balls, a fifth of them at rest at first."""
+    rng, n = np.random.default_rng(3), 300
+    d, kappa = rng.uniform(0.05, 0.4, n), np.exp(rng.uniform(1, 4.5, n))
+    pair = vijax.impact_pair(d, kappa, rng.uniform(0.2, 0.9, n), rng.uniform(-0.3, 0.3, n))
+    u0, v0 = rng.uniform(-0.45, 0.45, n) * d, rng.uniform(-0.6, 0.6, n)
+    v0[::5] = 0
+    rough, fine = (
+        vijax.trajectory(pair, u0, v0, 6, method=method)
+        for method in (Ode("Tsit5", 1e-8, 1e-10, friction=friction), exactly(friction))
+    )
+    np.testing.assert_array_equal(rough.status, fine.status)
+    assert np.isin(fine.status, [Status.OK, Status.NO_IMPACT]).all()
+    np.testing.assert_array_equal(rough.filled, fine.filled)
+    assert np.asarray(fine.filled).sum() > 5 * n
+    first = slice(0, 3)  # later ones of chaotic motion part
+    np.testing.assert_allclose(rough.impacts.v_in[:, first], fine.impacts.v_in[:, first], atol=1e-5)
 
 
 def impact_after(pair, friction, u, v, number):
