@@ -169,6 +169,15 @@ def test_friction_that_holds_the_ball_leaves_no_impact_and_none_is_none():
     assert "friction" not in free.attrs
 
 
+def test_a_ball_that_comes_to_rest_after_its_transient_meets_no_wall_any_more():
+    """Fast, with walls that lose nothing: it is brought to rest after five of eight periods, two of them transient."""
+    start = {"d": 0.3, "kappa": 60.0, "r": 1.0, "u0": 0.0, "v0": 10.0, "periods": 8, "method": "ode"}
+    found = vijax.sweep(**start, friction=1.05, outputs=("P", "period", "impacts_per_period"))
+    assert found.status == Status.NO_IMPACT
+    assert found.period == 1
+    assert found.P == 0
+
+
 def test_friction_takes_what_slides_and_mirror_images_stay_such():
     pair = vijax.impact_pair(0.2, 12.0, 0.5, 0.1)
     one = vijax.trajectory(pair, 0.03, 0.2, PERIODS, method=exactly(0.2))
