@@ -143,7 +143,7 @@ def rounds(mesh: Mesh, found: Found, level_ground: np.ndarray) -> Iterator[Cells
         yield new
         known[new] = True
         for level in range(1, mesh.levels + 2):
-            unlike, missed = _surprises(mesh, found, level_ground, new, level)
+            unlike, missed = _surprises(mesh, found, level_ground, known, new, level)
             if level in fronts:
                 fronts[level].mark(new[unlike | missed])
             # Blocks that a missed one is split into may miss too, and nothing has been computed in them yet.
@@ -152,7 +152,7 @@ def rounds(mesh: Mesh, found: Found, level_ground: np.ndarray) -> Iterator[Cells
         for level, front in fronts.items():
             # What lies in these was computed before their corners were.
             past = front.surrounded(known)
-            unlike, missed = _surprises(mesh, found, level_ground, past, level)
+            unlike, missed = _surprises(mesh, found, level_ground, known, past, level)
             front.mark(past[unlike | missed])
         wanted = np.zeros(known.size, bool)
         # The finest first: children are looked at a round later, when their corners are known.
@@ -219,11 +219,15 @@ def _kind(found: Found, level_ground: np.ndarray, cells: Cells) -> np.ndarray:
 
 
 def _surprises(
-    mesh: Mesh, found: Found, level_ground: np.ndarray, cells: Cells, level: int
+    mesh: Mesh, found: Found, level_ground: np.ndarray, known: np.ndarray, cells: Cells, level: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find cells of another kind than a corner of their block, and those of the others where P is missed."""
+    """Find cells of another kind than a corner of their block, and those of the others where P is missed.
+
+    Where a corner is not known yet there is nothing to compare with.
+    """
     corners, weights, _ = mesh.corners(cells, level)
-    unlike = (_kind(found, level_ground, corners) != _kind(found, level_ground, cells)).any((0, -1))
+    judged = known[corners].all(0)
+    unlike = judged & (_kind(found, level_ground, corners) != _kind(found, level_ground, cells)).any((0, -1))
 
     def told(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
         power, error = found["P"][cells], found["P_stderr"][cells]
@@ -233,7 +237,7 @@ def _surprises(
     (logs, errors), (log, error) = told(corners), told(cells)
     guess, doubt = ((weights[..., None] * values).sum(0) for values in (logs, errors))
     missed = (np.abs(guess - log) > TOLERANCE + SURE * (doubt + error)).any(-1)
-    return unlike, missed & ~unlike
+    return unlike, missed & judged & ~unlike
 
 
 def _with_neighbours(blocks: np.ndarray) -> np.ndarray:
