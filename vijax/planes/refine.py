@@ -143,17 +143,14 @@ def rounds(mesh: Mesh, found: Found, level_ground: np.ndarray) -> Iterator[Cells
         yield new
         known[new] = True
         for level in range(1, mesh.levels + 2):
-            unlike, missed = _surprises(mesh, found, level_ground, known, new, level)
+            unlike, missed = _surprises(mesh, found, level_ground, new, level)
             if level in fronts:
                 fronts[level].mark(new[unlike | missed])
             # Blocks that a missed one is split into may miss too, and nothing has been computed in them yet.
             if level - 1 in fronts:
                 fronts[level - 1].mark(new[missed])
-        for level, front in fronts.items():
-            # What lies in these was computed before their corners were.
-            past = front.surrounded(known)
-            unlike, missed = _surprises(mesh, found, level_ground, known, past, level)
-            front.mark(past[unlike | missed])
+        for front in fronts.values():
+            front.surrounded(known)
         wanted = np.zeros(known.size, bool)
         # The finest first: children are looked at a round later, when their corners are known.
         for level, front in fronts.items():
@@ -180,8 +177,8 @@ class _Front:
         for block in itertools.product(*sides):
             self.bad[block] = True
 
-    def surrounded(self, known: np.ndarray) -> Cells:
-        """Take blocks as there whose corners are known though none was split into them; give the known cells in them.
+    def surrounded(self, known: np.ndarray) -> None:
+        """Take blocks as there whose corners are known though none was split into them: they would be filled unjudged.
 
         So it is with blocks at the end of an axis that are too narrow to have a point within: others asked for theirs.
         """
@@ -190,13 +187,7 @@ class _Front:
             tuple(slice(i, i + n) for i, n in zip(place, size, strict=True))
             for place in itertools.product((0, 1), repeat=len(size))
         )
-        blocks = np.all([known[self.points[corner]] for corner in corners], axis=0) & ~self.there
-        self.there |= blocks
-        if not blocks.any():
-            return np.empty(0, int)
-        cells = np.flatnonzero(known)
-        sides = [self.mesh.blocks(axis, self.level, rank) for axis, rank in enumerate(self.mesh.ranks_of(cells))]
-        return cells[np.any([blocks[block] for block in itertools.product(*sides)], axis=0)]
+        self.there |= np.all([known[self.points[corner]] for corner in corners], axis=0)
 
     def split(self, found: Found, level_ground: np.ndarray) -> np.ndarray:
         """Find the blocks to split now: those on a border and their neighbours, and those that a cell contradicts."""
@@ -219,15 +210,11 @@ def _kind(found: Found, level_ground: np.ndarray, cells: Cells) -> np.ndarray:
 
 
 def _surprises(
-    mesh: Mesh, found: Found, level_ground: np.ndarray, known: np.ndarray, cells: Cells, level: int
+    mesh: Mesh, found: Found, level_ground: np.ndarray, cells: Cells, level: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find cells of another kind than a corner of their block, and those of the others where P is missed.
-
-    Where a corner is not known yet there is nothing to compare with.
-    """
+    """Find cells of another kind than a corner of their block, and those of the others where P is missed."""
     corners, weights, _ = mesh.corners(cells, level)
-    judged = known[corners].all(0)
-    unlike = judged & (_kind(found, level_ground, corners) != _kind(found, level_ground, cells)).any((0, -1))
+    unlike = (_kind(found, level_ground, corners) != _kind(found, level_ground, cells)).any((0, -1))
 
     def told(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
         power, error = found["P"][cells], found["P_stderr"][cells]
@@ -237,7 +224,7 @@ def _surprises(
     (logs, errors), (log, error) = told(corners), told(cells)
     guess, doubt = ((weights[..., None] * values).sum(0) for values in (logs, errors))
     missed = (np.abs(guess - log) > TOLERANCE + SURE * (doubt + error)).any(-1)
-    return unlike, missed & judged & ~unlike
+    return unlike, missed & ~unlike
 
 
 def _with_neighbours(blocks: np.ndarray) -> np.ndarray:
