@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from vijax.batch import chain, lanes, rows, stragglers
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, walls_of
@@ -162,12 +162,18 @@ def summarise(
         length_variant=jnp.asarray(scale.length_variant, dtype),
         speed_variant=jnp.asarray(scale.speed_variant, dtype),
     )
-    if more := checks.whole("padded", cells.shape[0] if padded is None else padded, cells.shape[0]) - cells.shape[0]:
-        cells = jnp.concatenate([cells, jnp.broadcast_to(cells[:1], (more, cells.shape[1]))])
+    if padded is not None:
+        cells = _filled_up(cells, checks.whole("padded", padded, cells.shape[0]))
     number = jnp.asarray(count, jnp.int32)
     if on is not None:
         cells, number, settings = jax.device_put((cells, number, settings), on)
     return _run(plan, cells, number, settings, read=count > 0)
+
+
+def _filled_up(cells: Float[Array, "cell in"], size: int) -> Float[Array, "row in"]:
+    """Add copies of the first cell up to so many rows."""
+    more = size - cells.shape[0]
+    return jnp.concatenate([cells, jnp.broadcast_to(cells[:1], (more, cells.shape[1]))]) if more else cells
 
 
 def _run(

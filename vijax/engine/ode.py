@@ -18,7 +18,7 @@ from jaxtyping import Array, Int
 
 from vijax.engine.dense_output import SolverState, dense_output
 from vijax.engine.method import ImpactOutcome, Method, decided, finished
-from vijax.engine.ode_events import LONGEST, Landing, OdeCarry, Sight, Trial, land, look, meet
+from vijax.engine.ode_events import FIRST_STEP, LONGEST, Landing, OdeCarry, Sight, Trial, land, look, meet
 from vijax.engine.ode_friction import Grip, grip, onward, rubbed
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
@@ -29,9 +29,6 @@ from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 
 Solver = Any  # a Runge-Kutta solver of diffrax
-# The first step, in half periods of the forcing; in a contact at most 0.1/kappa. The method chooses all others: a
-# longer one is refused where it is too long, a shorter one costs a few steps.
-_FIRST_STEP = 1e-3
 _VANISHING = 4  # roundings: a shorter step does not advance time
 
 
@@ -115,7 +112,7 @@ class Ode(Method[OdeCarry]):
         x = jnp.where(held, side * state.u - 0.5 * pair.d, state.u)
         if self.dt is None:
             stiffest = reduce(jnp.maximum, named("kappa", pair._soft_kappa()).values())
-            first, inside = zero + _FIRST_STEP, jnp.minimum(_FIRST_STEP, 0.1 / stiffest)
+            first, inside = zero + FIRST_STEP, jnp.minimum(FIRST_STEP, 0.1 / stiffest)
         else:
             first = inside = zero + self.dt
         no = jnp.zeros_like(held)

@@ -16,6 +16,9 @@ from vijax.engine.method import decided
 from vijax.model.membrane import Wall
 from vijax.runtime.arrays import Flag, Scalar
 
+# The first step, in half periods of the forcing; in a contact at most 0.1/kappa. The method chooses all others: a
+# longer one is refused where it is too long, a shorter one costs a few steps.
+FIRST_STEP = 1e-3
 LONGEST = 0.25  # longest step: the acceleration changes its sign at most once within it, but for |gamma| close to 1
 _CLOSED = 1e-4  # of the repeated step: the Taylor polynomial of second order closes what is less, to 1e-13 of the step
 _ATTEMPTS = 6  # repeats after which a crossing is taken as it is: rounding holds it from closing

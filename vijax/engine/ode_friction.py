@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from vijax.engine.dense_output import SolverState
-from vijax.engine.ode_events import OdeCarry, Trial
+from vijax.engine.ode_events import FIRST_STEP, OdeCarry, Trial
 from vijax.model.flow import PI
 from vijax.model.pair import Real
 from vijax.runtime.arrays import Flag, Scalar, present
@@ -28,7 +28,6 @@ class Grip(NamedTuple):
 
 
 _PAST = 16  # roundings by which the moment of release may seem to be over when a ball comes to rest at it
-_FIRST_STEP = 1e-3  # of a ball that is torn loose, in half periods of the forcing
 
 
 def onward(drive: Scalar, friction: Real) -> Scalar:
@@ -93,7 +92,7 @@ def rubbed(
         a, b, c, d = y.tangent
         y = SolverState(y.x, y.z, y.work, (a, b, jump * c, jump * d))
     # One that is torn loose is hardly driven at first: a second turning within its step would be rounding.
-    first = jnp.full_like(new.h, _FIRST_STEP)
+    first = jnp.full_like(new.h, FIRST_STEP)
     return replace(
         new,
         y=y,

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 # Lanes of a block, a thread each. A power of two, as all of Triton's blocks are.
 LANES = 128
-_THREADS = 32  # of a warp
+_WARP = 32  # threads that a GPU runs in step
 
 
 def used() -> bool:
@@ -82,7 +82,7 @@ def _in_one_kernel(work: Callable[[T], T], lanes: T, interpret: bool = False) ->
         out_specs=[part(leaves[i]) for i in moved],
         out_shape=[jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in moved],
         input_output_aliases={i: place for place, i in enumerate(moved)},
-        compiler_params=triton.CompilerParams(num_warps=LANES // _THREADS),
+        compiler_params=triton.CompilerParams(num_warps=LANES // _WARP),
         interpret=interpret,
     )(*leaves, *traced.consts)
     for i, value in zip(moved, found, strict=True):
