@@ -64,3 +64,11 @@ def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, say):
     assert said.startswith("error: ")
     assert say in said
     assert not list(folder.iterdir())
+
+
+def test_a_branch_under_harmonics_says_which(folder, capsys):
+    told = ["--kappa", "40", "--along", "d=0.19:0.21", "--harmonics", "1,0.3", "--phases", "0,0.7"]
+    assert script.main([*told, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0
+    found = vijax.load(folder / "branch.zarr")
+    assert found.attrs["excitation"] == "harmonics 1.0, 0.3 at 0.7 rad"
+    assert "orbits stable" in capsys.readouterr().out

@@ -103,6 +103,7 @@ def test_a_further_axis_and_what_is_fixed_can_be_moved(physical):
         (lambda power: power.isel(kappa=[0]), "two axes of more than one value; got d"),
         (lambda power: power.assign_attrs(until="window"), "until='attractor'"),
         (lambda power: power.assign_attrs(method="rk4"), "method='exact'"),
+        (lambda power: power.assign_attrs(excitation="harmonics 1.0, 0.3"), "excitation='sine'"),
         (lambda power: power.rename(kappa="pressure"), "must be a map that vijax.sweep made"),
         (lambda power: power.assign_attrs(periods=10**9), "1 to 100,000 periods, .*; got 1,000,000,000"),
         (lambda power: 3, "dataset must be"),

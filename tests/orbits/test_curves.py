@@ -504,6 +504,8 @@ def test_a_map_that_curves_cannot_lie_over_is_told(found):
         (made_map().isel(d=[0]), "dataset must have at least two values along each axis; got 1 and 7"),
         (energy_only(made_map()), "got one over d; its motion does not depend on A"),
         (made_map().assign_attrs(membrane="hunt-crossley"), "dataset must be of linear membranes"),
+        (made_map().assign_attrs(excitation="harmonics 1.0, 0.3"), "of the sine; got one of excitation harmonics"),
+        (made_map().assign_attrs(friction=0.1), "dataset must be of no friction; got one of friction 0.1"),
         (made_map().assign(period=0 * made_map()["period"]), "dataset must have periodic cells with impacts"),
         (5, "dataset must be a dataset"),
     ],

@@ -149,7 +149,7 @@ def test_what_is_uncertain_of_a_contact_is_part_of_the_residual(springs, monkeyp
 
 def test_a_ball_that_meets_a_wall_between_is_seen():
     """Impacts on one wall know nothing of the other, which stands in the way of a narrow gap."""
-    wide = vijax.find_orbits(vijax.impact_pair(0.9, 40.0, 0.5), "L", guesses=64, membrane=Plain())
+    wide = vijax.find_orbits(vijax.impact_pair(0.9, 40.0, 0.5, 0.2), "L", guesses=64, membrane=Plain())
     assert len(wide) == 1
     narrow = replace(wide.pair, d=jnp.full(1, 0.02))
     for pair in (narrow, replace(narrow, law=None)):

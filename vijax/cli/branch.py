@@ -12,6 +12,7 @@ import click
 from vijax.cli import membranes, options, process
 from vijax.cli.arguments import about, at_one_point, device, take_axes
 from vijax.cli.closing import finish, pace
+from vijax.cli.excitation import harmonic_options, take_excitation
 from vijax.cli.kinds import Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
@@ -22,6 +23,7 @@ from vijax.runtime.pages import see
 if TYPE_CHECKING:
     from vijax.model.choices import Walls
     from vijax.model.device import Harvester
+    from vijax.model.excitation import Excitation
     from vijax.model.membrane import MembraneLaw
     from vijax.model.pair import ImpactPair
     from vijax.orbits.continuation import Branch
@@ -40,7 +42,8 @@ class BranchRequest:
 
     Attributes:
         pair, device: What the orbits belong to.
-        impacts, guesses, membrane, max_switches: As `orbit_search.search` and `switching.family` take them.
+        impacts, guesses, membrane, excitation, max_switches: As `orbit_search.search` and `switching.family` take
+            them.
         along, within: The parameter that is followed, and its bounds.
         places: Values of it at which orbits to begin with are looked for, in turn.
     """
@@ -50,6 +53,7 @@ class BranchRequest:
     impacts: str
     guesses: int
     membrane: "MembraneLaw | None"
+    excitation: "Excitation | None"
     max_switches: int
     along: str
     within: tuple[float, float]
@@ -96,6 +100,7 @@ def branches(
 def _asked(
     constants: tuple[str, ...], along: str, impacts: str, guesses: int, max_switches: int, wall: "Walls", **given: Any
 ) -> BranchRequest:
+    from vijax.engine.forcing import with_harmonics
     from vijax.model.membrane import with_law
     from vijax.orbits import orbit_search, parameter, switching
     from vijax.runtime import checks
@@ -108,14 +113,15 @@ def _asked(
     own_r = {name: given[name] for name in PARAMETERS if whole(name) == "r" and given[name] is not None}
     pair, made = at_one_point(take_axes(given, start), device(constants), wall)
     pair = _without_r(pair, membrane, own_r)
-    with_law(pair, membrane)  # which says what such a pair cannot have
+    excitation = take_excitation(given)
+    with_harmonics(with_law(pair, membrane), excitation)  # which say what such a pair cannot have
     checks.whole("max_switches", max_switches, 0, switching.MOST_SWITCHES)
     walls, _ = orbit_search.sequences(impacts)
     orbit_search.check_guesses(guesses, len(walls))
     with about("along"):
         parameter.check_along(pair, name, within)
     places = list(_places(float(parameter.value_at(pair, name, made)), name, within, chosen))
-    return BranchRequest(pair, made, impacts, guesses, membrane, max_switches, name, within, places)
+    return BranchRequest(pair, made, impacts, guesses, membrane, excitation, max_switches, name, within, places)
 
 
 def _without_r(pair: "ImpactPair", membrane: "MembraneLaw | None", given: dict[str, str]) -> "ImpactPair":
@@ -180,7 +186,9 @@ def _found(asked: BranchRequest) -> "Orbit":
 def _searched(asked: BranchRequest, pair: "ImpactPair") -> "Orbit":
     from vijax.orbits import orbit_search
 
-    return orbit_search.search(pair, asked.impacts, guesses=asked.guesses, membrane=asked.membrane)
+    return orbit_search.search(
+        pair, asked.impacts, guesses=asked.guesses, membrane=asked.membrane, excitation=asked.excitation
+    )
 
 
 def _summary(followed: "list[Branch]", seconds: float) -> str:
@@ -228,6 +236,7 @@ def _sections() -> Sections:
             options.wall_option(),
             *membranes.membrane_options("law of the soft walls"),
         ],
+        "Excitation": harmonic_options(),
         "Files": [options.quantity_option(BRANCH_QUANTITIES), *options.file_options()],
     }
 
@@ -238,6 +247,7 @@ _EXAMPLES = (
     "--s 0.2 --omega 11 --impacts 1:1/3T --along omega=2.5:13 --max-switches 2",
     "--s 0.3 --along omega0=20:400 --quantity P",
     "--kappa 40 --along d=0.1:0.3 --membrane hunt-crossley --chi 0.3",
+    "--kappa 40 --along d=0.1:0.3 --harmonics 1,0.3",
 )
 
 branch = Page(

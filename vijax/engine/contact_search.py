@@ -216,7 +216,7 @@ def turning_points(
         endless = first & jnp.isinf(ahead) & (m.zeta == 0)
         lost = seeking & (jnp.isnan(ahead) | endless)
         going = seeking & jnp.where(first, ~lost, ahead < seen.exit)
-        seen = _compared(seen, s, w, s > 0, (s > 0) & (v.sign > 0))
+        seen = compared(seen, s, w, s > 0, (s > 0) & (v.sign > 0))
         return _Visit(
             number=v.number + 1,
             s=jnp.where(going & ~first, ahead, s),
@@ -246,13 +246,13 @@ def _settled_turns(contact: _Oscillator, end: _Visit) -> Turns:
         ahead = when + 2 * jnp.ceil(0.5 * (end.s - when))
         there = end.settled & (ahead > 0) & (ahead < seen.exit)
         w, _ = contact.at(jnp.where(there, ahead, 0.0))
-        return _compared(seen, ahead, w, there, there & (low == 1))
+        return compared(seen, ahead, w, there, there & (low == 1))
 
     # A loop, so that a program holds the membrane's flow once for both.
     return lax.fori_loop(0, 2, look, end.seen)
 
 
-def _compared(seen: Turns, s: Scalar, w: Scalar, turns: Flag, rises: Flag) -> Turns:
+def compared(seen: Turns, s: Scalar, w: Scalar, turns: Flag, rises: Flag) -> Turns:
     """Add one turning point to those seen, where it `turns`: a minimum where it `rises` after."""
     higher, lower = turns & (w > seen.highest), rises & (w < seen.lowest)
     return Turns(

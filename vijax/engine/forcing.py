@@ -3,6 +3,7 @@
 Time is told by the knots passed and by what has gone since, so that no digit is lost however long a run is.
 """
 
+import dataclasses
 import math
 from typing import Any
 
@@ -15,12 +16,14 @@ from jaxtyping import Array, Float
 
 from vijax.engine import taylor
 from vijax.engine.taylor import Push
-from vijax.model.excitation import Excitation, Harmonics, Noise, Waveform
+from vijax.model.excitation import Excitation, Harmonics, Noise, Waveform, instance
 from vijax.model.flow import PI
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
 from vijax.model.waves import Wave, Waves
+from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray, Scalar, Values, present
+from vijax.runtime.pages import see
 from vijax.runtime.tiles import padded
 from vijax.runtime.xla import share
 
@@ -182,6 +185,47 @@ def forcing(excitation: Excitation) -> Forcing:
     }
     looped = waveform is not None and waveform.looped
     return Forcing(orders=orders, looped=looped, every=every, noise_every=noise_every, **fields)
+
+
+def with_harmonics(pair: ImpactPair, excitation: Any) -> ImpactPair:
+    """Give the pair of an orbit what shakes it, whose numbers become those of every cell; None leaves it the sine.
+
+    Args:
+        pair: A checked pair.
+        excitation: Harmonics, or None.
+
+    Raises:
+        ValueError: No excitation, or one that does not repeat after every period.
+    """
+    if excitation is None or instance(excitation).sine:
+        return pair
+    if not excitation.periodic:
+        raise ValueError(
+            see(
+                "excitation",
+                f"excitation must repeat every period, as vijax.Harmonics do, for orbits; got {excitation}",
+            )
+        )
+    made, own = forcing(excitation), tiles.library(pair)
+    if not made.orders:
+        raise ValueError("excitation must not cancel; got harmonics that do")
+    wide = [
+        own.broadcast_to(own.asarray(x, pair.d.dtype), (*np.shape(pair.d), x.size)) for x in (made.cosines, made.sines)
+    ]
+    waves = tuple(Wave(order, *(each[..., i] for each in wide)) for i, order in enumerate(made.orders))
+    return dataclasses.replace(pair, waves=waves)
+
+
+def told_harmonics(pair: ImpactPair) -> dict[str, str]:
+    """Name what shakes some pairs of orbits for attributes, one for all; nothing of the sine."""
+    if pair.waves is None:
+        return {}
+    amplitudes = np.zeros(max(wave.order for wave in pair.waves), complex)
+    for wave in pair.waves:
+        amplitudes[wave.order - 1] = complex(np.ravel(wave.c)[0], np.ravel(wave.q)[0])
+    # To 15 digits, as amplitude and phase come back by roots and arcs.
+    rounded = ([float(f"{x:.15g}") for x in each] for each in (np.abs(amplitudes), np.angle(amplitudes)))
+    return {"excitation": str(Harmonics(*rounded))}
 
 
 def _shared_knots(waveform: Waveform | None, noise: Noise | None) -> tuple[float, int, int]:

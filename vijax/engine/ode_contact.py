@@ -13,9 +13,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vijax.engine.contact_search import Turns
-from vijax.model.flow import PI
 from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair
+from vijax.model.waves import pushing, waves_at
 from vijax.runtime.arrays import Scalar
 
 STEPS = 32
@@ -26,22 +26,22 @@ class Contact(eqx.Module):
     """A contact: which wall the ball enters, when, and how fast.
 
     Attributes:
+        pair: What shakes the ball.
         wall: The membrane.
-        gamma: Of the pair.
         side: The wall's, -1 or +1.
         t: Time of the onset.
         speed: Into the wall, > 0.
     """
 
+    pair: ImpactPair
     wall: Wall
-    gamma: Scalar
     side: Scalar
     t: Scalar
     speed: Scalar
 
     def push(self, s: Scalar) -> Scalar:
         """Compute the forcing into the wall, a time s after the onset."""
-        return self.side * (jnp.cos(PI * (self.t + s)) - self.gamma)
+        return self.side * pushing(waves_at(self.pair, self.t + s), self.pair.gamma)
 
     def acceleration(self, s: Scalar, w: Scalar, z: Scalar) -> Scalar:
         """Compute w'' at penetration w and rate z, a time s after the onset."""
@@ -52,7 +52,7 @@ def contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar) -> Contact
     """Make the contact of an onset with a wall of a pair, whose membrane is `pair.law`."""
     here = pair.at(side)
     law: Any = here.law
-    return Contact(law.wall(here), pair.gamma, side, t, speed)
+    return Contact(here, law.wall(here), side, t, speed)
 
 
 class Held(NamedTuple):

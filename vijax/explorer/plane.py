@@ -140,7 +140,7 @@ def explored(dataset: "xr.Dataset") -> ExploredPlane:
     if len(along) < 2:
         got = checks.joined(along) or "none"
         raise ValueError(f"dataset must have two axes of more than one value; got {got}; plots draw what has fewer")
-    for name, needed in (("method", "exact"), ("until", "attractor")):
+    for name, needed in (("method", "exact"), ("until", "attractor"), ("excitation", "sine")):
         if (got := dataset.attrs.get(name, needed)) != needed:
             raise ValueError(
                 f"dataset must be made with {name}={needed!r}, as the page runs its cells; got {got!r}; make it anew"

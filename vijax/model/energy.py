@@ -137,16 +137,18 @@ def _legendre_from_ends(parity: int) -> np.ndarray:
 _EVEN, _ODD = _legendre_from_ends(0), _legendre_from_ends(1)
 
 
-def _squared_speed_short(
-    kappa: Values, mu: Values, ends: tuple[list[Values], list[Values]], z: tuple[Values, Values], half: Values
+def short_contact_work(
+    kappa: Values, mu: Values, ends: tuple[list[Values], list[Values]], z: tuple[Values, Values], duration: Values
 ) -> Values:
-    """Integrate w'^2 over a short contact, without cancellation: a sum of squares of Legendre coefficients.
+    """Compute mu int w'^2 of a short contact, without cancellation: a sum of squares of Legendre coefficients.
 
     Args:
+        kappa, mu: The pair's.
         ends: The forcing and its derivatives at onset and at exit.
         z: Velocity w' at onset and at exit.
-        half: Half the duration.
+        duration: Time from onset to exit.
     """
+    half = 0.5 * duration
     jets = []
     for force, speed in zip(ends, z, strict=True):
         # Derivatives by the equation of motion, times half^j; w = 0 at either end.
@@ -166,7 +168,7 @@ def _squared_speed_short(
         for matrix, part in ((_EVEN, even), (_ODD, odd))
         for row in 0.5 * matrix
     ]
-    return half * sum(squares)
+    return mu * (half * sum(squares))
 
 
 def _long_work(
@@ -252,13 +254,12 @@ def membrane_work(
     work_long = _long_work(kappa, mu, (c, q, onset), turn, (z_in, z_out))
 
     short = jnp.maximum(kappa, PI) * duration < SHORT_REACH
-    half = 0.5 * jnp.where(short, duration, 0.0)
     sin_e, cos_e = c * sin_s + q * cos_s, c * cos_s - q * sin_s
     ends = (
         [onset, -PI * q, -(PI**2) * c],
         [cos_e - steady, -PI * sin_e, -(PI**2) * cos_e],
     )
-    work_short = mu * _squared_speed_short(kappa, mu, ends, (z_in, z_out), half)
+    work_short = short_contact_work(kappa, mu, ends, (z_in, z_out), jnp.where(short, duration, 0.0))
     work = jnp.where(short, work_short, work_long)
     # Exactly zero without damping, with the derivative in mu kept.
     return jnp.where(mu > 0, work, work - lax.stop_gradient(work))

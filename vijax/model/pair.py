@@ -41,6 +41,7 @@ class ImpactPair(eqx.Module):
         gamma: Gravity along the axis over the forcing amplitude, g sin(beta)/A.
         law: The membrane of a periodic orbit, a `MembraneLaw`; None for the linear one, and wherever a method of its
             own knows it.
+        waves: What shakes a periodic orbit from phase 0 on, `vijax.model.waves.Waves`; likewise None for the sine.
 
     Of walls that differ in kappa, r or law these are `Sides`, of what each wall has; kappa of a rigid one beside a soft
     one is None. It has no membrane: the depth of its impacts is 0, and nothing is harvested from them.
@@ -52,6 +53,7 @@ class ImpactPair(eqx.Module):
     r: Float[AnyArray, "..."]
     gamma: Float[AnyArray, "..."]
     law: eqx.Module | None = eqx.field(default=None, kw_only=True)
+    waves: tuple[Any, ...] | None = eqx.field(default=None, kw_only=True)
 
     def __post_init__(self):
         # One of two forms, so that no program need be compiled for walls that differ in one of both alone.
@@ -65,8 +67,11 @@ class ImpactPair(eqx.Module):
 
     @property
     def symmetric(self) -> Any:
-        """Say in which cells the mirror image of a motion is one too, as gamma is 0 and the walls are equal."""
-        differ = self.hard_wall or isinstance(self.law, Sides)
+        """Say in which cells the mirror image of a motion is one too, as gamma is 0 and the walls are equal.
+
+        What shakes the ball is its own opposite half a period later, then, by odd harmonics alone.
+        """
+        differ = self.hard_wall or isinstance(self.law, Sides) or any(wave.order % 2 == 0 for wave in self.waves or ())
         return (self.gamma == 0) & False if differ else symmetric(quantities(self))
 
     def apart(self) -> "ImpactPair":
@@ -204,19 +209,22 @@ def from_membrane_pair(pair: MembranePair) -> ImpactPair:
     return ImpactPair(pair.length_unit, 1 / pair.time_unit, restitution(ratio), pair.g_star / pair.A_star)
 
 
-def check_pair(pair: Any, *, any_law: bool = False) -> ImpactPair:
+def check_pair(pair: Any, *, of_orbit: bool = False) -> ImpactPair:
     """Return the pair, if its fields may be; those of traced values pass unseen.
 
     Args:
         pair: What came.
-        any_law: Whether its membranes need not be linear.
+        of_orbit: Whether it may be that of an orbit, whose membranes need not be linear, nor its shaking the sine.
 
     Raises:
         ValueError: No pair, a field that cannot be, or fields that do not broadcast.
     """
     given = dict(vars(checks.instance("pair", pair, ImpactPair, "vijax.impact_pair(...)")))
-    if (law := given.pop("law")) is not None and not any_law:
+    law, waves = given.pop("law"), given.pop("waves")
+    if law is not None and not of_orbit:
         raise ValueError(see("methods", f"pair must have linear membranes here; got {type(law).__name__}"))
+    if waves is not None and not of_orbit:
+        raise ValueError(see("excitation", "pair must know of no harmonics here; got some; give them as excitation="))
     fields: dict[str, Any] = {}
     for name, value in given.items():
         for argument, one in named(name, value).items():

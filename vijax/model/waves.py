@@ -1,9 +1,11 @@
 """The harmonics of the forcing, and what a ball does under them that meets no wall, or never leaves one."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from vijax.model.flow import PI, Force, Membrane, flight, half_turn, oscillate, steady_response
+from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import Values
 
 
@@ -42,15 +44,25 @@ def sine(t: Values) -> Waves:
     return (Wave(1, cos_t, sin_t),)
 
 
+def waves_at(pair: ImpactPair, t: Values) -> Waves:
+    """Give what shakes a pair from a time on: the sine, unless it is that of an orbit under harmonics."""
+    return sine(t) if pair.waves is None else tuple(wave.later(t) for wave in pair.waves)
+
+
+def pushing(waves: Waves, gamma: Values) -> Values:
+    """Compute what harmonics and gravity push with at the moment of the waves."""
+    return sum((wave.c for wave in waves), start=-gamma)
+
+
 def drift(waves: Waves, gamma: Values, v: Values, s: Values) -> tuple[Values, Values]:
     """Compute how far a ball of velocity v flies in a time s that meets no wall, and its velocity then."""
     zero = jnp.zeros_like(s)
     first = next((wave for wave in waves if wave.order == 1), Wave(1, zero, zero))
     rise, speed = flight(Force(first.c, first.q, gamma), v, s)
-    for wave in waves:
-        if wave.order != 1:
-            further, faster = flight(wave.slowed(), zero, wave.order * s)
-            rise, speed = rise + further / wave.order**2, speed + faster / wave.order
+    if others := _higher(waves):
+        k, force = _on_own_clocks(others, s)
+        further, faster = flight(force, jnp.zeros_like(s), k * s)
+        rise, speed = rise + (further / k**2).sum(axis=0), speed + (faster / k).sum(axis=0)
     return rise, speed
 
 
@@ -77,14 +89,29 @@ def pressed(m: Membrane, waves: Waves, side: Values, gamma: Values, z: Values, s
     zero = jnp.zeros_like(s)
     first = next((wave for wave in waves if wave.order == 1), Wave(1, zero, zero))
     w, rate = oscillate(m, Force(side * first.c, side * first.q, side * gamma), zero, z, s)
-    for wave in waves:
-        k = wave.order
-        if k != 1:
-            deeper, faster = oscillate(_slowed(m, k), wave.times(side / k**2).slowed(), zero, zero, k * s)
-            w, rate = w + deeper, rate + k * faster
+    if others := _higher(waves):
+        k, force = _on_own_clocks([wave.times(side / wave.order**2) for wave in others], s)
+        deeper, faster = oscillate(_slowed(m, k), force, zero, zero, k * s)
+        w, rate = w + deeper.sum(axis=0), rate + (k * faster).sum(axis=0)
     return w, rate
 
 
-def _slowed(m: Membrane, k: int) -> Membrane:
+def _higher(waves: Waves) -> list[Wave]:
+    return [wave for wave in waves if wave.order != 1]
+
+
+def _on_own_clocks(waves: list[Wave], s: Values) -> tuple[Values, Force]:
+    """Stack harmonics, so that a program holds the closed forms once for all; each is the first on its own clock.
+
+    Returns:
+        The orders, shaped to go before the axes of s, and the harmonics along a new first axis.
+    """
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves((waves, s))))
+    k = jnp.reshape(jnp.array([wave.order for wave in waves], s.dtype), (-1, *(1 for _ in shape)))
+    c, q = (jnp.stack([jnp.broadcast_to(getattr(wave, part), shape) for wave in waves]) for part in ("c", "q"))
+    return k, Force(c, q, jnp.zeros_like(c))
+
+
+def _slowed(m: Membrane, k: Values | int) -> Membrane:
     """Give a membrane on a clock that runs k times as fast."""
     return Membrane(m.kappa / k, m.zeta / k, m.omega1 / k, m.rolled)

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vijax.engine.forcing import told_harmonics
 from vijax.model.device import Harvester, depth_unit, one_device, with_constants
 from vijax.model.membrane import told
 from vijax.model.pair import quantities
@@ -61,7 +62,8 @@ def dataset(branches: list[Branch], device: Harvester | None = None) -> "xr.Data
             "along": along,
             "wall": branches[0].orbit.pair.walls,
         }
-        | told(branches[0].orbit.pair),
+        | told(branches[0].orbit.pair)
+        | told_harmonics(branches[0].orbit.pair),
     )
 
 

@@ -1,18 +1,23 @@
 """The contacts of an orbit: their ends, their turning points, their tangent maps; with rigid walls and any membrane.
 
-Linear membranes have closed forms. Contacts with others are flown by a solver of fixed steps (`engine.ode_contact`);
-nothing else of an orbit asks which of the two its membrane is.
+Linear membranes have closed forms, under the sine and under harmonics. Contacts with others are flown by a solver of
+fixed steps (`engine.ode_contact`); nothing else of an orbit asks which of the two its membrane is.
 """
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vijax.engine import contact_search, ode_contact
+from vijax.engine import contact_search, ode_contact, turn_search
 from vijax.engine.roots import implicit_root
+from vijax.engine.taylor import Oscillator, Push
 from vijax.model import energy, flow
+from vijax.model.flow import Membrane
 from vijax.model.pair import ImpactPair
+from vijax.model.wave_work import wave_work
+from vijax.model.waves import pressed, pushing, waves_at
 from vijax.runtime.arrays import Scalar, choose
 
 
@@ -55,12 +60,12 @@ def _end_of_linear(wall: ImpactPair, side, t, speed, stay) -> ContactEnd:
     An onset moved at the same length moves the whole motion, less the free motion of what the state at the onset gains.
     Automatic derivatives would run a tangent of the closed form for every unknown, at five times the cost.
     """
-    zero = jnp.zeros_like(t)
-    membrane, force = flow.membrane(wall, rolled=True), flow.contact_force(wall.gamma, side, t)
-    w, rate = flow.oscillate(membrane, force, zero, speed, stay)
+    membrane, waves = flow.membrane(wall, rolled=True), waves_at(wall, t)
+    w, rate = pressed(membrane, waves, side, wall.gamma, speed, stay)
     h, slope = flow.free_response(membrane, stay)
-    square, begin = membrane.kappa * membrane.kappa, force.c - force.g
-    push = force.at(stay) - membrane.mu * rate - square * w
+    square, begin = membrane.kappa * membrane.kappa, side * pushing(waves, wall.gamma)
+    later = tuple(wave.later(stay) for wave in waves)
+    push = side * pushing(later, wall.gamma) - membrane.mu * rate - square * w
     onset = rate - slope * speed - h * begin
     rate_onset = push + square * h * speed - slope * (begin - membrane.mu * speed)
     return ContactEnd(
@@ -96,8 +101,7 @@ def within(wall: ImpactPair, side, t, speed, s) -> tuple[Scalar, Scalar]:
     if wall.law is not None:
         there = ode_contact.held(ode_contact.contact(wall, side, t, speed), s)
         return there.w, there.z
-    force = flow.contact_force(wall.gamma, side, t)
-    return flow.oscillate(flow.membrane(wall, rolled=True), force, jnp.zeros_like(t), speed, s)
+    return pressed(flow.membrane(wall, rolled=True), waves_at(wall, t), side, wall.gamma, speed, s)
 
 
 def tangent(wall: ImpactPair, side, t, speed, stay) -> Float[Array, "2 2"]:
@@ -128,30 +132,62 @@ def turns(pair: ImpactPair, side, t, speed, stay, real) -> contact_search.Turns:
         found = ode_contact.turns(ode_contact.contact(wall, side, t, speed), stay)
         zero = jnp.zeros_like(t)
         return choose(wanted, found, contact_search.Turns(zero, zero, zero, zero, zero + jnp.inf, zero > 0))
-    force = flow.contact_force(pair.gamma, side, t)
     membrane = flow.membrane(wall, rolled=True)
+    if pair.waves is not None:
+        return _turns_under_harmonics(wall, membrane, side, t, speed, stay, wanted)
+    force = flow.contact_force(pair.gamma, side, t)
     return contact_search.turning_points(membrane, force, jnp.zeros_like(t), speed, wanted, length=stay)
 
 
+def _turns_under_harmonics(wall: ImpactPair, membrane: Membrane, side, t, speed, stay, wanted) -> contact_search.Turns:
+    zero, waves = jnp.zeros_like(t), waves_at(wall, t)
+    spring = Oscillator(membrane.kappa, membrane.kappa * membrane.kappa, membrane.mu, zero + jnp.inf)
+    push = Push(-wall.gamma, zero, waves).turned(side)
+    course = lambda s: pressed(membrane, waves, side, wall.gamma, speed, s)  # noqa: E731
+    look = lambda seen, s, w, rises: contact_search.compared(seen, s, w, s > 0, rises)  # noqa: E731
+    blank = contact_search.Turns(stay, zero, zero, zero, zero + jnp.inf, zero > 0)
+    seen, lost = turn_search.visit_turns(spring, push, course, stay, wanted, look, blank)
+    return eqx.tree_at(lambda turns: turns.lost, seen, lost)
+
+
 class Given(NamedTuple):
-    """What a contact gives: its greatest depth, and the energy that the membrane gets, per mass of the ball."""
+    """What a contact gives: its greatest depth, and the energy that the wall gets, per mass of the ball."""
 
     depth: Float[Array, ""]
     work: Float[Array, ""]
 
 
-def given(wall: ImpactPair, side, t, speed, stay, v_out, crest) -> Given:
-    """Compute what a contact with a soft wall gives; the time `crest` of its deepest point moves with all else.
+def given(pair: ImpactPair, side, knot: Float[Array, "3"], v_out, crest) -> Given:
+    """Compute what a contact gives; the time `crest` of its deepest point moves with all else.
 
     Args:
-        wall, side, t, speed, stay: As in `within`.
+        pair, side: As in `end`.
+        knot: Onset time, speed into the wall and length of the contact.
         v_out: Velocity after the contact.
         crest: Time since the onset, a constant of differentiation.
+
+    Returns:
+        Of a rigid wall the depth of a membrane of kappa = 1 in its place, or 0 beside a soft one.
     """
+    t, speed, stay = knot
+
+    def rigid(wall: ImpactPair) -> Given:
+        return Given(speed * energy.rigid_depth(wall), energy.membrane_work_rigid(speed, wall.r))
+
+    def soft(wall: ImpactPair) -> Given:
+        return _given_to_membrane(wall, side, t, speed, stay, v_out, crest)
+
+    return pair.met(side, rigid, soft)
+
+
+def _given_to_membrane(wall: ImpactPair, side, t, speed, stay, v_out, crest) -> Given:
     of = wall, side, t, speed
     depth, _ = within(wall, side, t, speed, implicit_root(_rate, crest, of))
     if wall.law is not None:
         return Given(depth, ode_contact.held(ode_contact.contact(*of), stay).work)
+    if wall.waves is not None:
+        ends = speed, side * v_out
+        return Given(depth, wave_work(flow.membrane(wall), waves_at(wall, t), wall.gamma, side, stay, ends))
     return Given(depth, energy.membrane_work(wall.kappa, wall.mu, wall.gamma, side, t, stay, side * speed, v_out))
 
 

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vijax.engine.forcing import told_harmonics
 from vijax.model.label import label
 from vijax.model.membrane import told
 from vijax.model.pair import quantities
@@ -74,7 +75,8 @@ def curve_dataset(curves: list[BifurcationCurve] | MapCurves) -> "xr.Dataset":
             "along": " ".join(along),
             "wall": listed[0].orbit.pair.walls,
         }
-        | told(listed[0].orbit.pair),
+        | told(listed[0].orbit.pair)
+        | told_harmonics(listed[0].orbit.pair),
     )
     return made if of_map is None else _with_borders(made, of_map)
 

@@ -15,11 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.model import flow
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.model.sides import at
-from vijax.orbits import contacts, grazing, multipliers, shooting, steady
+from vijax.orbits import contacts, flights, grazing, multipliers, shooting, steady
 from vijax.orbits.arclength_step import PathEquations
 from vijax.orbits.parameter import moved_together
 from vijax.orbits.shooting import Sequence
@@ -144,7 +143,7 @@ class CurvePath(eqx.Module):
             t, speed, _ = knots[self.touch.impact]
             return jnp.stack(contacts.within(pair.at(self.touch.wall), self.touch.wall, t, speed, y[-3]))
         leave = jax.tree.map(lambda leaf: leaf[self.touch.impact], shooting.departures(pair, self.sequence, knots))
-        rise, v = flow.flight(flow.flight_force(pair.gamma, leave.t), -leave.side * leave.speed, y[-3])
+        rise, v = flights.flown(pair, leave.t, -leave.side * leave.speed, y[-3])
         return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])
 
     def _loads(self, device: Harvester, z, pair: ImpactPair, knots) -> Float[Array, "impact"]:
@@ -180,9 +179,9 @@ class CurvePath(eqx.Module):
     def _push(self, pair: ImpactPair, knots, wait) -> Float[Array, ""]:
         """Compute the acceleration away from where the ball touches: off the wall in flight, into it in a contact."""
         if self.condition == "split":
-            return self.touch.wall * flow.acceleration(pair.gamma, knots[self.touch.impact, 0] + wait)
+            return self.touch.wall * flights.acceleration(pair, knots[self.touch.impact, 0] + wait)
         leave = shooting.departures(pair, self.sequence, knots).t[self.touch.impact]
-        return -self.touch.wall * flow.acceleration(pair.gamma, leave + wait)
+        return -self.touch.wall * flights.acceleration(pair, leave + wait)
 
     def tests(self, y, tangent, former) -> CurveTests:
         """Compute the test functions at a point with its tangent, reached along a former tangent."""

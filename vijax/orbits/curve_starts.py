@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
-from vijax.orbits import grazing, symmetry
+from vijax.orbits import flights, grazing, symmetry
 from vijax.orbits.curve_equations import Touch
 from vijax.orbits.events import Point
 from vijax.orbits.parameter import skews
@@ -101,7 +100,7 @@ def _without_impact(orbit: Orbit, place: tuple[float, float]) -> CurveStart | st
     side, (t, _, stay) = int(sequence.side[index]), knots[index]
     if count == 1:
         return "no impact would be left"
-    inside = side * float(flow.acceleration(pair.gamma, t)) > 0
+    inside = side * float(flights.acceleration(pair, t)) > 0
     if inside and pair.rigid:
         return "the forcing holds the ball on its wall"
     rest = np.delete(np.arange(len(knots)), index)

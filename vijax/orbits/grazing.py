@@ -2,22 +2,14 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax.engine import flight_search
-from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.orbits import contacts, shooting
+from vijax.orbits import contacts, flights, shooting
+from vijax.orbits.flights import NOTHING, SAME_TURN
 from vijax.orbits.shooting import Knots, Sequence
-
-_NOTHING = 1.0  # clearance where there is nothing to clear
-# Half periods between two turning points that are one, found twice: far more than the search is off, except where the
-# acceleration vanishes too, and far less than the ball takes from one to another.
-_SAME_TURN = 1e-6
 
 
 class Clearance(NamedTuple):
@@ -27,37 +19,6 @@ class Clearance(NamedTuple):
     flight: Float[Array, ""]  # least room at a turning point in flight: an impact appears
     contact: Float[Array, ""]  # least penetration at a turning point in contact: it splits
     exit: Float[Array, ""]  # least speed away from a wall, over that into it: the ball stays
-
-
-class _Flight(eqx.Module):
-    """A flight on its way: how far it was looked at, the velocity there, the least room at a turn yet, and when."""
-
-    s: Float[Array, ""]
-    v: Float[Array, ""]
-    room: Float[Array, ""]
-    when: Float[Array, ""]
-
-
-def _flight_room(pair: ImpactPair, side, speed, t, length, real, touch):
-    """Find the least distance from a wall at a turning point of the flight that follows a contact.
-
-    Between zeros of the acceleration the velocity is monotone, so that no turning point is missed. One may be known to
-    touch the wall, `touch` after the flight began, and is left out.
-    """
-    force, v0 = flow.flight_force(pair.gamma, t), -side * speed
-
-    def onward(at: _Flight) -> _Flight:
-        end = jnp.minimum(jnp.minimum(flight_search.next_turn(force, at.s), at.s + flight_search.LONGEST_PIECE), length)
-        v_end, turns, turn = flight_search.monotone_piece(force, v0, at.s, at.v, end, real)
-        rise, _ = flow.flight(force, v0, turn)
-        # Where the velocity changes from rising to falling the wall ahead is the right one.
-        room = 0.5 * pair.d - jnp.sign(at.v) * (0.5 * side * pair.d + rise)
-        least = turns & ~(jnp.abs(turn - touch) < _SAME_TURN) & (room < at.room)
-        return _Flight(end, v_end, jnp.where(least, room, at.room), jnp.where(least, turn, at.when))
-
-    start = _Flight(jnp.zeros_like(t), v0, jnp.full_like(t, _NOTHING), jnp.full_like(t, jnp.nan))
-    end = lax.while_loop(lambda at: real & (at.s < length), onward, start)
-    return end.room, end.when
 
 
 class Between(NamedTuple):
@@ -72,7 +33,7 @@ def _contacts(pair: ImpactPair, departure: shooting.Departure, knots: Knots, rea
     t, speed, stay = knots.T
     turns = jax.vmap(contacts.turns, in_axes=(None, 0, 0, 0, 0, 0))(pair, departure.side, t, speed, stay, real)
     deepest = jnp.where(turns.lost | (turns.crest == 0), jnp.nan, turns.crest)
-    shallow = jnp.where(jnp.isfinite(turns.lowest), turns.lowest, _NOTHING)
+    shallow = jnp.where(jnp.isfinite(turns.lowest), turns.lowest, NOTHING)
     return deepest, jnp.where(turns.lost, jnp.nan, shallow), turns.trough
 
 
@@ -99,27 +60,27 @@ def between(
     departure = shooting.departures(pair, sequence, knots)
 
     def least(values):
-        return jnp.where(real, values, _NOTHING).min()
+        return jnp.where(real, values, NOTHING).min()
 
     if touch is None:
         touch = jnp.full_like(departure.t, jnp.nan)
     flight, _ = _flights(pair, departure, real, touch)
     if pair.rigid:
         deepest = jnp.full_like(departure.side, jnp.nan)
-        contact = leaves = jnp.full_like(pair.d, _NOTHING)
+        contact = leaves = jnp.full_like(pair.d, NOTHING)
     else:
         deepest, shallow, _ = _contacts(pair, departure, knots, real)
         if split is not None:
             shallow = _halves(pair, departure, knots, real, split)
         # At a rigid wall a ball that comes at all leaves.
-        exits = jnp.where(pair.hard(departure.side), _NOTHING, departure.speed / knots[:, 1])
+        exits = jnp.where(pair.hard(departure.side), NOTHING, departure.speed / knots[:, 1])
         contact, leaves = least(shallow), least(exits)
     return Between(Clearance(least(knots[:, 1]), least(flight), contact, leaves), deepest)
 
 
 def _flights(pair: ImpactPair, departure: shooting.Departure, real, touch):
     """Find the least room in every flight, and how long after the contact it is."""
-    each = jax.vmap(_flight_room, in_axes=(None, 0, 0, 0, 0, 0, 0))
+    each = jax.vmap(flights.nearest_turn, in_axes=(None, 0, 0, 0, 0, 0, 0))
     return each(pair, departure.side, departure.speed, departure.t, departure.next_t - departure.t, real, touch)
 
 
@@ -131,7 +92,7 @@ def _halves(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real,
     parted = real & jnp.isfinite(split)
     split = jnp.where(parted, split, 0.0)
     onset, speed, stay = knots.T
-    before = jnp.stack([onset, speed, jnp.where(parted, split - _SAME_TURN, stay)], axis=1)
+    before = jnp.stack([onset, speed, jnp.where(parted, split - SAME_TURN, stay)], axis=1)
     after = jnp.stack([onset + split, 0.0 * speed, stay - split], axis=1)
     shallow = [_contacts(pair, departure, half, there)[1] for half, there in ((before, real), (after, parted))]
     return jnp.minimum(*shallow)
@@ -153,8 +114,7 @@ def flight_turns(pair: ImpactPair, sequence: Sequence, knots: Knots) -> NearTurn
     real = sequence.real
     departure = shooting.departures(pair, sequence, jnp.where(real[:, None], knots, 1.0))
     room, when = _flights(pair, departure, real, jnp.full_like(departure.t, jnp.nan))
-    force = flow.flight_force(pair.gamma, departure.t)
-    rise, _ = flow.flight(force, -departure.side * departure.speed, when)
+    rise, _ = flights.flown(pair, departure.t, -departure.side * departure.speed, when)
     return NearTurns(jnp.where(real, room, jnp.inf), when, jnp.sign(0.5 * departure.side * pair.d + rise))
 
 

@@ -98,6 +98,10 @@ def labelled_plane(dataset: "xr.Dataset") -> LabelledPlane:
     return LabelledPlane(along, (axes[0], axes[1]), names, like["period"], cells, wall, kept)
 
 
+# What a map may say of its making, without it, and what curves over it know.
+_ALONE = ("membrane", "linear", "linear membranes"), ("excitation", "sine", "the sine"), ("friction", 0, "no friction")
+
+
 def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
     """Give the two axes of a map, if curves can be followed in their plane; what its cells do is not looked at.
 
@@ -113,8 +117,9 @@ def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
     if min(dataset.sizes[one], dataset.sizes[other]) < 2:
         got = f"{dataset.sizes[one]} and {dataset.sizes[other]}"
         raise ValueError(f"dataset must have at least two values along each axis; got {got}")
-    if dataset.attrs.get("membrane", "linear") != "linear":
-        raise ValueError(f"dataset must be of linear membranes; got one of {dataset.attrs['membrane']}")
+    for name, plain, needed in _ALONE:
+        if (got := dataset.attrs.get(name, plain)) != plain:
+            raise ValueError(f"dataset must be of {needed}; got one of {name} {got}")
     first = {name: x.flat[0] for name, x in _cells(dataset).items()}
     pair = pair_of(first, dataset.attrs.get("wall", "soft"))
     check_plane(pair, {name: (float(dataset[name].min()), float(dataset[name].max())) for name in dims})

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vijax.model import flow
 from vijax.model.pair import ImpactPair, check_pair
-from vijax.orbits import contacts
+from vijax.orbits import contacts, flights
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.programs import jitted
@@ -92,8 +91,7 @@ def _at(pair: ImpactPair, t, side, v_in, v_out, duration, when) -> tuple[Array, 
     """Compute where the ball is a time after each impact."""
     inside = when - t <= duration
     u, v = jax.vmap(partial(_contact, pair))(t, side, v_in, jnp.where(inside, when - t, 0.0))
-    force = flow.flight_force(pair.gamma, t + duration)
-    rise, speed = flow.flight(force, v_out, jnp.where(inside, 0.0, when - t - duration))
+    rise, speed = flights.flown(pair, t + duration, v_out, jnp.where(inside, 0.0, when - t - duration))
     return jnp.where(inside, u, 0.5 * side * pair.d + rise), jnp.where(inside, v, speed)
 
 
@@ -104,7 +102,7 @@ def pieces(pair: ImpactPair, t, side, v_in, v_out, duration, until, samples: int
     held, aloft = duration[:, None] * parts, (until - t - duration)[:, None] * parts
     over_parts = jax.vmap(partial(_contact, pair), in_axes=(None, None, None, 0))
     u, v = jax.vmap(over_parts)(t, side, v_in, held)
-    rise, w = flow.flight(flow.flight_force(pair.gamma, (t + duration)[:, None]), v_out[:, None], aloft)
+    rise, w = flights.flown(pair, (t + duration)[:, None], v_out[:, None], aloft)
     clock = jnp.concatenate([t[:, None] + held, (t + duration)[:, None] + aloft], axis=1)
     wall = (0.5 * side * pair.d)[:, None]
     return clock, jnp.concatenate([u, wall + rise], axis=1), jnp.concatenate([v, w], axis=1)

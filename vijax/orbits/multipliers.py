@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.orbits import contacts
+from vijax.orbits import contacts, flights
 from vijax.orbits.shooting import Knots, Sequence, joined_knots
 
 
@@ -26,7 +26,7 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
         side, t, speed, stay, flight, real = here
 
         def rigid(wall: ImpactPair) -> Float[Array, "2 2"]:
-            return flow.rigid_matrix(wall.r, flow.acceleration(pair.gamma, t), side * speed)
+            return flow.rigid_matrix(wall.r, flights.acceleration(pair, t), side * speed)
 
         def soft(wall: ImpactPair) -> Float[Array, "2 2"]:
             return contacts.tangent(wall, side, t, speed, stay)
@@ -53,7 +53,7 @@ def returned(pair: ImpactPair, sequence: Sequence, knots: Knots, impact: Int[Arr
     def one(before, here):
         place, real = here
         r = pair.at(side[place]).r
-        hit = flow.rigid_matrix(r, flow.acceleration(pair.gamma, t[place]), side[place] * speed[place])
+        hit = flow.rigid_matrix(r, flights.acceleration(pair, t[place]), side[place] * speed[place])
         after = flow.flight_matrix(jnp.where(place == impact, wait, flight[place]))
         return jnp.where(real, after @ hit @ before, before), None
 
@@ -99,7 +99,7 @@ def multiplier_conditions(pair: ImpactPair, sequence: Sequence, knots: Knots) ->
         def rigid(wall: ImpactPair) -> Float[Array, "2 2"]:
             # The matrix for v = v + 0.1, and that part of r which remains.
             t, speed, _ = on
-            contact = flow.rigid_matrix(wall.r, flow.acceleration(pair.gamma, t), side * slow)
+            contact = flow.rigid_matrix(wall.r, flights.acceleration(pair, t), side * slow)
             keep = speed / slow
             return contact * jnp.array([[keep, 1.0], [1.0, keep]])
 

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from vijax.batch.trajectory import trajectory
-from vijax.model.membrane import Laws, with_law
+from vijax.engine.forcing import with_harmonics
+from vijax.model.excitation import Excitation
+from vijax.model.membrane import Laws, said, with_law
 from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
@@ -36,6 +38,7 @@ def from_state(
     period: int = 1,
     settle: int = 0,
     membrane: Laws | None = None,
+    excitation: Excitation | None = None,
 ) -> Orbit:
     """Find periodic orbits near states: each is flown once around to learn its impacts, then corrected by Newton.
 
@@ -45,12 +48,13 @@ def from_state(
         period: Forcing periods of the orbits.
         settle: Forcing periods that the states are flown first: the guesses are then near attractors.
         membrane: The membrane, as in `trajectory`; the linear one if None. States are then flown by "ode".
+        excitation: What shakes the capsule, if not the sine: `vijax.Harmonics`, as orbits need it to repeat.
 
     Returns:
         One orbit a state, stable or not; NO_ORBIT where Newton found none, or the state meets no wall.
 
     Raises:
-        ValueError: period below 1, settle below 0, or an inadmissible pair or state.
+        ValueError: period below 1, settle below 0, or an inadmissible pair, state or excitation.
     """
     period, settle = checks.whole("period", period, 1, _MOST_PERIOD), checks.whole("settle", settle, 0)
     checks.known("pair", check_pair(pair))
@@ -60,8 +64,13 @@ def from_state(
     shape = checks.shapes(u=u, v=v, t=t, **quantities(pair))
     check_start(pair, "u", u)
     pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)
-    lawful = with_law(pair, membrane)
-    follow = partial(trajectory, pair, method="ode" if lawful.law else "exact", membrane=membrane)
+    lawful = with_harmonics(with_law(pair, membrane), excitation)
+    if membrane is not None and lawful.law and lawful.waves:
+        raise ValueError(
+            see("excitation", f"membrane must be linear where states are flown under harmonics; got {said(membrane)}")
+        )
+    method: Any = "ode" if lawful.law else "exact"
+    follow = partial(trajectory, pair, method=method, membrane=membrane, excitation=excitation)
     u, v, t = (np.broadcast_to(x, shape) for x in (u, v, t))
     inside = (t >= 0) & (t < 2)
     if not inside.all():
@@ -91,6 +100,7 @@ def search(
     guesses: int = 2048,
     seed: int = 0,
     membrane: Laws | None = None,
+    excitation: Excitation | None = None,
 ) -> Orbit:
     """Search every orbit with a given impact sequence, stable or unstable, from random guesses.
 
@@ -102,12 +112,14 @@ def search(
         guesses: Random guesses a sequence.
         seed: Of the guesses.
         membrane: The membrane, as in `trajectory`; the linear one if None.
+        excitation: As in `from_state`.
 
     Returns:
         The distinct orbits, each once.
 
     Raises:
-        ValueError: Neither a sequence nor a label, or a period that does not agree with it.
+        ValueError: Neither a sequence nor a label, a period that does not agree with it, or an excitation that does
+            not repeat.
 
     Source: Eqs. (28)-(29) ask for one sequence from one guess.
     """
@@ -116,7 +128,7 @@ def search(
         raise ValueError(f"pair must be one cell; got shape {np.shape(pair.d)}; search each")
     every, period = sequences(impacts, period)
     check_guesses(guesses, len(every))
-    pair = with_law(pair, membrane)
+    pair = with_harmonics(with_law(pair, membrane), excitation)
     draw = np.random.default_rng(checks.seed(seed))
     found = [_search(pair, walls, period, guesses, draw) for walls in every]
     return distinct(concatenate(found))
@@ -172,7 +184,7 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     count = len(walls)
     gaps = draw.dirichlet(np.ones(count), guesses) * 2 * period
     t = draw.uniform(0, 2, (guesses, 1)) + np.cumsum(gaps, axis=1) - gaps[:, :1]
-    speed = draw.uniform(0, _FASTEST, (guesses, count))
+    speed = draw.uniform(0, _FASTEST * _strength(pair), (guesses, count))
     lasts = pair.met(np.asarray(walls), lambda wall: 0.0 * wall.r, _lasts)
     free = np.asarray(lasts)  # contacts without forcing
     knots = np.stack([t, speed, np.minimum(free, 0.5 * gaps)], axis=-1)
@@ -185,6 +197,12 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     first = _each_once(side, claim.knots, np.flatnonzero(np.isfinite(claim.residual)))
     kept = first if first.size else np.zeros(1, int)
     return judged(*jax.tree.map(lambda leaf: np.asarray(leaf)[kept], (wide, sequence, claim)))
+
+
+def _strength(pair: ImpactPair) -> float:
+    """Say how fast the harmonics of a cell can make a ball, beside what the sine can; not less than that."""
+    speeds = [float(np.hypot(wave.c, wave.q)) / wave.order for wave in pair.waves or ()]
+    return max(1.0, sum(speeds))
 
 
 def _lasts(wall: ImpactPair) -> Any:

@@ -93,7 +93,7 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit im
     Returns:
         Orbits in the order of the guesses, each with its `status`.
     """
-    checks.known("pair", check_pair(pair, any_law=True))
+    checks.known("pair", check_pair(pair, of_orbit=True))
     checks.instance("sequence", sequence, Sequence, "vijax.orbits.shooting.Sequence(...)")
     if np.shape(pair.d) != np.shape(sequence.side)[:1]:
         raise ValueError(f"pair must be one cell an orbit; got shape {np.shape(pair.d)}; impact_pair broadcasts")
@@ -143,8 +143,11 @@ def _first_row(*rows: Any) -> Any:
 
 
 def judged(pair: ImpactPair, sequence: Sequence, claim: "Claim") -> Orbit:
-    """Prove claims by the impact map, or say what they lack; of membranes that are not linear by what lies between."""
-    if pair.law is not None:
+    """Prove claims by the impact map, or say what they lack.
+
+    It knows linear membranes and the sine alone: claims of others are judged by what lies between their impacts.
+    """
+    if pair.law is not None or pair.waves is not None:
         return _by_tiles(_prove_between, (pair, sequence, claim))
     return _by_tiles(partial(_prove, ground_of(pair.gamma)), (pair, sequence, claim))
 
@@ -225,10 +228,7 @@ def _prove(ground: Ground, rows: tuple) -> Orbit:
 
 @jitted
 def _prove_between(rows: tuple) -> Orbit:
-    """Judge claims by their turning points, between which nothing can happen.
-
-    The impact map knows linear membranes alone; flights are in closed form here too.
-    """
+    """Judge claims by their turning points, between which nothing can happen."""
     pair, sequence, claim = rows
     clearance, depth, work = jax.vmap(_between)(pair, sequence, claim.knots)
     found = (claim.residual < SAME) & sequence.real.any(axis=1)
@@ -237,11 +237,10 @@ def _prove_between(rows: tuple) -> Orbit:
 
 
 def _between(pair: ImpactPair, sequence: Sequence, knots: shooting.Knots) -> tuple[Clearance, Any, Any]:
-    """Find the clearances of one claim, and depth and work of each impact, with membranes of any law."""
+    """Find the clearances of one claim, and depth and work of each impact."""
     motion, departure = between(pair, sequence, knots), shooting.departures(pair, sequence, knots)
-    each = jax.vmap(lambda side, *impact: contacts.given(pair.at(side), side, *impact))
-    out = -departure.side * departure.speed
-    return motion.clearance, *each(departure.side, *knots.T, out, jnp.nan_to_num(motion.deepest))
+    out, each = -departure.side * departure.speed, jax.vmap(partial(contacts.given, pair))
+    return motion.clearance, *each(departure.side, knots, out, jnp.nan_to_num(motion.deepest))
 
 
 @jitted

@@ -14,9 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.orbits import contacts
+from vijax.orbits import contacts, flights
 from vijax.runtime import ring_solve
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.ring_solve import Ring
@@ -70,14 +69,14 @@ def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Fl
     t, speed, stay, next_t, next_speed = knot
     contact = contacts.end(pair, side, t, speed, stay)
     leave, length, out = t + stay, next_t - t - stay, side * contact.rate
-    rise, v = flow.flight(flow.flight_force(pair.gamma, leave), out, length)
+    rise, v = flights.flown(pair, leave, out, length)
     # In (onset, speed, stay, next onset, next speed): how each end of the flight moves.
     unit = jnp.eye(5, dtype=knot.dtype)
     d_leave, d_next, d_next_speed = unit[0] + unit[2], unit[3], unit[4]
     d_out = side * jnp.pad(contact.rate_slope, (0, 2))
-    push = flow.acceleration(pair.gamma, leave)
+    push = flights.acceleration(pair, leave)
     d_rise = v * d_next + length * d_out - (out + length * push) * d_leave
-    d_v = flow.acceleration(pair.gamma, next_t) * d_next + d_out - push * d_leave
+    d_v = flights.acceleration(pair, next_t) * d_next + d_out - push * d_leave
     back = side == onward
     place = jnp.where(back, rise / length, rise - onward * pair.d)
     d_place = jnp.where(back, (d_rise - rise / length * (d_next - d_leave)) / length, d_rise)

@@ -15,9 +15,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.orbits import grazing
+from vijax.orbits import flights, grazing
 from vijax.orbits.arclength_step import BranchPlace, Path, advance
 from vijax.orbits.branch_path import FIRST_END, Arc, Tests, heading
 from vijax.orbits.events import orbits_at
@@ -108,7 +107,7 @@ def _without_impact(pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> 
     fading = np.flatnonzero(speed <= speed.min() + _SAME_SPEED)
     if fading.size == count:
         return None
-    push = np.asarray(flow.acceleration(pair.gamma, knots[fading, 0]))
+    push = np.asarray(flights.acceleration(pair, knots[fading, 0]))
     splits = bool((side[fading] * push > 0).all())
     for index in fading[::-1] if splits else ():
         end = knots[index, 0] + knots[index, 2] + (0.0 if index else float(sequence.span))
@@ -132,7 +131,7 @@ def with_impact(pair: ImpactPair, found: Touching) -> Insertion:
     # Backwards, so that the places of those before stay what they are.
     for after, wait, wall in zip(found.after[::-1], found.wait[::-1], found.wall[::-1], strict=True):
         onset = knots[after, 0] + wait + (0.0 if found.splits else knots[after, 2])
-        push = abs(float(flow.acceleration(pair.gamma, onset)))
+        push = abs(float(flights.acceleration(pair, onset)))
         if found.splits:
             new, way = (onset, 0.0, knots[after, 2] - wait), (1 / push, 1.0, -1 / push)
             knots[after, 2], along[after, 2] = wait, -np.sqrt(push) / push

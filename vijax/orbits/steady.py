@@ -5,6 +5,7 @@ with every impact's own unknowns kept. Where that derivative means nothing, valu
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ from vijax.model.membrane import Laws, Linear, check_laws, one_of
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.model.sides import at
+from vijax.model.waves import Waves
 from vijax.orbits import contacts, shooting
 from vijax.orbits.grazing import Between, Clearance
 from vijax.orbits.periodic import Orbit
@@ -94,7 +96,8 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None, m
         device: Constants, scalars; those under differentiation traced.
         orbit: One element of a `periodic.Orbit` (`found[0]`) of the device or of a near one: its walls, and
             where Newton begins. Values come from `device`, not from `orbit.pair`.
-        pair: d, kappa, r, gamma to move directly; those of the device unless given. Its wall is the orbit's.
+        pair: d, kappa, r, gamma to move directly; those of the device unless given. Its wall is the orbit's. What
+            shakes it is what shakes the orbit, unless it has harmonics of its own.
         membrane: Numbers of the membrane to move, of the orbit's kind; those of the orbit unless given.
 
     Returns:
@@ -110,7 +113,8 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None, m
             f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbits.periodic` found it"
         )
     # Numbers of one kind, however they are given: each kind would be a program of its own.
-    moved = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair, law))
+    waves = orbit.pair.waves if pair is None or pair.waves is None else pair.waves
+    moved = jax.tree.map(lambda x: jnp.asarray(x, orbit.knots.dtype), (device, pair, law, waves))
     return _near(moved, (orbit.sequence, orbit.knots), kind=orbit.pair.walls)
 
 
@@ -128,14 +132,14 @@ class Found(NamedTuple):
     validity: Validity
 
 
-Moved = tuple[Harvester, ImpactPair | None, Laws | None]
-"""What a steady state is a function of: a device, its pair where that is moved directly, and the membrane."""
+Moved = tuple[Harvester, ImpactPair | None, Laws | None, Waves | None]
+"""What a steady state is a function of: a device, its pair where that is moved directly, membrane and harmonics."""
 
 
 def _pair_of(moved: Moved, kind: Walls) -> ImpactPair:
-    device, pair, law = moved
+    device, pair, law, waves = moved
     pair = device.pair(kind) if pair is None else pair
-    return replace(pair, law=law)
+    return replace(pair, law=law, waves=waves)
 
 
 def _found(moved: Moved, about: tuple[Sequence, Knots], *, kind: Walls) -> Found:
@@ -175,7 +179,7 @@ def _check(device: Any, orbit: Any, pair: Any) -> None:
         raise ValueError(f"orbit must be a single one; got knots of shape {jnp.shape(orbit.knots)}; take found[0]")
     walls = [
         (one.rigid, one.hard_wall)
-        for one in (orbit.pair if pair is None else check_pair(pair, any_law=True), orbit.pair)
+        for one in (orbit.pair if pair is None else check_pair(pair, of_orbit=True), orbit.pair)
     ]
     if walls[0] != walls[1]:
         raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
@@ -257,21 +261,11 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
     Where several results need a derivative XLA would compute it for each of them: sharing them halves what it compiles.
     """
     real, side = sequence.real, jnp.where(sequence.real, sequence.side, 1)
-    t, speed, stay = knots.T
-
-    def rigid(wall: ImpactPair) -> tuple:
-        depth = speed * energy.rigid_depth(wall)
-        if pair.rigid:
-            depth = depth * device.omega / (flow.PI * at(device.omega0, side))
-        return depth, energy.membrane_work_rigid(speed, wall.r)
-
-    def soft(_: ImpactPair) -> tuple:
-        departure = shooting.departures(pair, sequence, knots)
-        out = -departure.side * shared_slopes(departure.speed)
-        each = jax.vmap(lambda side, *impact: contacts.given(pair.at(side), side, *impact))
-        return shared_slopes(tuple(each(departure.side, t, speed, stay, out, jnp.nan_to_num(deepest))))
-
-    depth, work = pair.met(side, rigid, soft)
+    departure = shooting.departures(pair, sequence, knots)
+    out, each = -departure.side * shared_slopes(departure.speed), jax.vmap(partial(contacts.given, pair))
+    depth, work = shared_slopes(each(departure.side, knots, out, jnp.nan_to_num(deepest)))
+    if pair.rigid:
+        depth = depth * device.omega / (flow.PI * at(device.omega0, side))
     depth = jnp.where(real, depth, 0.0) * device.length_unit
     work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
     return depth, energy.harvested_energy(device.at(side), depth), work

@@ -1,0 +1,85 @@
+"""The energy that contacts under several harmonics give: against quadrature, short and long, and with one harmonic."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vijax
+from vijax.engine.roots import implicit_root
+from vijax.model import flow
+from vijax.model.energy import SHORT_REACH, membrane_work
+from vijax.model.wave_work import wave_work
+from vijax.model.waves import Wave, pressed, sine
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(200)
+
+
+def under(*harmonics):
+    """Make harmonics of orders and complex amplitudes."""
+    return tuple(Wave(order, jnp.asarray(x.real), jnp.asarray(x.imag)) for order, x in harmonics)
+
+
+ONE = under((1, 1.0 + 0j))
+THREE = under((1, 0.8 - 0.6j), (2, 0.3 + 0.4j), (5, -0.2 + 0.1j))
+WITHOUT_THE_FIRST = under((2, 0.5 - 0.1j), (3, 0.2 + 0.7j))
+
+
+def contact(m, waves, gamma, side, speed):
+    """Find where a contact ends: its duration, and the rates at both ends."""
+    s = np.linspace(0, 4 * np.pi / float(m.omega1), 4001)
+    w = np.asarray(pressed(m, waves, side, gamma, speed, jnp.asarray(s))[0])
+    after = int(np.argmax(w[1:] <= 0)) + 1
+    low, high = s[after - 1], s[after]
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if float(pressed(m, waves, side, gamma, speed, middle)[0]) > 0 else (low, middle)
+    return high, (jnp.asarray(speed), pressed(m, waves, side, gamma, speed, high)[1])
+
+
+@pytest.mark.parametrize("waves", [ONE, THREE, WITHOUT_THE_FIRST], ids=["one", "three", "higher"])
+@pytest.mark.parametrize(
+    ("kappa", "r", "speed", "tolerance"),
+    [(40.0, 0.5, 0.3, 1e-12), (2.2, 0.7, 0.5, 1e-12), (60.0, 0.9, 1.0, 1e-12), (2 * np.pi, 0.6, 0.4, 1e-12)],
+)
+def test_it_is_the_loss_by_quadrature(waves, kappa, r, speed, tolerance):
+    m, gamma, side = flow.membrane(vijax.impact_pair(0.2, kappa, r)), jnp.asarray(0.1), jnp.asarray(-1.0)
+    duration, z = contact(m, waves, gamma, side, speed)
+    rate = pressed(m, waves, side, gamma, speed, jnp.asarray(0.5 * duration * (NODES + 1)))[1]
+    lost = float(m.mu) * 0.5 * duration * float(WEIGHTS @ np.asarray(rate) ** 2)
+    assert float(wave_work(m, waves, gamma, side, duration, z)) == pytest.approx(lost, rel=tolerance)
+
+
+def test_with_the_sine_alone_it_is_that_of_the_paper():
+    m, gamma, side, t = flow.membrane(vijax.impact_pair(0.2, 25.0, 0.5)), 0.05, 1.0, 0.3
+    waves = sine(jnp.asarray(t))
+    duration, z = contact(m, waves, gamma, side, 0.4)
+    known = membrane_work(m.kappa, m.mu, gamma, side, jnp.asarray(t), jnp.asarray(duration), side * z[0], side * z[1])
+    assert float(wave_work(m, waves, gamma, side, duration, z)) == pytest.approx(float(known), rel=1e-13)
+
+
+def test_short_contacts_keep_their_digits():
+    """Pressed back at once, a contact is a hundredth of a free one long: its closed form would lose ten digits."""
+    m, side, speed = flow.membrane(vijax.impact_pair(0.2, 3.0, 0.5)), 1.0, 1e-3
+    waves = under((1, -1.0 + 0j), (2, -0.5 + 0j))
+    duration, z = contact(m, waves, jnp.asarray(0.0), side, speed)
+    assert 2 * np.pi * duration < SHORT_REACH
+    rate = pressed(m, waves, side, jnp.asarray(0.0), speed, jnp.asarray(0.5 * duration * (NODES + 1)))[1]
+    lost = float(m.mu) * 0.5 * duration * float(WEIGHTS @ np.asarray(rate) ** 2)
+    assert float(wave_work(m, waves, jnp.asarray(0.0), side, duration, z)) == pytest.approx(lost, rel=1e-11)
+
+
+def test_nothing_is_lost_without_damping_but_what_a_little_would_lose_is_known():
+    m, gamma, side, speed = flow.membrane(vijax.impact_pair(0.2, 40.0, 1.0)), jnp.asarray(0.1), 1.0, 0.3
+    duration, _ = contact(m, THREE, gamma, side, speed)
+
+    def work(zeta):
+        damped = flow.Membrane(m.kappa, zeta, jnp.sqrt(m.kappa**2 - zeta**2))
+        ends = implicit_root(lambda s, m: pressed(m, THREE, side, gamma, speed, s)[0], jnp.asarray(duration), damped)
+        rate = pressed(damped, THREE, side, gamma, speed, ends)[1]
+        return wave_work(damped, THREE, gamma, side, ends, (jnp.asarray(speed), rate))
+
+    rate = pressed(m, THREE, side, gamma, speed, jnp.asarray(0.5 * duration * (NODES + 1)))[1]
+    lost = duration * float(WEIGHTS @ np.asarray(rate) ** 2)
+    assert float(work(jnp.asarray(0.0))) == 0.0
+    assert float(jax.grad(work)(jnp.asarray(0.0))) == pytest.approx(lost, rel=1e-9)
