@@ -17,6 +17,7 @@ from vijax.orbits import limits, multipliers, parameter, shooting, symmetry
 from vijax.orbits.curve_plane import check_plane
 from vijax.orbits.curve_starts import curve_start
 from vijax.orbits.events import Point
+from vijax.orbits.map_borders import device_of
 
 DEVICE = vijax.Harvester(V=Sides(1500.0, 2000.0))
 # d, kappa and r of the left wall and of the right one, gamma: of 1:1 orbits that attract.
@@ -251,7 +252,11 @@ BAD = [
         lambda orbit: check_plane(orbit.pair, {"kappa_left": (1.0, 2.0), "omega0_left": (1.0, 2.0)}),
         "kappa_left and omega0_left, which say the same",
     ),
-    (lambda orbit: parameter.check_along(MIXED, "d", (0.1, 0.2)), "between two walls of one kind"),
+    (
+        lambda orbit: parameter.check_along(MIXED, "kappa_right", (10.0, 90.0)),
+        "a rigid wall has no kappa or omega0 or k",
+    ),
+    (lambda orbit: parameter.check_along(MIXED, "kappa", (10.0, 90.0)), "along must be kappa_left, of one wall"),
     (
         lambda orbit: vijax.steady(DEVICE, orbit[0], pair=vijax.impact_pair(0.2, Sides(20.0, None), 0.5)),
         "pair must have the walls of the orbit",
@@ -264,3 +269,98 @@ def test_what_cannot_be_is_told(orbits, act, words):
     one = jax.tree.map(lambda x: np.asarray(x)[None], orbits[0])
     with pytest.raises(ValueError, match=words):
         act(one)
+
+
+def followed(right):
+    """Follow the attractor between a membrane and another wall, from where its branch grazes, or flips, on."""
+    pair = vijax.impact_pair(0.2, Sides(40.0, right), 0.5, 0.02)
+    some = vijax.find_orbits(pair, "LR", guesses=256)
+    size = np.abs(np.asarray(some.multipliers)).max(axis=1)
+    one = int(np.flatnonzero((size > 0.35) & (size < 0.4))[0])
+    (branch,) = vijax.follow_orbits(some[one : one + 1], "d", (0.16, 0.24))
+    return branch
+
+
+@pytest.fixture(scope="module")
+def beside_rigid():
+    """A branch between a membrane on the left and a rigid wall on the right."""
+    return followed(None)
+
+
+def last_flip(branch):
+    return [point for point in branch.points if point.kind == "flip"][-1]
+
+
+def test_a_branch_beside_a_rigid_wall_flips_where_runs_double_their_period(beside_rigid):
+    assert beside_rigid.ends == ("grazing flight", "high")
+    graze, flip = beside_rigid.points
+    assert (graze.kind, graze.gained, flip.kind) == ("grazing flight", 0, "flip")
+    first = jax.tree.map(lambda leaf: np.asarray(leaf)[0], vijax.orbit_impacts(flip.orbit))
+    left, side = float(first.t[0] + first.duration[0]) % 2, int(first.side[0])
+    apart = []
+    for off in (-2e-4, 2e-4):
+        d = flip.value + off
+        pair = vijax.impact_pair(d, Sides(40.0, None), 0.5, 0.02)
+        run = vijax.trajectory(pair, side * d / 2, float(first.v_out[0]), 2000, left)
+        v = np.asarray(run.states.v)
+        apart.append((abs(v[-1] - v[-2]), abs(v[-1] - v[-3])))
+    (doubled, twice), (same, _) = apart
+    assert doubled > 1e-3
+    assert max(twice, same) < 1e-6
+
+
+@pytest.mark.long
+def test_a_branch_beside_a_rigid_wall_is_the_limit_of_those_beside_stiff_ones(beside_rigid):
+    one, other = (float(last_flip(followed(stiff)).value) for stiff in (1e4, 2e4))
+    rigid = float(last_flip(beside_rigid).value)
+    assert abs(other - rigid) < 0.6 * abs(one - rigid) < 1e-4
+    assert 2 * other - one == pytest.approx(rigid, abs=5e-7)
+
+
+@pytest.mark.long
+def test_a_graze_at_the_membrane_beside_a_rigid_wall_leads_on():
+    pair = vijax.impact_pair(0.2, Sides(40.0, None), 0.5, 0.02)
+    some = vijax.find_orbits(pair, "LR", guesses=256)
+    (branch,) = vijax.follow_orbits(some[:1], "d", (0.16, 0.24))
+    (graze,) = [point for point in branch.points if point.kind == "grazing flight"]
+    assert (graze.gained, graze.wall) in ((1, -1), (-1, -1))
+
+
+@pytest.mark.long
+def test_curves_beside_a_rigid_wall_are_the_limit_of_those_beside_stiff_ones(beside_rigid):
+    def across(branch):
+        (curve,) = vijax.follow_curves([last_flip(branch)], "d", {"d": (0.14, 0.25), "r_left": (0.45, 0.6)})
+        d, r = curve.values.T
+        order = np.argsort(r)
+        return float(np.interp(0.53, r[order], d[order])), [point.kind for point in curve.points]
+
+    (rigid, met), (one, also) = across(beside_rigid), across(followed(1e4))
+    assert met == also
+    assert one == pytest.approx(rigid, abs=2e-4)
+
+
+@pytest.mark.long
+def test_a_graze_at_a_rigid_wall_beside_a_membrane_begins_a_curve_that_meets_that_of_the_flip(beside_rigid):
+    found = vijax.follow_curves(list(beside_rigid.points), "d", {"d": (0.14, 0.25), "r_left": (0.4, 0.6)})
+    both = {curve.kind: [point for point in curve.points if point.kind == "flip-graze"] for curve in found}
+    assert set(both) == {"grazing", "flip"}
+    np.testing.assert_allclose(both["grazing"][0].values, both["flip"][0].values, rtol=0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def half_rigid():
+    """A map of a membrane on the left and a rigid wall on the right."""
+    axes = {"d": np.linspace(0.1, 0.3, 32), "kappa_left": np.geomspace(10, 100, 16)}
+    return vijax.sweep(**axes, r=0.5, gamma=0.02, wall="rigid_right")
+
+
+def test_the_device_of_a_map_with_one_rigid_wall_has_a_membrane(half_rigid):
+    device = device_of(half_rigid)
+    assert float(device.omega0.left) == pytest.approx(10.0 * float(device.omega) / np.pi)
+    assert np.isfinite(float(device.omega0.right))
+
+
+@pytest.mark.long
+def test_curves_explain_the_borders_of_a_map_with_one_rigid_wall(half_rigid):
+    found = vijax.bifurcation_curves(half_rigid)
+    assert found.explained == found.borders > 60

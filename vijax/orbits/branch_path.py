@@ -94,8 +94,9 @@ class Arc(eqx.Module):
         room = grazing.between(pair, self.sequence, knots).clearance
         # At a soft wall the parameter goes as the square of the speed of an impact that fades: at that graze its share
         # of the tangent vanishes without a fold. Over the speed it does not, and has the same sign on real orbits.
+        soft = self.sequence.real & ~pair.hard(self.sequence.side)
         return Tests(
-            fold=tangent[-1] if pair.rigid else tangent[-1] / room.speed,
+            fold=tangent[-1] / jnp.where(soft, knots[:, 1], 1.0).min(),
             plus=1 - trace + determinant,
             minus=1 + trace + determinant,
             speed=room.speed,

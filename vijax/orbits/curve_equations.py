@@ -193,8 +193,9 @@ class CurvePath(eqx.Module):
             here = jnp.arange(knots.shape[0], dtype=jnp.int32) == self.touch.impact
             touches = {self.condition: jnp.where(here, y[-3], jnp.nan)}
             push = self._push(pair, knots, y[-3])
-            if pair.rigid:
-                resonance = multipliers.returned(pair, self.sequence, knots, self.touch.impact, y[-3])
+            if pair.rigid or pair.hard_wall:
+                met = multipliers.returned(pair, self.sequence, knots, self.touch.impact, y[-3])
+                resonance = jnp.where(pair.hard(self.touch.wall), met, one)
         elif self.device is not None and self.touch.alike is not None:
             plus, minus = multipliers.multiplier_conditions(pair, self.sequence, knots)
             loads = self._loads(self.device, y[-2:], pair, knots)

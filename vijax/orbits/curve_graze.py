@@ -29,9 +29,7 @@ def curve_passage(path: CurvePath, y: np.ndarray, test: str) -> Passage | None:
         test: What grazes: flight, contact, impact or exit.
     """
     pair, knots = path.pair_and_knots(y)
-    if pair.rigid or path.condition != "multiplier":
-        return None
-    if (found := touching(pair, path.sequence, np.asarray(knots), test)) is None:
+    if path.condition != "multiplier" or (found := touching(pair, path.sequence, np.asarray(knots), test)) is None:
         return None
     fewer = alone(among(path, found.side))
     start = unknowns(found.knots, y[-2:])

@@ -45,7 +45,7 @@ def check_points(points: Any) -> list[Point]:
     for index, point in enumerate(listed):
         if len(check_orbit(point.orbit)) != 1:
             raise ValueError(f"points must have one orbit each; got {len(point.orbit)} at index {index}; take [0:1]")
-        if point.orbit.pair.rigid != listed[0].orbit.pair.rigid:
+        if point.orbit.pair.walls != listed[0].orbit.pair.walls:
             raise ValueError(f"points must be of one kind of wall; got soft and rigid ones, the first at index {index}")
     return listed
 
@@ -101,7 +101,7 @@ def _without_impact(orbit: Orbit, place: tuple[float, float]) -> CurveStart | st
     if count == 1:
         return "no impact would be left"
     inside = side * float(flights.acceleration(pair, t)) > 0
-    if inside and pair.rigid:
+    if inside and pair.hard(side):
         return "the forcing holds the ball on its wall"
     rest = np.delete(np.arange(len(knots)), index)
     rest = np.append(rest, rest[-1:])  # The row keeps its width: the last impact stands twice, as padding.

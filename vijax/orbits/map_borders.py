@@ -64,11 +64,13 @@ def device_of(dataset: "xr.Dataset") -> Harvester:
     first = {str(name): float(dataset[name].values.flat[0]) for name in (*_MOVED, *walls) if name in dataset.coords}
     device = replace(told_device(dataset.attrs), **{name: first.pop(name) for name in _MOVED if name in first})
     natural = device.omega / math.pi
+    # The kappa of a rigid wall beside a membrane is infinite in a map, and no constant of a device.
+    finite = {name: value for name, value in first.items() if math.isfinite(value)}
     return with_constants(
         device,
         **{
             name.replace("kappa", "omega0"): value * natural if name.startswith("kappa") else value
-            for name, value in first.items()
+            for name, value in finite.items()
         },
     )
 

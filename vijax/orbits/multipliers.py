@@ -24,14 +24,7 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
 
     def one(before, here):
         side, t, speed, stay, flight, real = here
-
-        def rigid(wall: ImpactPair) -> Float[Array, "2 2"]:
-            return flow.rigid_matrix(wall.r, flights.acceleration(pair, t), side * speed)
-
-        def soft(wall: ImpactPair) -> Float[Array, "2 2"]:
-            return contacts.tangent(wall, side, t, speed, stay)
-
-        step = flow.flight_matrix(flight) @ pair.met(side, rigid, soft)
+        step = flow.flight_matrix(flight) @ _contact_map(pair, side, t, speed, stay)
         return jnp.where(real, step @ before, before), None
 
     # A cyclic shift of the product: contact then flight, which has the multipliers of flight then contact.
@@ -40,20 +33,32 @@ def monodromy(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array
     return jnp.where(sequence.mirrored, -1.0, 1.0) * around
 
 
-def returned(pair: ImpactPair, sequence: Sequence, knots: Knots, impact: Int[Array, ""], wait) -> Float[Array, ""]:
-    """Compute how far u is off once around, over how far u' was, from so long after an impact at a rigid wall.
+def _contact_map(pair: ImpactPair, side, t, speed, stay) -> Float[Array, "2 2"]:
+    """Compute the tangent map of a contact in (du, du'), its saltations included."""
 
-    Where the ball just touches a wall then, orbits that hit it there depart from the graze by their speed times this.
+    def rigid(wall: ImpactPair) -> Float[Array, "2 2"]:
+        return flow.rigid_matrix(wall.r, flights.acceleration(pair, t), side * speed)
+
+    def soft(wall: ImpactPair) -> Float[Array, "2 2"]:
+        return contacts.tangent(wall, side, t, speed, stay)
+
+    return pair.met(side, rigid, soft)
+
+
+def returned(pair: ImpactPair, sequence: Sequence, knots: Knots, impact: Int[Array, ""], wait) -> Float[Array, ""]:
+    """Compute how far u is off once around, over how far u' was, from so long after the end of a contact.
+
+    Where the ball just touches a rigid wall then, orbits that hit it there depart from the graze by their speed times
+    this.
     """
     side, _, joined = joined_knots(sequence, knots)
-    t, speed, _, next_t, _ = joined.T
-    flight, index = next_t - t, jnp.arange(side.size, dtype=jnp.int32)
+    t, speed, stay, next_t, _ = joined.T
+    flight, index = next_t - t - stay, jnp.arange(side.size, dtype=jnp.int32)
     count = sequence.real.sum(dtype=jnp.int32)
 
     def one(before, here):
         place, real = here
-        r = pair.at(side[place]).r
-        hit = flow.rigid_matrix(r, flights.acceleration(pair, t[place]), side[place] * speed[place])
+        hit = _contact_map(pair, side[place], t[place], speed[place], stay[place])
         after = flow.flight_matrix(jnp.where(place == impact, wait, flight[place]))
         return jnp.where(real, after @ hit @ before, before), None
 

@@ -4,7 +4,6 @@ Of the pair itself it moves alone; of the device it moves several of the pair's 
 """
 
 import math
-import operator
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -50,15 +49,20 @@ def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Valu
         return _with(pair, **{along: x})
     fields: dict[str, Any] = {}
     for name, power in _POWERS[along].items():
-        value, factor = field_of(pair, name), (x / start) ** power
-        # Rigid walls have no kappa.
-        fields[name] = None if value is None else each(partial(operator.mul, factor), value)
+        fields[name] = each(partial(_times, (x / start) ** power), field_of(pair, name))
     return _with(pair, **fields)
 
 
+def _times(factor: Values, value: Any) -> Any:
+    """Multiply a quantity of a wall; rigid ones have no kappa."""
+    return None if value is None else factor * value
+
+
 def _shared(value: Any) -> Any:
-    """Take what both walls have alike."""
-    return value.left if isinstance(value, Sides) else value
+    """Take what both walls have alike, or what one of them has alone."""
+    if not isinstance(value, Sides):
+        return value
+    return value.right if value.left is None else value.left
 
 
 def _with(pair: ImpactPair, **values: Any) -> ImpactPair:
@@ -122,18 +126,15 @@ def check_bounds(pair: ImpactPair, along: str, within: tuple[float, float], devi
 
 def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tuple[float, float]:
     """Take the bounds of a parameter; raise ValueError unless branches of such a pair can be followed between them."""
-    if pair.hard_wall:
-        raise ValueError("orbit must be between two walls of one kind to be followed; got one rigid and one soft")
-    stiff = [name for name, (first, *_) in MOVED.items() if whole(first) == "kappa" and pair.rigid]
-    of_both = [name for name in stiff if not of_both_walls(name)]
-    hint = f"a rigid wall has no {' or '.join(of_both)}" if stiff else ""
+    stiff = [name for name, (first, *_) in MOVED.items() if whole(first) == "kappa" and field_of(pair, first) is None]
+    hint = f"a rigid wall has no {' or '.join(dict.fromkeys(map(whole, stiff)))}" if stiff else ""
     lossless = [name for name in MOVED if whole(name) == "r" and pair.r is None]
     hint = "the loss of this membrane is told by its law, not by r" if lossless else hint
     checks.choice("along", along, [name for name in MOVED if name not in (*stiff, *lossless)], hint)
     (first, *more) = MOVED[along]
     both = getattr(pair, first, None)
     if not more and isinstance(both, Sides) and not np.array_equal(both.left, both.right):
-        of_walls = " or ".join(f"{along}_{side}" for side in SIDES)
+        of_walls = " or ".join(f"{along}_{side}" for side in SIDES if f"{along}_{side}" not in stiff)
         raise ValueError(f"along must be {of_walls}, of one wall, where walls differ; got {along!r}")
     bounds = checks.bounds("within", units.plain(along, within))
     for bound in bounds:

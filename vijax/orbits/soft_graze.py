@@ -79,24 +79,28 @@ _flights, _contacts = jitted(grazing.flight_turns), jitted(grazing.contact_turns
 
 
 def touching(pair: ImpactPair, sequence: Sequence, knots: np.ndarray, test: str) -> Touching | None:
-    """Find what touches a wall at a graze; None where no impact would be left.
+    """Find what touches a soft wall at a graze; None at a rigid one, and where no impact would be left.
 
     Args:
         pair, sequence, knots: Of the orbit that has come to it, alone.
         test: Which clearance is zero: of `flight` or `contact` where impacts begin, of `speed` (impact) or `exit` where
             they end.
     """
+    if pair.rigid:
+        return None
     if test not in ("flight", "contact"):
         return _without_impact(pair, sequence, knots)
     splits, count = test == "contact", int(sequence.real.sum())
     turns = jax.tree.map(np.asarray, (_contacts if splits else _flights)(pair, sequence, tiles.arrays(knots)))
     after = np.flatnonzero(turns.room <= turns.room.min() + _SAME_ROOM)
+    if np.any(pair.hard(turns.wall[after])):
+        return None
     side = np.asarray(sequence.side)[:count]
     return Touching(side, knots[:count], splits, after, turns.when[after], turns.wall[after])
 
 
 def _without_impact(pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> Touching | None:
-    """Leave out the impacts whose speed has come to zero; None where these are all.
+    """Leave out the impacts whose speed has come to zero; None where these are all, or are at a rigid wall.
 
     Where the acceleration is away from the wall the contact, too, has no length. Else it is the flight before it that
     has none, and the contact before goes on through it.
@@ -105,7 +109,7 @@ def _without_impact(pair: ImpactPair, sequence: Sequence, knots: np.ndarray) -> 
     knots, side = knots[:count].copy(), np.asarray(sequence.side)[:count]
     speed = np.abs(knots[:, 1])
     fading = np.flatnonzero(speed <= speed.min() + _SAME_SPEED)
-    if fading.size == count:
+    if fading.size == count or np.any(pair.hard(side[fading])):
         return None
     push = np.asarray(flights.acceleration(pair, knots[fading, 0]))
     splits = bool((side[fading] * push > 0).all())
@@ -196,7 +200,7 @@ def branch_passage(arc: Arc, y: np.ndarray, test: str, sign: float) -> Passage |
         sign: Whether the parameter rises along the path, which it goes on to do.
     """
     pair, knots = arc.pair_and_knots(y)
-    if pair.rigid or (found := touching(pair, arc.sequence, np.asarray(knots), test)) is None:
+    if (found := touching(pair, arc.sequence, np.asarray(knots), test)) is None:
         return None
     # The orbit with fewer impacts is regular at the graze, and has the multipliers of both. It is to have the parameter
     # of the graze: at a fold there, where none has, the sign of the parameter says nothing of the way on.
