@@ -203,6 +203,8 @@ def test_what_knows_no_harmonics_refuses_the_pair_of_an_orbit(rough):
             call()
 
 
-def test_states_of_other_membranes_are_not_flown_under_harmonics():
-    with pytest.raises(ValueError, match="membrane must be linear where states are flown under harmonics; got Plain"):
-        vijax.orbits_from_states(PAIR, 0.0, 0.1, membrane=Plain(), excitation=ROUGH)
+@pytest.mark.long
+def test_a_run_with_any_membrane_comes_to_an_orbit(rough):
+    found = vijax.orbits_from_states(PAIR, 0.0, 0.1, settle=100, membrane=Plain(), excitation=ROUGH)
+    assert found.status[0] == Status.OK
+    np.testing.assert_allclose(np.asarray(found.knots)[0, :3], np.asarray(rough.knots)[0, :3], rtol=0, atol=1e-10)

@@ -187,6 +187,18 @@ def forcing(excitation: Excitation) -> Forcing:
     return Forcing(orders=orders, looped=looped, every=every, noise_every=noise_every, **fields)
 
 
+def harmonics_of(excitation: Excitation) -> Waves:
+    """List the harmonics of an excitation that has nothing else, from phase 0 on.
+
+    Raises:
+        ValueError: Harmonics that cancel.
+    """
+    made = forcing(excitation)
+    if not made.orders:
+        raise ValueError("excitation must not cancel; got harmonics that do")
+    return made.waves(jnp.zeros(()))
+
+
 def with_harmonics(pair: ImpactPair, excitation: Any) -> ImpactPair:
     """Give the pair of an orbit what shakes it, whose numbers become those of every cell; None leaves it the sine.
 
@@ -206,14 +218,9 @@ def with_harmonics(pair: ImpactPair, excitation: Any) -> ImpactPair:
                 f"excitation must repeat every period, as vijax.Harmonics do, for orbits; got {excitation}",
             )
         )
-    made, own = forcing(excitation), tiles.library(pair)
-    if not made.orders:
-        raise ValueError("excitation must not cancel; got harmonics that do")
-    wide = [
-        own.broadcast_to(own.asarray(x, pair.d.dtype), (*np.shape(pair.d), x.size)) for x in (made.cosines, made.sines)
-    ]
-    waves = tuple(Wave(order, *(each[..., i] for each in wide)) for i, order in enumerate(made.orders))
-    return dataclasses.replace(pair, waves=waves)
+    made, own = harmonics_of(excitation), tiles.library(pair)
+    numbers = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, pair.d.dtype), np.shape(pair.d)), made)
+    return dataclasses.replace(pair, waves=numbers)
 
 
 def told_harmonics(pair: ImpactPair) -> dict[str, str]:

@@ -1,6 +1,5 @@
 """The door of the methods: which there are by name, what each is told, and how a map says so."""
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, get_args
@@ -37,7 +36,7 @@ def choose(
 ) -> Method | None:
     """Make the method of a name, with what it is told; None for the exact one, which is told nothing.
 
-    Any excitation but the sine has a method of its own, as exact as that of the sine.
+    Any excitation but the sine has a method of its own, as exact as that of the sine; "ode" takes harmonics, too.
 
     Args:
         method: "exact", "ode" or "rk4".
@@ -61,10 +60,14 @@ def choose(
         if method not in takers and name != "membrane":
             theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
             raise ValueError(see("methods", f"{name} must be left out unless method is {theirs}; got {got}"))
-    if excitation is not None and not excitation.sine:
-        return _driven(method, excitation)
+    shaken = None if excitation is None or excitation.sine else excitation
+    if shaken is not None and (method == "rk4" or (method == "ode" and not shaken.periodic)):
+        also = "" if method == "rk4" else '; "ode" knows harmonics alone'
+        raise ValueError(
+            see("excitation", f'method must be "exact" with an excitation; got {checks.shown(method)}{also}')
+        )
     if method == "exact":
-        return None
+        return None if shaken is None else _driven(shaken)
     if wall != "soft":
         raise ValueError(
             see("methods", f'wall must be "soft" for method={_quoted(method)}; got {wall!r}; use method="exact"')
@@ -82,15 +85,17 @@ def choose(
     atol = checks.real("atol", given.get("atol", atol), "a finite number above 0", lambda x: 0 < x < math.inf)
     must = "a finite number of at least 0"
     friction = checks.real("friction", given.get("friction", 0.0), must, lambda x: 0 <= x < math.inf)
+    if friction and shaken is not None:
+        raise ValueError(see("excitation", f"friction must be left out with an excitation; got {friction}"))
+    from vijax.engine.forcing import harmonics_of
     from vijax.engine.ode import Ode
 
-    return Ode(solver, rtol, atol, friction=friction or None, law=law)
+    waves = None if shaken is None else harmonics_of(shaken)
+    return Ode(solver, rtol, atol, friction=friction or None, harmonics=waves, law=law)
 
 
-def _driven(method: str, excitation: Excitation) -> Method:
+def _driven(excitation: Excitation) -> Method:
     """Make the method of an excitation that is not the sine."""
-    if method != "exact":
-        raise ValueError(see("excitation", f'method must be "exact" with an excitation; got {checks.shown(method)}'))
     from vijax.engine.driven import Driven
     from vijax.engine.forcing import forcing
 
@@ -99,13 +104,13 @@ def _driven(method: str, excitation: Excitation) -> Method:
 
 def record(method: Method | None, excitation: Excitation | None = None) -> dict[str, Any]:
     """Name what a method was told, for the attributes of a map."""
-    if excitation is not None and not excitation.sine:
-        return {"excitation": str(excitation)}
-    if method is None:
-        return {}
-    told = {field.name: getattr(method, field.name) for field in dataclasses.fields(method) if field.name != "law"}
+    shaken = {} if excitation is None or excitation.sine else {"excitation": str(excitation)}
+    options = dict.fromkeys(name for names in OPTIONS.values() for name in names)
+    told = {name: getattr(method, name) for name in options if hasattr(method, name)}
+    # The exact methods are told nothing, and know the linear membrane alone.
+    membrane = {"membrane": said(method.law)} if method is not None and told else {}
     numbers = {name: np.asarray(value).item() for name, value in told.items() if value is not None}
-    return {"membrane": said(method.law)} | numbers
+    return membrane | numbers | shaken
 
 
 def _quoted(name: str) -> str:

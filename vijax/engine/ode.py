@@ -25,6 +25,7 @@ from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair, Real
 from vijax.model.records import State
 from vijax.model.sides import Sides, at, named
+from vijax.model.waves import Waves, pushing, sine
 from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 
@@ -36,17 +37,23 @@ class FieldArguments(eqx.Module):
     """What a smooth spell of the motion depends on: the wall it is at, and its side (0: flight).
 
     Friction that brakes the ball is a part of gamma; `slides` says whether it moves at all, None without friction.
+    `waves` is the forcing from phase 0 on; None for the sine.
     """
 
     gamma: Scalar
     mode: Int[Array, ""]
     wall: Wall
     slides: Any = None
+    waves: Waves | None = None
 
 
 def _field(t: Any, y: SolverState, spell: FieldArguments) -> SolverState:
     held = spell.mode != 0
-    force = jnp.where(spell.mode < 0, -1.0, 1.0) * (jnp.cos(PI * t) - spell.gamma)
+    if spell.waves is None:
+        push = jnp.cos(PI * t) - spell.gamma
+    else:
+        push = pushing(tuple(wave.later(t) for wave in spell.waves), spell.gamma)
+    force = jnp.where(spell.mode < 0, -1.0, 1.0) * push
     pull = jnp.where(held, spell.wall(y.x, y.z), 0.0)
     work = tangent = None
     if y.work is not None:
@@ -82,6 +89,7 @@ class Ode(Method[OdeCarry]):
         rtol, atol: Tolerances of position and velocity, step by step.
         dt: A constant step instead, for measuring orders of convergence.
         friction: Of the capsule, over the forcing's amplitude; None without.
+        harmonics: Of the forcing, from phase 0 on; None for the sine.
     """
 
     solver: str = eqx.field(static=True)
@@ -89,6 +97,11 @@ class Ode(Method[OdeCarry]):
     atol: Real
     dt: Real | None = None
     friction: Real | None = None
+    harmonics: Waves | None = None
+
+    def waves(self, t: Any) -> Waves:
+        """Give the harmonics of the forcing from phase t on."""
+        return sine(t) if self.harmonics is None else tuple(wave.later(t) for wave in self.harmonics)
 
     @property
     def arithmetic(self) -> bool:
@@ -209,7 +222,7 @@ class Ode(Method[OdeCarry]):
         half, held = 0.5 * pair.d, m.mode != 0
         side = jnp.where(held, m.mode.astype(half.dtype), jnp.sign(lax.stop_gradient(m.aim)))
         wall, grasp, way = at(walls, side), None, None
-        spell = FieldArguments(pair.gamma, m.mode, wall)
+        spell = FieldArguments(pair.gamma, m.mode, wall, waves=self.harmonics)
         if m.slip is not None:
             friction: Any = self.friction
             spell = FieldArguments(pair.gamma + friction * m.slip, m.mode, wall, m.slip != 0)

@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike
 from vijax.batch.trajectory import trajectory
 from vijax.engine.forcing import with_harmonics
 from vijax.model.excitation import Excitation
-from vijax.model.membrane import Laws, said, with_law
+from vijax.model.membrane import Laws, with_law
 from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
@@ -65,10 +65,6 @@ def from_state(
     check_start(pair, "u", u)
     pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)
     lawful = with_harmonics(with_law(pair, membrane), excitation)
-    if membrane is not None and lawful.law and lawful.waves:
-        raise ValueError(
-            see("excitation", f"membrane must be linear where states are flown under harmonics; got {said(membrane)}")
-        )
     method: Any = "ode" if lawful.law else "exact"
     follow = partial(trajectory, pair, method=method, membrane=membrane, excitation=excitation)
     u, v, t = (np.broadcast_to(x, shape) for x in (u, v, t))
