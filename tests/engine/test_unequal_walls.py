@@ -195,3 +195,17 @@ def test_a_ball_that_gravity_holds_rests_on_the_wall_below():
     hard = chain.resting(vijax.impact_pair([0.25, 0.25], Sides(8.0, None), 0.5, [1.5, -1.5]), jnp.zeros(2))
     assert float(hard.u[0]) == float(mine.u[0])
     assert float(hard.u[1]) == 0.125
+
+
+def test_walls_that_are_exchanged_mirror_the_motion_to_the_last_bit_where_the_forcing_is_turned_too():
+    """Of harmonics whose amplitudes change sign no phase is rounded anew, as half a period of the sine does it."""
+    kappa, r, gamma = Sides(12.0, 60.0), Sides(0.5, 0.7), 0.125
+    turned = vijax.impact_pair(0.25, Sides(kappa.right, kappa.left), Sides(r.right, r.left), -gamma)
+    shaken, opposite = (vijax.Harmonics([sign, 0.3 * sign], [0.0, 0.7]) for sign in (1.0, -1.0))
+    one = vijax.trajectory(vijax.impact_pair(0.25, kappa, r, gamma), 0.03125, 0.25, 60, excitation=shaken).impacts
+    other = vijax.trajectory(turned, -0.03125, -0.25, 60, excitation=opposite).impacts
+    assert int((np.asarray(one.side) != 0).sum()) > 100
+    for name in ("side", "v_in", "v_out"):
+        np.testing.assert_array_equal(getattr(one, name), -np.asarray(getattr(other, name)), err_msg=name)
+    for name in ("n", "t", "duration", "depth", "work"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
