@@ -118,7 +118,7 @@ def test_records_and_noise_share_knots(bandwidth, knots, every, noise_every):
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"method": "ode"}, 'method must be "exact" with an excitation; got'),
+        ({"method": "ode"}, 'method must be "exact" with noise of level 0.1 .*; got'),
         ({"until": "attractor"}, 'until must be "window"'),
         ({"excitation": "sine"}, "excitation must be of the kind Excitation; got 'sine'"),
     ],

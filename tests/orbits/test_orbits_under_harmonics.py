@@ -28,7 +28,7 @@ def rough():
 
 def test_the_sine_is_one_of_them():
     sine = vijax.find_orbits(PAIR, "LR", guesses=64)
-    known = vijax.find_orbits(PAIR, "LR", guesses=64, excitation=vijax.Harmonics())
+    known = vijax.find_orbits(PAIR, "LR", guesses=64, excitation=vijax.Harmonics([1.0, 0.0, 0.0], [0.0, 2.0, 0.0]))
     assert known.pair.waves is None
     np.testing.assert_array_equal(known.knots, sine.knots)
     # What is not the sine, but for rounding, takes the form of harmonics: other searches and other sums.

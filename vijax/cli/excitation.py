@@ -19,7 +19,7 @@ def harmonic_options() -> list[click.Parameter]:
     amplitudes = "amplitudes of the forcing frequency's multiples, in units of A [the sine]"
     return [
         click.Option(["--harmonics"], metavar="A1,A2,..", help=amplitudes),
-        click.Option(["--phases"], metavar="P1,P2,..", help="of --harmonics: their phases, rad [0]"),
+        click.Option(["--phases"], metavar="P1,P2,..", help="of --harmonics: their phases, or one for all, rad [0]"),
     ]
 
 

@@ -62,10 +62,8 @@ def choose(
             raise ValueError(see("methods", f"{name} must be left out unless method is {theirs}; got {got}"))
     shaken = None if excitation is None or excitation.sine else excitation
     if shaken is not None and (method == "rk4" or (method == "ode" and not shaken.periodic)):
-        also = "" if method == "rk4" else '; "ode" knows harmonics alone'
-        raise ValueError(
-            see("excitation", f'method must be "exact" with an excitation; got {checks.shown(method)}{also}')
-        )
+        also = ', or "ode" with harmonics,' if shaken.periodic else ""
+        raise ValueError(see("excitation", f'method must be "exact"{also} with {shaken}; got {checks.shown(method)}'))
     if method == "exact":
         return None if shaken is None else _driven(shaken)
     if wall != "soft":

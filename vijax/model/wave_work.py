@@ -23,7 +23,8 @@ def wave_work(
         (kappa^2 - n^2) C + mu n S = int cos f' ds - [cos z' + n sin z + mu cos z],
         (kappa^2 - n^2) S - mu n C = int sin f' ds - [sin z' - n cos z + mu sin z].
 
-    With one harmonic it is what `energy.membrane_work` computes, and as accurate. Short contacts take its other form.
+    With one harmonic it is what `energy.membrane_work` computes, and as accurate: off by eps kappa/mu, and where kappa
+    is near a harmonic's n by eps (kappa/mu)^2. Short contacts take its other form.
 
     Args:
         m: The membrane.

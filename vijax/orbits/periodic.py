@@ -28,7 +28,8 @@ _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion tha
 # orbits that agree so closely are of one. Rounding of a flight is far below; nearer orbits than this are where two of
 # them are born.
 SAME = 1e-6
-TILES = (32, 256, 4096)  # orbits of one compiled call
+TILES = (32, 256, 1024, 4096)  # orbits of one compiled call
+_SMALL = 256  # so many cost little more than a few
 
 T = TypeVar("T")
 
@@ -180,8 +181,11 @@ def _by_tiles(work: Callable[[Any], T], rows: Any) -> T:
         found: Any = work(jax.tree.map(lambda leaf: leaf[tile.rows], rows))
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: tile.real], found)
 
-    with context.pool(tiles.workers()) as pool:
-        found = list(pool.map(part, tiles.tiles(jax.tree.leaves(rows)[0].shape[0], TILES)))
+    count, cores = jax.tree.leaves(rows)[0].shape[0], tiles.workers()
+    # No core is left without a tile for the sake of a larger one.
+    sizes = tuple(size for size in TILES if size <= _SMALL or size * cores <= count)
+    with context.pool(cores) as pool:
+        found = list(pool.map(part, tiles.tiles(count, sizes)))
     return concatenate(found)
 
 

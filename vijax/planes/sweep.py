@@ -100,8 +100,8 @@ def sweep(
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
         excitation: What shakes the capsule: `Harmonics`, a `Record`, a `Waveform`, `Noise`, or a sum of them; the sine
-            unless given. All but harmonics repeat no motion: they take until="window", and "exact". Under a record A and
-            omega are units alone, one number each.
+            unless given. All but harmonics repeat no motion: they take until="window", and the exact method. Under a
+            record A and omega are units alone, one number each.
         refine: Levels of refinement: every 2^refine-th cell along each axis is computed, then only those at borders
             between kinds of motion or where P is not interpolated to 1 %, and the others are filled.
             `computed` says which are which.
