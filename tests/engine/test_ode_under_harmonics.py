@@ -65,7 +65,7 @@ def test_a_membrane_that_stiffens_is_shaken_by_all_harmonics():
             'method must be "exact", or "ode" with harmonics, with harmonics 1.0, 0.3 at 0.7 rad, .*; got .rk4',
         ),
         (FINE, ROUGH + vijax.Noise(0.1, 8), 'method must be "exact" with harmonics .* noise of level 0.1 .*; got .ode'),
-        (FINE, vijax.Waveform(np.zeros(64), 4), 'method must be "exact" with waveform of 64 samples .*; got .ode'),
+        (FINE, vijax.Waveform(np.zeros(64), 4), 'method must be "exact" with waveform of 64 samples, .*; got .ode'),
         (FINE | {"friction": 0.1}, ROUGH, "friction must be left out with an excitation; got 0.1"),
         (FINE, vijax.Harmonics([1.0]) + vijax.Harmonics([-1.0]), "excitation must not cancel"),
         ({"membrane": Plain()}, ROUGH, 'membrane must be linear for method="exact"'),
