@@ -44,6 +44,10 @@ def test_a_branch_of_another_membrane_says_which(folder, capsys):
             "the loss of this membrane is told by its law, not by r",
         ),
         (
+            ["--wall", "soft", "--harmonics", "1,-1", "--phases", "0,0,0"],
+            "phases must be one number, or one a harmonic, 2; got 3",
+        ),
+        (
             ["--membrane", "hyperelastic", "--prestretch", "2", "--radius", "1"],
             "membrane must be left out with a rigid",
         ),
@@ -66,9 +70,24 @@ def test_bad_input_is_one_line_and_exit_code_2(folder, capsys, arguments, say):
     assert not list(folder.iterdir())
 
 
+@pytest.mark.long
 def test_a_branch_under_harmonics_says_which(folder, capsys):
     told = ["--kappa", "40", "--along", "d=0.19:0.21", "--harmonics", "1,0.3", "--phases", "0,0.7"]
     assert script.main([*told, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0
     found = vijax.load(folder / "branch.zarr")
     assert found.attrs["excitation"] == "harmonics 1.0, 0.3 at 0.7 rad"
     assert "orbits stable" in capsys.readouterr().out
+
+
+def test_harmonics_reach_the_search(folder, capsys, monkeypatch):
+    seen = []
+
+    def search(pair, impacts, **told):
+        seen.append(told["excitation"])
+        raise ValueError("enough")
+
+    monkeypatch.setattr("vijax.orbits.orbit_search.search", search)
+    assert script.main(["--kappa", "40", "--harmonics", "1,0.3", "--phases", "0,0.7"]) == 2
+    assert capsys.readouterr().err.strip().endswith("enough")
+    assert seen == [vijax.Harmonics([1.0, 0.3], [0.0, 0.7])]
+    assert not list(folder.iterdir())

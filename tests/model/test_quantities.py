@@ -27,7 +27,7 @@ PAGES = [command.vijax.get_command(click.Context(command.vijax), name) for name 
 def test_every_axis_and_every_constant_of_the_device_is_in_the_table():
     assert list(Parameters.__annotations__) == list(PARAMETERS)
     assert set(Axes.__annotations__) == set(AXES)
-    assert {field.name for field in dataclasses.fields(ImpactPair)} - {"law"} < set(PARAMETERS)
+    assert {field.name for field in dataclasses.fields(ImpactPair)} - {"law", "waves"} < set(PARAMETERS)
     of_walls = {f"{name}_{side}" for name in ("omega0", "r") for side in quantities.SIDES}
     assert of_walls < set(AXES)
     assert set(QUANTITIES) == set(AXES) | set(CONSTANTS)

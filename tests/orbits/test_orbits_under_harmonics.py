@@ -9,6 +9,7 @@ import pytest
 
 import vijax
 from tests.helpers import Plain
+from vijax.engine.forcing import with_harmonics
 from vijax.model.records import Status
 from vijax.orbits import periodic, symmetry
 
@@ -28,7 +29,7 @@ def rough():
 
 def test_the_sine_is_one_of_them():
     sine = vijax.find_orbits(PAIR, "LR", guesses=64)
-    known = vijax.find_orbits(PAIR, "LR", guesses=64, excitation=vijax.Harmonics([1.0, 0.0, 0.0], [0.0, 2.0, 0.0]))
+    known = vijax.find_orbits(PAIR, "LR", guesses=64, excitation=vijax.Harmonics())
     assert known.pair.waves is None
     np.testing.assert_array_equal(known.knots, sine.knots)
     # What is not the sine, but for rounding, takes the form of harmonics: other searches and other sums.
@@ -56,6 +57,7 @@ def test_an_attractor_is_the_motion_that_a_run_comes_to(kappa):
     np.testing.assert_allclose(np.sort(np.ravel(run.impacts.work[last])), np.sort(work), rtol=1e-7)
 
 
+@pytest.mark.long
 def test_a_search_finds_the_attractor_and_what_repels(rough):
     label = "".join("L" if side < 0 else "R" for side in np.asarray(rough.sequence.side)[0] if side)
     found = vijax.find_orbits(PAIR, label, guesses=256, excitation=ROUGH)
@@ -77,7 +79,7 @@ def test_a_later_start_of_the_clock_is_the_same_orbit_earlier(rough):
     shift = 0.37
     later = vijax.Harmonics(ROUGH.amplitudes, [p + (k + 1) * np.pi * shift for k, p in enumerate(ROUGH.phases)])
     knots = np.asarray(rough.knots) - np.array([shift, 0.0, 0.0])
-    moved = periodic.solve(vijax.engine.forcing.with_harmonics(rough.pair, later), rough.sequence, knots)
+    moved = periodic.solve(with_harmonics(rough.pair, later), rough.sequence, knots)
     assert moved.status[0] == Status.OK
     gone = (np.asarray(moved.knots) - knots)[0, :3] / np.array([2.0, 1.0, 1.0])
     np.testing.assert_allclose(gone - np.round(gone[:1]), 0.0, atol=1e-12)
@@ -105,6 +107,7 @@ def test_derivatives_are_those_of_differences(rough):
         assert float(getattr(slopes, name)) == pytest.approx(difference, rel=1e-7), name
 
 
+@pytest.mark.long
 def test_the_harmonics_have_derivatives_too(rough):
     """A designer of the shaking asks what a second harmonic does."""
     own = rough[0].pair
@@ -118,6 +121,13 @@ def test_the_harmonics_have_derivatives_too(rough):
     assert slope == pytest.approx((one - other) / (2 * h), rel=1e-5)
 
 
+def test_odd_harmonics_alone_leave_a_level_pair_symmetric():
+    assert bool(with_harmonics(LEVEL, ODD).symmetric)
+    assert not bool(with_harmonics(LEVEL, ROUGH).symmetric)
+    assert not bool(with_harmonics(PAIR, ODD).symmetric)
+
+
+@pytest.mark.long
 def test_mirror_images_are_orbits_under_odd_harmonics_alone():
     odd, rough = (vijax.find_orbits(LEVEL, "LR", guesses=64, excitation=one) for one in (ODD, ROUGH))
     assert symmetry.symmetric(odd).tolist() == [True]

@@ -96,7 +96,7 @@ class Harmonics(Excitation):
     @property
     def sine(self) -> bool:
         """Say whether it is the forcing of the paper, cos(pi t)."""
-        return self.amplitudes[0] == 1 and self.phases[0] == 0 and not any(self.amplitudes[1:])
+        return self.amplitudes == (1.0,) and self.phases == (0.0,)
 
     def __str__(self) -> str:
         """Name it and its numbers, as maps do in their attributes."""
