@@ -6,6 +6,7 @@ import pytest
 
 import vijax
 from tests.helpers import Cubic, Plain
+from vijax.engine.method_choice import choose
 
 PAIR = vijax.impact_pair(0.2, 40.0, 0.5, 0.02)
 ROUGH = vijax.Harmonics([1.0, 0.3, 0.1], [0.0, 0.7, -1.0])
@@ -20,6 +21,14 @@ def test_its_motion_is_that_of_the_exact_method():
         one, other = (np.asarray(getattr(run.impacts, name))[:10] for run in (stepped, exact))
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-9, err_msg=name)
     np.testing.assert_allclose(stepped.impacts.work[:10], exact.impacts.work[:10], rtol=1e-6)
+
+
+def test_it_says_what_shakes_it():
+    """By this the search for an attractor follows flights that meet no wall."""
+    own, exact = (choose(name, {}, excitation=ROUGH).waves(0.3) for name in ("ode", "exact"))
+    assert [wave.order for wave in own] == [wave.order for wave in exact] == [1, 2, 3]
+    for one, other in zip(own, exact, strict=True):
+        np.testing.assert_allclose((one.c, one.q), (other.c, other.q), rtol=0, atol=1e-15)
 
 
 def test_its_derivatives_are_those_of_the_exact_method():

@@ -9,9 +9,9 @@ import pytest
 
 import vijax
 from tests.helpers import Plain
-from vijax.engine.forcing import with_harmonics
+from vijax.engine.forcing import told_harmonics, with_harmonics
 from vijax.model.records import Status
-from vijax.orbits import periodic, symmetry
+from vijax.orbits import orbit_search, periodic, symmetry
 
 PAIR = vijax.impact_pair(0.2, 40.0, 0.5, 0.02)
 LEVEL = vijax.impact_pair(0.2, 40.0, 0.5)
@@ -119,6 +119,23 @@ def test_the_harmonics_have_derivatives_too(rough):
     slope, h = float(jax.grad(power)(own.waves[1].c)), 1e-4
     one, other = (float(power(own.waves[1].c + sign * h)) for sign in (1, -1))
     assert slope == pytest.approx((one - other) / (2 * h), rel=1e-5)
+
+
+def test_a_capsule_that_is_shaken_harder_has_the_orbits_of_a_smaller_one():
+    """Of five times the amplitude: all lengths and speeds are five times as large, guesses of speeds too."""
+    small = vijax.find_orbits(PAIR, "LR", guesses=64)
+    wide = vijax.impact_pair(5 * 0.2, 40.0, 0.5, 5 * 0.02)
+    large = vijax.find_orbits(wide, "LR", guesses=64, excitation=vijax.Harmonics([5.0]))
+    assert len(large) == len(small) == 3
+    scale = np.array([1.0, 5.0, 1.0])
+    np.testing.assert_allclose(np.sort(large.knots / scale, axis=0), np.sort(small.knots, axis=0), rtol=0, atol=1e-11)
+    assert orbit_search._strength(with_harmonics(wide, vijax.Harmonics([5.0, 2.0]))) == pytest.approx(6.0)
+    assert orbit_search._strength(with_harmonics(wide, vijax.Harmonics([0.1]))) == 1.0
+
+
+def test_harmonics_are_told_as_they_were_given():
+    assert told_harmonics(with_harmonics(PAIR, ROUGH)) == {"excitation": str(ROUGH)}
+    assert told_harmonics(PAIR) == {}
 
 
 def test_odd_harmonics_alone_leave_a_level_pair_symmetric():

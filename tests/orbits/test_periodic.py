@@ -149,3 +149,19 @@ def test_labels_become_cyclically_distinct_sequences():
     every, period = orbit_search.sequences("2:2/3T")
     assert period == 3
     assert every == [(-1, -1, 1, 1), (-1, 1, -1, 1)]
+
+
+def test_no_core_is_left_without_a_tile_for_the_sake_of_a_larger_one(monkeypatch):
+    """A search of 2,048 guesses would fill half of a call of 4,096 rows with padding."""
+    sizes = []
+
+    def work(rows):
+        sizes.append(len(rows[0]))
+        return rows
+
+    monkeypatch.setattr(periodic.tiles, "workers", lambda: 2)
+    for count, wanted in ((20, {32}), (300, {256}), (2048, {1024}), (5000, {1024}), (9000, {4096})):
+        sizes.clear()
+        (found,) = periodic._by_tiles(work, (np.arange(float(count)),))
+        np.testing.assert_array_equal(found, np.arange(float(count)))
+        assert set(sizes) == wanted, count

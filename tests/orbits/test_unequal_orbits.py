@@ -161,7 +161,7 @@ def test_where_the_symmetry_of_walls_goes_a_pitchfork_begins_no_curve(along):
     assert int(np.asarray(whole.count)[0]) == 2
 
 
-@pytest.mark.parametrize("kappa", [None, Sides(50.0, 30.0)], ids=["rigid", "soft"])
+@pytest.mark.parametrize("kappa", [None, Sides(50.0, 30.0), Sides(50.0, None)], ids=["rigid", "soft", "one rigid"])
 def test_conditions_of_multipliers_are_those_of_the_map_once_around(kappa):
     pair = vijax.impact_pair(0.3, kappa, Sides(0.4, 0.5))
     one = vijax.find_orbits(pair, "LR", guesses=64)[0]
@@ -169,8 +169,9 @@ def test_conditions_of_multipliers_are_those_of_the_map_once_around(kappa):
     both = multipliers.multiplier_conditions(pair, one.sequence, knots)
     around = np.asarray(multipliers.monodromy(pair, one.sequence, knots))
     trace, product = np.trace(around), np.linalg.det(around)
-    speed = np.asarray(one.knots)[np.asarray(one.sequence.real), 1]
-    weight = np.prod(speed / (speed + 0.1)) if kappa is None else 1.0
+    hard = np.asarray(one.sequence.real & pair.hard(one.sequence.side))
+    speed = np.asarray(one.knots)[hard, 1]
+    weight = np.prod(speed / (speed + 0.1))
     np.testing.assert_allclose(both.plus, weight * (1 - trace + product), rtol=1e-9)
     np.testing.assert_allclose(both.minus, weight * (1 + trace + product), rtol=1e-9)
 
@@ -271,6 +272,14 @@ def test_what_cannot_be_is_told(orbits, act, words):
         act(one)
 
 
+def test_omega_moves_the_membrane_beside_a_rigid_wall():
+    begun = float(parameter.value_at(MIXED, "omega", DEVICE))
+    moved = parameter.pair_at(MIXED, "omega", 2 * begun, DEVICE)
+    assert float(moved.d) == pytest.approx(4 * 0.3)
+    assert float(moved.kappa.left) == pytest.approx(30.0 / 2)
+    assert moved.kappa.right is None
+
+
 def followed(right):
     """Follow the attractor between a membrane and another wall, from where its branch grazes, or flips, on."""
     pair = vijax.impact_pair(0.2, Sides(40.0, right), 0.5, 0.02)
@@ -315,6 +324,26 @@ def test_a_branch_beside_a_rigid_wall_is_the_limit_of_those_beside_stiff_ones(be
     rigid = float(last_flip(beside_rigid).value)
     assert abs(other - rigid) < 0.6 * abs(one - rigid) < 1e-4
     assert 2 * other - one == pytest.approx(rigid, abs=5e-7)
+
+
+def test_what_decides_of_resonance_beside_a_rigid_wall_is_the_limit_of_that_beside_stiff_ones():
+    """Contacts with a membrane last, and each kind of wall has a tangent map of its own."""
+    found = []
+    for right in (None, 1e4, 2e4):
+        pair = vijax.impact_pair(0.2, Sides(40.0, right), 0.5, 0.02)
+        some = vijax.find_orbits(pair, "LR", guesses=64)
+        one = int(np.asarray(some.knots)[:, 0, 1].argmax())
+        pair, sequence, knots = jax.tree.map(lambda leaf, i=one: leaf[i], (some.pair, some.sequence, some.knots))
+        side = np.asarray(sequence.side)
+        found.append(
+            [
+                float(multipliers.returned(pair, sequence, knots, np.int32(np.flatnonzero(side == s)[0]), 0.1))
+                for s in (-1, 1)
+            ]
+        )
+    rigid, stiff, stiffer = np.array(found)
+    assert np.abs(rigid).min() > 0.05
+    np.testing.assert_allclose(2 * stiffer - stiff, rigid, rtol=2e-5)
 
 
 @pytest.mark.long

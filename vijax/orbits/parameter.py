@@ -59,10 +59,8 @@ def _times(factor: Values, value: Any) -> Any:
 
 
 def _shared(value: Any) -> Any:
-    """Take what both walls have alike, or what one of them has alone."""
-    if not isinstance(value, Sides):
-        return value
-    return value.right if value.left is None else value.left
+    """Take what both walls have alike."""
+    return value.left if isinstance(value, Sides) else value
 
 
 def _with(pair: ImpactPair, **values: Any) -> ImpactPair:
