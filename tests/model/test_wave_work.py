@@ -58,12 +58,14 @@ def test_with_the_sine_alone_it_is_that_of_the_paper():
     assert float(wave_work(m, waves, gamma, side, duration, z)) == pytest.approx(float(known), rel=1e-13)
 
 
-def test_short_contacts_keep_their_digits():
-    """Pressed back at once, a contact is a hundredth of a free one long: its closed form would lose ten digits."""
-    m, side, speed = flow.membrane(vijax.impact_pair(0.2, 3.0, 0.5)), 1.0, 1e-3
-    waves = under((1, -1.0 + 0j), (2, -0.5 + 0j))
+@pytest.mark.parametrize(("order", "speed"), [(2, 1e-3), (2, 1e-6), (5, 0.045)])
+def test_short_contacts_keep_their_digits(order, speed):
+    """Pressed back at once: of the shortest the closed form would lose all, and the longest is short for one alone."""
+    m, side = flow.membrane(vijax.impact_pair(0.2, 3.0, 0.5)), 1.0
+    waves = under((1, -1.0 + 0j), (order, -0.5 + 0j))
     duration, z = contact(m, waves, jnp.asarray(0.0), side, speed)
-    assert 2 * np.pi * duration < SHORT_REACH
+    assert np.pi * duration < SHORT_REACH
+    assert (order * np.pi * duration < SHORT_REACH) == (order == 2)
     rate = pressed(m, waves, side, jnp.asarray(0.0), speed, jnp.asarray(0.5 * duration * (NODES + 1)))[1]
     lost = float(m.mu) * 0.5 * duration * float(WEIGHTS @ np.asarray(rate) ** 2)
     assert float(wave_work(m, waves, jnp.asarray(0.0), side, duration, z)) == pytest.approx(lost, rel=1e-11)

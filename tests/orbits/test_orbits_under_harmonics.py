@@ -11,7 +11,7 @@ import vijax
 from tests.helpers import Plain
 from vijax.engine.forcing import told_harmonics, with_harmonics
 from vijax.model.records import Status
-from vijax.orbits import orbit_search, periodic, symmetry
+from vijax.orbits import flights, orbit_search, periodic, symmetry
 
 PAIR = vijax.impact_pair(0.2, 40.0, 0.5, 0.02)
 LEVEL = vijax.impact_pair(0.2, 40.0, 0.5)
@@ -131,6 +131,23 @@ def test_a_capsule_that_is_shaken_harder_has_the_orbits_of_a_smaller_one():
     np.testing.assert_allclose(np.sort(large.knots / scale, axis=0), np.sort(small.knots, axis=0), rtol=0, atol=1e-11)
     assert orbit_search._strength(with_harmonics(wide, vijax.Harmonics([5.0, 2.0]))) == pytest.approx(6.0)
     assert orbit_search._strength(with_harmonics(wide, vijax.Harmonics([0.1]))) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_nearest_turn_of_a_flight_is_that_of_a_scan(seed):
+    draw = np.random.default_rng(seed)
+    pair, side, speed, t = with_harmonics(PAIR, ROUGH), -1.0, draw.uniform(0.1, 0.4), draw.uniform(0, 2)
+    s = np.linspace(0, 2, 200_001)
+    rise, v = (np.asarray(x) for x in flights.flown(pair, jnp.asarray(t), speed, jnp.asarray(s)))
+    turns = np.flatnonzero(v[:-1] * v[1:] < 0)
+    assert turns.size > 0
+    ahead = np.sign(v[turns])
+    rooms = 0.1 - ahead * (-0.1 + rise[turns])
+    told = (jnp.asarray(x) for x in (side, speed, t, 2.0, True, np.nan))
+    room, when = flights.nearest_turn(pair, *told)
+    if rooms.min() < 1:
+        assert float(room) == pytest.approx(rooms.min(), abs=1e-9)
+        assert float(when) == pytest.approx(s[turns[rooms.argmin()]], abs=2e-5)
 
 
 def test_harmonics_are_told_as_they_were_given():

@@ -13,7 +13,7 @@ import vijax
 from benchmarks.yardstick import DIGITS, mp_contact, mp_flight, newton
 from vijax import Sides
 from vijax.model.records import Status
-from vijax.orbits import limits, multipliers, parameter, shooting, symmetry
+from vijax.orbits import grazing, limits, motion, multipliers, parameter, shooting, soft_graze, symmetry
 from vijax.orbits.curve_plane import check_plane
 from vijax.orbits.curve_starts import curve_start
 from vijax.orbits.events import Point
@@ -326,24 +326,39 @@ def test_a_branch_beside_a_rigid_wall_is_the_limit_of_those_beside_stiff_ones(be
     assert 2 * other - one == pytest.approx(rigid, abs=5e-7)
 
 
-def test_what_decides_of_resonance_beside_a_rigid_wall_is_the_limit_of_that_beside_stiff_ones():
-    """Contacts with a membrane last, and each kind of wall has a tangent map of its own."""
-    found = []
-    for right in (None, 1e4, 2e4):
-        pair = vijax.impact_pair(0.2, Sides(40.0, right), 0.5, 0.02)
-        some = vijax.find_orbits(pair, "LR", guesses=64)
-        one = int(np.asarray(some.knots)[:, 0, 1].argmax())
-        pair, sequence, knots = jax.tree.map(lambda leaf, i=one: leaf[i], (some.pair, some.sequence, some.knots))
-        side = np.asarray(sequence.side)
-        found.append(
-            [
-                float(multipliers.returned(pair, sequence, knots, np.int32(np.flatnonzero(side == s)[0]), 0.1))
-                for s in (-1, 1)
+def test_what_decides_of_resonance_beside_a_rigid_wall_is_how_far_a_neighbour_returns():
+    some = vijax.find_orbits(MIXED, "LR", guesses=64)
+    one = int(np.abs(np.asarray(some.multipliers)).max(axis=1).argmin())
+    pair, sequence, knots = jax.tree.map(lambda leaf: leaf[one], (some.pair, some.sequence, some.knots))
+    hits = jax.tree.map(lambda leaf: np.asarray(leaf)[one], vijax.orbit_impacts(some))
+    off, wait = np.array([1e-5, -1e-5]), 0.05
+    for impact in (0, 1):
+        onset, *_ = leaving = [getattr(hits, name)[impact] for name in ("t", "side", "v_in", "v_out", "duration")]
+        begun = onset + leaving[-1] + wait
+        u, v = (x[0] for x in motion.states(MIXED, *(np.atleast_1d(float(x)) for x in leaving), when=np.array([begun])))
+        t0 = begun % 2
+        found = vijax.trajectory(MIXED, u, v + off, 4, t0).impacts
+        ends = []
+        for row in (0, 1):
+            there = np.asarray(found.side)[row] != 0
+            own = [
+                np.asarray(x, float)[row][there]
+                for x in (2.0 * np.asarray(found.n) + np.asarray(found.t), found.side, found.v_in, found.v_out)
             ]
-        )
-    rigid, stiff, stiffer = np.array(found)
-    assert np.abs(rigid).min() > 0.05
-    np.testing.assert_allclose(2 * stiffer - stiff, rigid, rtol=2e-5)
+            ends.append(
+                motion.states(MIXED, *own, np.asarray(found.duration)[row][there], when=np.array([t0 + 2]))[0][0]
+            )
+        got = multipliers.returned(pair, sequence, knots, np.int32(impact), wait)
+        assert float(got) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-6)
+
+
+def test_what_touches_a_rigid_wall_beside_a_membrane_goes_nowhere(beside_rigid):
+    graze = beside_rigid.points[0].orbit
+    pair, sequence, knots = jax.tree.map(lambda leaf: np.asarray(leaf)[0], (graze.pair, graze.sequence, graze.knots))
+    assert soft_graze.touching(pair, sequence, knots, "flight") is None
+    turns = jax.tree.map(np.asarray, grazing.flight_turns(pair, sequence, jnp.asarray(knots)))
+    assert abs(turns.room.min()) < 1e-12
+    assert turns.wall[turns.room.argmin()] == 1.0
 
 
 @pytest.mark.long
