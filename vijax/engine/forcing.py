@@ -20,7 +20,7 @@ from vijax.model.excitation import Excitation, Harmonics, Noise, Waveform, insta
 from vijax.model.flow import PI
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
-from vijax.model.waves import Wave, Waves
+from vijax.model.waves import Wave, Waves, later
 from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray, Scalar, Values, present
 from vijax.runtime.pages import see
@@ -99,7 +99,7 @@ class Forcing(eqx.Module):
     def waves(self, phase: Values) -> Waves:
         """List the harmonics from a phase on; of any shape."""
         each = zip(self.orders, self.cosines, self.sines, strict=True)
-        return tuple(Wave(k, c, q).later(phase) for k, c, q in each)
+        return later(tuple(Wave(k, c, q) for k, c, q in each), phase)
 
     def _sampled(self, k: Scalar) -> tuple[Scalar, Scalar] | None:
         """Look up the samples before and after a knot."""

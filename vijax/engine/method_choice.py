@@ -60,10 +60,7 @@ def choose(
         if method not in takers and name != "membrane":
             theirs, got = " or ".join(map(_quoted, takers)), checks.shown(given[name])
             raise ValueError(see("methods", f"{name} must be left out unless method is {theirs}; got {got}"))
-    shaken = None if excitation is None or excitation.sine else excitation
-    if shaken is not None and (method == "rk4" or (method == "ode" and not shaken.periodic)):
-        also = ', or "ode" with harmonics,' if shaken.periodic else ""
-        raise ValueError(see("excitation", f'method must be "exact"{also} with {shaken}; got {checks.shown(method)}'))
+    shaken = _shaken(method, excitation)
     if method == "exact":
         return None if shaken is None else _driven(shaken)
     if wall != "soft":
@@ -90,6 +87,17 @@ def choose(
 
     waves = None if shaken is None else harmonics_of(shaken)
     return Ode(solver, rtol, atol, friction=friction or None, harmonics=waves, law=law)
+
+
+def _shaken(method: str, excitation: Excitation | None) -> Excitation | None:
+    """Pass an excitation that is not the sine, if a method knows it; None for the sine."""
+    if excitation is None or excitation.sine:
+        return None
+    if method == "rk4" or (method == "ode" and not excitation.periodic):
+        also = ', or "ode" with harmonics,' if excitation.periodic else ""
+        must = f'method must be "exact"{also} with {excitation}'
+        raise ValueError(see("excitation", f"{must}; got {checks.shown(method)}"))
+    return excitation
 
 
 def _driven(excitation: Excitation) -> Method:

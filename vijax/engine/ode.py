@@ -25,7 +25,7 @@ from vijax.model.membrane import Wall
 from vijax.model.pair import ImpactPair, MembranePair, Real
 from vijax.model.records import State
 from vijax.model.sides import Sides, at, named
-from vijax.model.waves import Waves, pushing, sine
+from vijax.model.waves import Waves, begun, later, pushing
 from vijax.runtime.arrays import Flag, Scalar
 from vijax.runtime.xla import share
 
@@ -49,10 +49,7 @@ class FieldArguments(eqx.Module):
 
 def _field(t: Any, y: SolverState, spell: FieldArguments) -> SolverState:
     held = spell.mode != 0
-    if spell.waves is None:
-        push = jnp.cos(PI * t) - spell.gamma
-    else:
-        push = pushing(tuple(wave.later(t) for wave in spell.waves), spell.gamma)
+    push = jnp.cos(PI * t) - spell.gamma if spell.waves is None else pushing(later(spell.waves, t), spell.gamma)
     force = jnp.where(spell.mode < 0, -1.0, 1.0) * push
     pull = jnp.where(held, spell.wall(y.x, y.z), 0.0)
     work = tangent = None
@@ -101,7 +98,7 @@ class Ode(Method[OdeCarry]):
 
     def waves(self, t: Any) -> Waves:
         """Give the harmonics of the forcing from phase t on."""
-        return sine(t) if self.harmonics is None else tuple(wave.later(t) for wave in self.harmonics)
+        return begun(self.harmonics, t)
 
     @property
     def arithmetic(self) -> bool:

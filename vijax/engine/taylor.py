@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from vijax.model.flow import PI
-from vijax.model.waves import Waves
+from vijax.model.waves import Waves, later
 from vijax.runtime.arrays import Flags, Values
 from vijax.runtime.xla import shared
 
@@ -40,7 +40,7 @@ class Push(eqx.Module):
 
     def later(self, s: Values) -> "Push":
         """Start its clock a time s later."""
-        return Push(self.level + self.slope * s, self.slope, tuple(wave.later(s) for wave in self.waves))
+        return Push(self.level + self.slope * s, self.slope, later(self.waves, s))
 
     def derivatives(self) -> tuple[Values, Values, Values, Values]:
         """Compute its value and the first three derivatives now."""

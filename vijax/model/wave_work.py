@@ -7,7 +7,7 @@ from jax import lax
 
 from vijax.model.energy import SHORT_REACH, short_contact_work
 from vijax.model.flow import PI, Membrane, half_turn
-from vijax.model.waves import Wave, Waves, pushing
+from vijax.model.waves import Wave, Waves, later, pushing
 from vijax.runtime.arrays import Values
 
 
@@ -36,7 +36,7 @@ def wave_work(
     """
     z_in, z_out = z
     first = tuple(wave.times(side) for wave in waves)
-    last = tuple(wave.later(duration) for wave in first)
+    last = later(first, duration)
     push_in, push_out = (pushing(part, side * gamma) for part in (first, last))
     bends = push_in - m.mu * z_in, push_out - m.mu * z_out
     given = 0.5 * (z_in - z_out) * (z_in + z_out)

@@ -44,9 +44,19 @@ def sine(t: Values) -> Waves:
     return (Wave(1, cos_t, sin_t),)
 
 
+def later(waves: Waves, s: Values) -> Waves:
+    """Start the clock of harmonics a time s later."""
+    return tuple(wave.later(s) for wave in waves)
+
+
+def begun(waves: Waves | None, t: Values) -> Waves:
+    """Give the forcing from a time on that has these harmonics at phase 0; None is the sine."""
+    return sine(t) if waves is None else later(waves, t)
+
+
 def waves_at(pair: ImpactPair, t: Values) -> Waves:
     """Give what shakes a pair from a time on: the sine, unless it is that of an orbit under harmonics."""
-    return sine(t) if pair.waves is None else tuple(wave.later(t) for wave in pair.waves)
+    return begun(pair.waves, t)
 
 
 def pushing(waves: Waves, gamma: Values) -> Values:

@@ -17,7 +17,7 @@ from vijax.model import energy, flow
 from vijax.model.flow import Membrane
 from vijax.model.pair import ImpactPair
 from vijax.model.wave_work import wave_work
-from vijax.model.waves import pressed, pushing, waves_at
+from vijax.model.waves import later, pressed, pushing, waves_at
 from vijax.runtime.arrays import Scalar, choose
 
 
@@ -64,8 +64,7 @@ def _end_of_linear(wall: ImpactPair, side, t, speed, stay) -> ContactEnd:
     w, rate = pressed(membrane, waves, side, wall.gamma, speed, stay)
     h, slope = flow.free_response(membrane, stay)
     square, begin = membrane.kappa * membrane.kappa, side * pushing(waves, wall.gamma)
-    later = tuple(wave.later(stay) for wave in waves)
-    push = side * pushing(later, wall.gamma) - membrane.mu * rate - square * w
+    push = side * pushing(later(waves, stay), wall.gamma) - membrane.mu * rate - square * w
     onset = rate - slope * speed - h * begin
     rate_onset = push + square * h * speed - slope * (begin - membrane.mu * speed)
     return ContactEnd(

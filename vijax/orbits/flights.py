@@ -10,7 +10,7 @@ from vijax.engine.taylor import Oscillator, Push
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
 from vijax.model.waves import drift, pushing, waves_at
-from vijax.runtime.arrays import Scalar, Values
+from vijax.runtime.arrays import Scalar, Values, choose
 
 NOTHING = 1.0  # clearance where there is nothing to clear
 # Half periods between two turning points that are one, found twice: far more than the search is off, except where the
@@ -82,8 +82,7 @@ def _sine_turns(pair: ImpactPair, v0, t, length, real, look, start: _Turn) -> _T
         end = jnp.minimum(jnp.minimum(flight_search.next_turn(force, at.s), at.s + flight_search.LONGEST_PIECE), length)
         v_end, turns, turn = flight_search.monotone_piece(force, v0, at.s, at.v, end, real)
         seen = look(at.seen, turn, flow.flight(force, v0, turn)[0], at.v < 0)
-        kept = _Turn(jnp.where(turns, seen.room, at.seen.room), jnp.where(turns, seen.when, at.seen.when))
-        return _Flight(end, v_end, kept)
+        return _Flight(end, v_end, choose(turns, seen, at.seen))
 
     begin = _Flight(jnp.zeros_like(t), v0, start)
     return lax.while_loop(lambda at: real & (at.s < length), onward, begin).seen
