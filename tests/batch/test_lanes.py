@@ -169,18 +169,23 @@ def test_an_accelerator_is_given_no_kernels_and_the_same_results(monkeypatch):
 
 
 def test_lanes_that_stay_in_registers_give_the_same_results(monkeypatch):
-    """Its kernels are interpreted here: lanes are stepped and reviewed block by block, and served all together."""
+    """Its kernels are interpreted here: lanes are stepped, reviewed and given their second tries block by block."""
     cells = draw(600, [EASY, DECLINES, HARD])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    blocks, stay = [], registers.stay
+    blocks, stay, each = [], registers.stay, registers.each
 
     def interpreted(work, at):
         blocks.append(at.cell.size // registers.LANES)
         return stay(work, at, interpret=True)
 
+    def interpreted_each(work, requests, real):
+        blocks.append(requests.left.size // registers.FEW)
+        return each(work, requests, real, interpret=True)
+
     monkeypatch.setattr(lane_rounds.registers, "stay", interpreted)
+    monkeypatch.setattr(lane_rounds.registers, "each", interpreted_each)
     found = jax.jit(lambda cells: lanes.run(PROGRAM, cells, jnp.asarray(600, jnp.int32), OUTPUTS, 256))(cells)
-    assert blocks == [2]
+    assert blocks == [2, 1]
     assert np.array_equal(found, [plain(row) for row in cells])
 
 
@@ -228,6 +233,55 @@ def test_the_last_cells_go_on_elsewhere_and_end_alike(count, few):
     found[rest] = np.asarray(run_rest(jnp.asarray(left.lanes), jnp.asarray(real.sum(), jnp.int32)))[: rest.size]
     assert real[: rest.size].all()
     assert np.array_equal(found[:count], np.reshape([plain(row) for row in cells[:count]], (count, OUTPUTS)))
+
+
+def of_kind(kind, starts):
+    """Rows of cells that count down from these numbers, once."""
+    starts = np.asarray(starts, float)
+    return np.stack([np.arange(starts.size, dtype=float), starts, np.full(starts.size, kind), np.ones(starts.size)], 1)
+
+
+def test_few_cells_are_flown_on_while_they_end_quickly():
+    cells = of_kind(EASY, np.linspace(1, 64, 600).round())
+    _, left = run_most(jnp.asarray(cells), jnp.asarray(600, jnp.int32), 128)
+    assert not np.any(left.cell >= 0)
+
+
+def test_a_cell_that_goes_on_for_long_is_left_to_others():
+    cells = of_kind(EASY, [*np.linspace(1, 64, 599).round(), 1e6])
+    _, left = run_most(jnp.asarray(cells), jnp.asarray(600, jnp.int32), 128)
+    assert left.cell[left.cell >= 0].tolist() == [599]
+
+
+def is_served(easy, hard, going, width=16):
+    """Say whether lanes are served now, and if so whether those are easy ones."""
+    toy = load(jnp.asarray(of_kind(EASY, np.full(easy + hard + going, 5.0))))
+    lane = jnp.arange(easy + hard + going)
+    toy = toy._replace(declined=lane < easy + hard, hard=(lane >= easy) & (lane < easy + hard))
+    cell = lane.astype(jnp.int32)
+    service = PROGRAM.service
+    due = lane_rounds._service_due(PROGRAM, service, width, cell, toy)
+    return ("easy" if lane_rounds._ask(PROGRAM, service, width, cell, toy)[0] else "hard") if due else None
+
+
+@pytest.mark.parametrize(
+    ("easy", "hard", "going", "on_a_cpu", "elsewhere"),
+    [
+        (16, 0, 90, "easy", "easy"),  # a batch is full
+        (15, 0, 90, None, None),
+        (15, 0, 15, "easy", "easy"),  # as many wait as go on
+        (0, 3, 3, "hard", None),  # a careful try holds up an accelerator
+        (0, 3, 0, "hard", "hard"),
+        (2, 3, 4, "hard", None),
+        (2, 3, 2, "hard", "easy"),
+        (5, 4, 90, None, "hard"),  # it makes one for a quarter of a batch
+        (16, 4, 90, "easy", "hard"),
+    ],
+)
+def test_who_is_served_when(monkeypatch, easy, hard, going, on_a_cpu, elsewhere):
+    assert is_served(easy, hard, going) == on_a_cpu
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert is_served(easy, hard, going) == elsewhere
 
 
 def test_a_new_number_of_real_cells_compiles_nothing():

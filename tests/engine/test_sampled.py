@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.yardstick import TILE, both_ways, long_contact, march, pairs, start
-from vijax.engine import sampled
+from vijax.engine import exact, sampled
 from vijax.engine.impact import Arrival, Ball
+from vijax.model.records import State
 
 RESTITUTIONS, SLOPES = [0.05, 0.2, 0.5, 0.9, 0.99, 1.0], [0.0, 0.1, -0.5, 1.2]
 SURE = {"plane": 0.97, "wide": 0.65, "rigid": 0.65}  # least share of the impacts, a few per cent below the measured
@@ -112,13 +113,40 @@ def test_contacts_that_gravity_prolongs_are_sampled_where_they_may_end():
         hit, sure = jax.tree.map(np.asarray, deep_step(jax.tree.map(jnp.asarray, pair), lanes(u, v, t)))
         shares.append(sure.mean())
         cell, hit = jax.tree.map(lambda x, sure=sure: x[sure, None], (pair, hit))
-        s = hit.duration * np.linspace(0, 1, 6001)
+        s = hit.duration * np.linspace(0, 1, 20_001)  # the longest contact's swings have 200 of them each
         state = (cell.kappa, cell.r, cell.gamma, hit.side, hit.onset_t, 0.0, hit.side * hit.v_in, s)
         w, _ = long_contact(*state)
-        assert np.max(np.abs(w.max(axis=1) / hit.depth[:, 0] - 1)) < 1e-4
+        assert np.max(np.abs(w.max(axis=1) / hit.depth[:, 0] - 1)) < 2e-5
         longest = max(longest, float(np.max(hit.duration * cell.kappa)) / np.pi)
     assert np.mean(shares) > 0.55
     assert longest > 50
+
+
+def off_the_left_wall(kappas, speeds, count=512):
+    """Sampled and exact steps of balls that fall on the left wall of a narrow gap, at any phase."""
+    rng = np.random.default_rng(5)
+    kappa, v, t = rng.uniform(*kappas, count), rng.uniform(*speeds, count), rng.uniform(0, 2, count)
+    pair = jax.tree.map(jnp.asarray, pairs(np.full(count, 0.06), kappa, np.full(count, 0.5), np.zeros(count)))
+    at = [jnp.asarray(np.resize(x, count), float) for x in (-0.03, v, t)]
+    still = jnp.zeros(count, jnp.int32)
+    step = jax.jit(jax.vmap(lambda pair, state: exact.step(pair, state, jnp.asarray(100.0))))
+    return deep_step(pair, Ball(*at, jnp.zeros(count))), step(pair, State(*at, still, still)).impact
+
+
+def test_close_to_resonance_few_contacts_are_in_doubt():
+    """There a large swing and a large response all but cancel, and bounds that add them up say nothing: 13 % were."""
+    (hit, sure), impact = off_the_left_wall(kappas=(2.6, 3.8), speeds=(0.1, 0.5))
+    assert np.mean(sure) > 0.97
+    np.testing.assert_allclose(hit.depth[sure], impact.depth[sure], rtol=1e-12)
+
+
+def test_no_slow_exit_is_in_doubt():
+    """Where the ball all but stays, the chord between two samples is a poor guess of when it leaves: 9 % were."""
+    (hit, sure), impact = off_the_left_wall(kappas=(8, 15), speeds=(0.05, 0.4), count=4096)
+    slow = np.abs(impact.v_out) < 0.1 * np.abs(impact.v_in)
+    assert slow.sum() > 50
+    assert np.all(sure[slow])
+    np.testing.assert_allclose(hit.v_out[slow], impact.v_out[slow], rtol=1e-11)
 
 
 def test_flights_that_are_not_sure_are_sampled_where_asked_for():

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax.runtime import registers
-from vijax.runtime.xla import first, in_blocks, kernel, put, repeat, shared, up_to
+from vijax.runtime.xla import first, in_blocks, kernel, on_cpu, put, repeat, shared, up_to
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -127,7 +127,7 @@ def run_round(program: Program, width: int, at: AtWork) -> Carry:
     carry = _held_steps(program, *at) if held else program.kernel(partial(_steps, program))(*at)
     if service := program.service:
         due = program.kernel(partial(_service_due, program, service, width))
-        serve = partial(_serve, program, service, width)
+        serve = partial(_serve, program, service, width, held)
         carry = lax.while_loop(partial(due, at.cell), partial(serve, at.cell), carry)
     return carry if held else program.kernel(program.review)(carry)
 
@@ -165,17 +165,37 @@ def _goes_on(program: Program, at_first: Int[Array, ""], at: AtWork) -> Bool[Arr
 def _service_due(
     program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
 ) -> Bool[Array, ""]:
-    """Say whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
+    """Say whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one.
+
+    On an accelerator a careful try, however many lanes have one, takes longer than a thousand steps: those who need it
+    wait for many others, or until nobody else goes on.
+    """
     at = AtWork(cell, carry)
-    asking, hard = _declined(program, at), service.hard(carry)
-    full = ((asking & ~hard).sum() >= width) | ((asking & hard).sum() >= width)
-    return full | (asking.any() & (asking.sum() >= able(program, at)))
+    easy, hard = (lanes.sum() for lanes in asking(program, at))
+    going = able(program, at)
+    if on_cpu():
+        return (easy >= width) | (hard >= width) | ((easy + hard > 0) & (easy + hard >= going))
+    full = (easy >= width) | (hard >= _many(width))
+    return full | jnp.where(easy > 0, easy >= going, (hard > 0) & (going == 0))
 
 
-def _serve(program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+def _many(width: int) -> int:
+    """Say for how many lanes an accelerator makes a careful try."""
+    return max(width // 4, 1)
+
+
+def asking(program: Program, at: AtWork) -> tuple[Bool[Array, "lane"], Bool[Array, "lane"]]:
+    """Find the lanes that wait for their second try, and those that wait for the careful one."""
+    declined = _declined(program, at)
+    hard = program.service.hard(at.carry) if program.service else declined
+    return declined & ~hard, declined & hard
+
+
+def _serve(program: Program, service: Service, width: int, held: bool, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Give a batch of easy lanes their second try, or a batch of hard ones the careful try."""
     easy, batch, requests = program.kernel(partial(_ask, program, service, width))(cell, carry)
-    answers = lax.cond(easy, program.kernel(service.second), program.kernel(service.careful), requests)
+    second = partial(registers.each, service.second, real=batch.real) if held else program.kernel(service.second)
+    answers = lax.cond(easy, second, program.kernel(service.careful), requests)
     return program.kernel(partial(_settle, service))(carry, answers, batch)
 
 
@@ -183,10 +203,13 @@ def _ask(
     program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
 ) -> tuple[Bool[Array, ""], LaneBatch, Any]:
     """Say whose turn it is, easy lanes or hard ones, and what they request."""
-    asking, hard = _declined(program, AtWork(cell, carry)), service.hard(carry)
-    easy = (asking & ~hard).sum() >= jnp.minimum((asking & hard).sum(), width)
-    batch = batch_of(asking & (hard != easy), width)
-    return easy, batch, take(service.request(carry), batch.members)
+    easy, hard = asking(program, AtWork(cell, carry))
+    some, others = easy.sum(), hard.sum()
+    turn = some >= jnp.minimum(others, width)
+    if not on_cpu():
+        turn = (some > 0) & (others < _many(width))
+    batch = batch_of(jnp.where(turn, easy, hard), width)
+    return turn, batch, take(service.request(carry), batch.members)
 
 
 def _settle(service: Service, carry: Carry, answers: Any, batch: LaneBatch) -> Carry:

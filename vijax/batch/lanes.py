@@ -21,14 +21,18 @@ from vijax.runtime.xla import on_cpu, put, whole_blocks
 # One lane in so many is served or refilled together, on an accelerator and on a CPU. A larger batch keeps slow cells
 # waiting; but to serve 16,384 lanes takes an accelerator no longer than to serve 4,096.
 _SHARE_ELSEWHERE, _SHARE, _FEWEST = 8, 32, 4
+# In a round of an accelerator a core flies so small a share of the cells that `run_most` leaves: while more than that
+# end in one, it goes on. Their number is averaged over so many rounds.
+_SHARE_OF_A_ROUND, _ROUNDS = 1 / 512, 16
 
 
 class _Queue(NamedTuple):
-    """The loop's state: the lanes, the next cell to start, the results so far."""
+    """The loop's state: the lanes, the next cell to start, the results so far, how many cells end in a round."""
 
     at: AtWork
     waiting: Int[Array, ""]
     results: Float[Array, "cell out"]
+    pace: Float[Array, ""]
 
 
 class _Table(NamedTuple):
@@ -85,7 +89,11 @@ def run(
 def run_most(
     program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int, few: int
 ) -> tuple[Float[Array, "cell out"], Left]:
-    """Do what `run` does until so few cells are left, whose rows of results are zeros; `resumed` goes on with them."""
+    """Do what `run` does until few cells are left, whose rows of results are zeros; `resumed` goes on with them.
+
+    At most `few`, and fewer where those end quickly: what is left in the end asks again and again to be served, a step
+    a round, and takes the accelerator longer than it takes others.
+    """
     queue = _run(program, _Table(cells, count), outputs, lanes, few)
     batch = batch_of(queue.at.cell >= 0, few)
     real = jnp.arange(few, dtype=jnp.int32) < batch.real
@@ -100,19 +108,30 @@ def resumed(program: Program, like: Float[Array, "row in"]) -> Program:
 
 
 def _run(program: Program, table: _Table, outputs: int, lanes: int, few: int) -> _Queue:
-    """Run cells until none waits and no more than `few` are on a lane."""
+    """Run cells until none waits and no more than `few` are on their way."""
     lanes = whole_blocks(lanes)
     width = _served(lanes)
 
     def refill_and_round(queue: _Queue) -> _Queue:
-        queue = _refill(program, table, width, queue)
-        return queue._replace(at=queue.at._replace(carry=run_round(program, width, queue.at)))
+        # Where the last cells are left to others nobody waits for a lane either, once no cell does.
+        queue = _refill(program, table, width, queue, width if few else 1)
+        new = queue._replace(at=queue.at._replace(carry=run_round(program, width, queue.at)))
+        ended = (_flying(program, queue.at) - _flying(program, new.at)).astype(new.pace.dtype)
+        return new._replace(pace=new.pace + (ended - new.pace) / _ROUNDS)
 
     def goes_on(queue: _Queue) -> Bool[Array, ""]:
-        busy = queue.at.cell >= 0
-        return (busy.sum() > few if few else busy.any()) | (queue.waiting < table.real)
+        if not few:
+            return (queue.at.cell >= 0).any() | (queue.waiting < table.real)
+        many = (_flying(program, queue.at) > few) | (queue.pace > max(few * _SHARE_OF_A_ROUND, 1.0))
+        return many | (queue.waiting < table.real)
 
-    return lax.while_loop(goes_on, refill_and_round, _all_waiting(program, table, outputs, lanes))
+    queue = lax.while_loop(goes_on, refill_and_round, _all_waiting(program, table, outputs, lanes))
+    return _refill(program, table, width, queue, 1) if few else queue
+
+
+def _flying(program: Program, at: AtWork) -> Int[Array, ""]:
+    """Count the cells that are on their way."""
+    return ((at.cell >= 0) & ~program.done(at.carry)).sum()
 
 
 def _all_waiting(program: Program, table: _Table, outputs: int, lanes: int) -> _Queue:
@@ -122,17 +141,22 @@ def _all_waiting(program: Program, table: _Table, outputs: int, lanes: int) -> _
         AtWork(jnp.full(lanes, -1, jnp.int32), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh)),
         waiting=jnp.asarray(0, jnp.int32),
         results=jnp.zeros((table.cells.shape[0], outputs), table.cells.dtype),
+        pace=jnp.asarray(0.0, table.cells.dtype),
     )
 
 
-def _refill(program: Program, table: _Table, width: int, queue: _Queue) -> _Queue:
-    """Write down the cells that are done and load waiting ones, a batch at a time, while that is worth its price."""
-    due = program.kernel(partial(_refill_due, program, table, width))
+def _refill(program: Program, table: _Table, width: int, queue: _Queue, last: int) -> _Queue:
+    """Write down the cells that are done and load waiting ones, a batch at a time, while that is worth its price.
+
+    Args:
+        last: For how many lanes it is, once no cell waits.
+    """
+    due = program.kernel(partial(_refill_due, program, table, width, last))
     exchange = program.kernel(partial(_exchange, program, table, width))
 
     def one_batch(queue: _Queue) -> _Queue:
         at, waiting, rows, found = exchange(queue.at, queue.waiting)
-        return _Queue(at, waiting, queue.results.at[rows].set(found, mode="drop"))
+        return queue._replace(at=at, waiting=waiting, results=queue.results.at[rows].set(found, mode="drop"))
 
     return lax.while_loop(lambda queue: due(queue.at, queue.waiting), one_batch, queue)
 
@@ -142,9 +166,11 @@ def _free(program: Program, table: _Table, at: AtWork, waiting: Int[Array, ""]) 
     return jnp.where(at.cell >= 0, program.done(at.carry), waiting < table.real)
 
 
-def _refill_due(program: Program, table: _Table, width: int, at: AtWork, waiting: Int[Array, ""]) -> Bool[Array, ""]:
-    # With cells waiting a refill is worth its price only for several lanes; at the end nobody waits for it.
-    enough = jnp.where(waiting < table.real, width, 1)
+def _refill_due(
+    program: Program, table: _Table, width: int, last: int, at: AtWork, waiting: Int[Array, ""]
+) -> Bool[Array, ""]:
+    # With cells waiting a refill is worth its price only for several lanes.
+    enough = jnp.where(waiting < table.real, width, last)
     return _free(program, table, at, waiting).sum() >= enough
 
 

@@ -161,8 +161,9 @@ def _polish(c: _Contact, s: Zeros) -> tuple[Zeros, Zeros, tuple[Zeros, ...]]:
     With the last step towards each, and the derivatives of w before that step. The second iteration's closed form is
     the careful one, which loses nothing in short contacts and at resonance.
     """
-    w, z = _state(c, _turned(c, s))
-    s = share(s + _step(c, s, w, z)[0])
+    for _ in range(2):
+        w, z = _state(c, _turned(c, s))
+        s = share(s + _step(c, s, w, z)[0])
     w, z = flow.oscillate(c.m, c.force, jnp.zeros_like(s), c.speed, s)
     step, derivatives = _step(c, s, w, z)
     return s + step, step, derivatives
@@ -197,11 +198,12 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
         w = share(along * re + across * im + held - steady.g)
         along, across = share((stiff * along - twist * across, stiff * across + twist * along))
         push = share(along * re + across * im - PI**2 * held)
-        curb = share(curb_of(push, free_bend * m.kappa * m.kappa + PI**2 * steady_bend, h))
+        fourth = free_bend * m.kappa * m.kappa + PI**2 * steady_bend
+        curb = share(curb_of(push, fourth, h))
         crossing = share(first_crossing(w, curb, slack))
         s = at.s + h * order
-        last, change = jnp.minimum(*crossing), (free_bend * m.kappa + PI * steady_bend) * h
-        crest = _higher(at, w, push, s, h, change, last) if deep else at.crest
+        third = free_bend * m.kappa + PI * steady_bend
+        crest = _higher(at, w, push, s, h, (third, fourth), jnp.minimum(*crossing)) if deep else at.crest
         return onward(at, s, h, crossing, jnp.ones_like(h), w, crest)
 
     found = search(advance, jnp.zeros_like(speed))
@@ -226,21 +228,39 @@ def _higher_of(one: tuple[Lane, Lane], other: tuple[Lane, Lane]) -> tuple[Lane, 
 
 
 @shared
-def _higher(at: Pass, w: Samples, push: Samples, s: Samples, h: Lane, change: Lane, last: Lane) -> Crest:
+def _bends(push: Samples, h: Lane, third: Lane, fourth: Lane) -> tuple[Samples, Samples]:
+    """Bound w" around each sample, as far as the next ones: what it is at most, and what it is in size.
+
+    Between two samples it is no further from its chord than 1/8 h^2 times the bound of its second derivative. That is
+    much nearer than what the bound of its first one allows, where a large swing and a large response all but cancel:
+    close to resonance. Before the first sample and after the last there is no chord.
+    """
+    size, slack, change = jnp.abs(push), 0.125 * h * h * fourth, third * h
+
+    def around(samples: Samples) -> Samples:
+        inner = jnp.maximum(jnp.maximum(samples[:-2], samples[2:]), samples[1:-1]) + slack
+        return jnp.concatenate([samples[:1] + change, inner, samples[-1:] + change])
+
+    return around(push), around(size)
+
+
+@shared
+def _higher(at: Pass, w: Samples, push: Samples, s: Samples, h: Lane, bounds: tuple[Lane, Lane], last: Lane) -> Crest:
     """Find the highest sample so far.
 
-    Where w" < 0 the samples around the highest hold one maximum, its own. `change` bounds that of w" over a step. A
-    maximum is half a step from a sample at most, and a whole one before the first sample of a pass.
+    Where w" < 0 the samples around the highest hold one maximum, its own. `bounds` are those of the third and fourth
+    derivatives. A maximum is half a step from a sample at most, and a whole one before the first sample of a pass.
     """
+    most_bend, bend_size = share(_bends(push, h, *bounds))
     order = jnp.arange(SAMPLES, dtype=w.dtype)[:, None]
     seen = share(jnp.where(order <= last, w, -jnp.inf))
     top, when = share(reduce(_higher_of, zip(seen, s, strict=True)))
     former = at.crest
     better = share(top > former.height)
     when, height = share((jnp.where(better, when, former.when), jnp.where(better, top, former.height)))
-    hidden = share(seen + jnp.where(order == 0, 0.5, 0.125) * h * h * (jnp.abs(push) + change))
+    hidden = share(seen + jnp.where(order == 0, 0.5, 0.125) * h * h * bend_size)
     near = jnp.abs(s - when) < 2.5 * h
-    around = near & (push + change < 0)
+    around = near & (most_bend < 0)
     apart = -least(share(jnp.where(around, jnp.inf, -hidden)))
     beaten = jnp.where(better & (when - former.when > 2.5 * h), former.most, 0.0)
     rival = jnp.maximum(former.rival, jnp.maximum(apart, beaten))

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vijax.runtime.arrays import Lane
-from vijax.runtime.xla import share, shared
+from vijax.runtime.xla import on_cpu, share, shared
 
 Samples = Float[Array, "sample lane"]
 Rows = Float[Array, "*row lane"]
@@ -95,8 +95,12 @@ def first_crossing(gap: Samples, curb: Float[Array, "interval lane"], slack: Lan
 
 
 def _at(samples: Samples, index: Lane) -> Lane:
-    row = jnp.clip(index, 0, SAMPLES - 1).astype(jnp.int32)
-    return jnp.take_along_axis(samples, row[None], axis=0)[0]
+    """Look up a sample of each lane; an accelerator, whose kernels know no lookup, adds up all others as zeros."""
+    row = jnp.clip(index, 0, SAMPLES - 1)
+    if on_cpu():
+        return jnp.take_along_axis(samples, row.astype(jnp.int32)[None], axis=0)[0]
+    order = jnp.arange(SAMPLES, dtype=row.dtype)[:, None]
+    return jnp.where(order == row, samples, 0.0).sum(axis=0)
 
 
 def search(advance: Callable[[Pass], Pass], side: Lane) -> Pass:

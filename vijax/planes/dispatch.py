@@ -33,6 +33,11 @@ _WAITING = logging.getLogger("vijax.waiting")
 Fields = dict[str, np.ndarray]
 """Fields of `Summary`, or of `expected.ManyStarts`, by name."""
 
+Part = np.ndarray | slice
+"""Some of an array's cells, by their places in it; `_ALL` of them in order."""
+
+_ALL = slice(None)
+
 
 class Call(NamedTuple):
     """Cells of a plan by flat index, how many rows their call has, and which tile it is."""
@@ -56,11 +61,11 @@ def rows_each(cells: int) -> int:
 def compute(planned: SweepPlan, wanted: np.ndarray, found: Fields, rows: int | None = None) -> Iterator[int]:
     """Compute cells, given by flat indices, into fields over all cells; yield how many are done."""
     of, done = planned.cells, 0
-    gamma = of.flat(of.quantities["gamma"], wanted)
     # Level cells have a faster program, and one cell with gravity in a call would keep all of it from that.
-    for group in (wanted[gamma == 0], wanted[gamma != 0]):
+    for kind in _kinds(planned, wanted):
+        group = wanted[kind]
         for index, part in _each(planned, group, rows or rows_each(group.size)):
-            _put(found, of.count, index, part)
+            _put(found, of.count, _ALL if np.array_equal(index, np.arange(of.count)) else index, part)
             done += index.size
             yield done
 
@@ -75,9 +80,9 @@ def _each(planned: SweepPlan, group: np.ndarray, rows: int) -> Iterator[tuple[np
         yield call.cells, found
 
 
-def _put(found: Fields, count: int, index: np.ndarray, part: Fields) -> None:
-    """Lay a part of the cells into the fields of all; what is all of them, in order, is not copied."""
-    if np.array_equal(index, np.arange(count)):
+def _put(found: Fields, count: int, index: Part, part: Fields) -> None:
+    """Lay a part of the cells into the fields of all; what is all of them is not copied."""
+    if isinstance(index, slice):
         found.update(part)
         return
     for name, values in part.items():
@@ -134,25 +139,29 @@ def perform(call: Call, place: jax.Device, stopped: threading.Event | None = Non
     began = time.perf_counter()
     _LOG.info("tile %d begins", call.number)
     found: Fields = {}
-    for part in _kinds(call):
-        _put(found, call.cells.size, part, _summarise(call, call.cells[part], part.size, place, stopped))
+    for part in _kinds(call.planned, call.cells):
+        cells = call.cells[part]
+        _put(found, call.cells.size, part, _summarise(call, cells, cells.size, place, stopped))
     return found, time.perf_counter() - began
 
 
 def prepare(call: Call, place: jax.Device) -> None:
     """Compile what a call needs, without running a cell. Threads that ask for the same wait for one, by `jax.jit`."""
     of = call.planned.cells
-    for part in _kinds(call):
+    for part in _kinds(call.planned, call.cells):
         # The steepest cell stands for all: which program they have depends on it, and on how many they are.
         cells = call.cells[part]
-        steepest = np.argmax(np.abs(of.flat(of.quantities["gamma"], cells)))
+        gamma = of.quantities["gamma"]
+        steepest = np.argmax(np.abs(of.flat(gamma, cells))) if gamma.dims else 0
         _summarise(call, cells[steepest : steepest + 1], 0, place)
 
 
-def _kinds(call: Call) -> list[np.ndarray]:
-    """Find the places of a call's level cells, which have a faster program, and of the others; those that there are."""
-    of = call.planned.cells
-    level = of.flat(of.quantities["gamma"], call.cells) == 0
+def _kinds(planned: SweepPlan, cells: np.ndarray) -> list[Part]:
+    """Find the places of level cells, which have a faster program, and of the others; those that there are."""
+    gamma = planned.cells.quantities["gamma"]
+    if not gamma.dims:
+        return [_ALL]
+    level = planned.cells.flat(gamma, cells) == 0
     return [kind for kind in (np.flatnonzero(level), np.flatnonzero(~level)) if kind.size]
 
 
@@ -163,7 +172,7 @@ def _summarise(
     planned = call.planned
     # Where no cell is run, one is laid out; and JAX would compile the padding of every number of cells.
     of = planned.cells
-    rows = of.places(np.resize(index, call.rows) if count else index)
+    rows = of.places(np.resize(index, call.rows) if count and index.size < call.rows else index)
     if planned.starts == 1:
         u0, v0 = (of.flat(of.quantities[name], rows) for name in ("u0", "v0"))
         return _run(call, rows, count, place, (u0, v0), planned.needs)

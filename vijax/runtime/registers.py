@@ -13,14 +13,18 @@ from typing import Any, TypeVar
 
 import jax
 from jax import lax
+from jaxtyping import Array, Int
 
 from vijax.runtime import xla
+from vijax.runtime.unrolled import unrolled
 
 T = TypeVar("T")
 
 # Lanes of a block, a thread each. A power of two, as all of Triton's blocks are.
 LANES = 128
 _WARP = 32  # threads that a GPU runs in step
+# Lanes of a block where each is worked on once: as few as may be, as blocks are not many for all of a GPU's parts.
+FEW = _WARP
 
 
 def used() -> bool:
@@ -42,6 +46,52 @@ def stay(work: Callable[[T], T], lanes: T, *, interpret: bool = False) -> T:
     if interpret:
         return _in_one_kernel(work, lanes, interpret=True)
     return lax.platform_dependent(lanes, cuda=partial(_in_one_kernel, work), default=work)
+
+
+def each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], *, interpret: bool = False) -> T:
+    """Make of the first `real` lanes what `work` makes of each: on a CUDA GPU in one kernel, elsewhere as it stands.
+
+    Args:
+        work: On lanes, arrays of one axis; what `unrolled` can follow, whose results are such arrays.
+            Where lanes are not whole blocks, it is not in one kernel.
+        lanes: What it is done on.
+        real: How many count; what becomes of the others may be anything.
+        interpret: As in `stay`.
+    """
+    leaves = jax.tree.leaves(lanes)
+    if any(leaf.ndim != 1 or leaf.size % FEW for leaf in leaves):
+        return work(lanes)
+    if interpret:
+        return _of_each(work, lanes, real, interpret=True)
+    return lax.platform_dependent(lanes, real, cuda=partial(_of_each, work), default=lambda lanes, _: work(lanes))
+
+
+def _of_each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], interpret: bool = False) -> T:
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    leaves, tree = jax.tree.flatten(lanes)
+    like = jax.eval_shape(work, lanes)
+
+    def body(real, *refs):
+        @pallas.when(pallas.program_id(0) * FEW < real[0])
+        def _():
+            lanes = [ref[...] for ref in refs[: len(leaves)]]
+            found = unrolled(lambda lanes: work(jax.tree.unflatten(tree, lanes)), lanes)
+            for ref, value in zip(refs[len(leaves) :], found, strict=True):
+                ref[...] = value
+
+    part = pallas.BlockSpec((FEW,), lambda i: (i,))
+    found = pallas.pallas_call(
+        body,
+        grid=(leaves[0].size // FEW,),
+        in_specs=[pallas.BlockSpec((1,), lambda _: (0,)), *(part for _ in leaves)],
+        out_specs=[part for _ in jax.tree.leaves(like)],
+        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(like)],
+        compiler_params=triton.CompilerParams(num_warps=FEW // _WARP),
+        interpret=interpret,
+    )(real.reshape(1), *leaves)
+    return jax.tree.unflatten(jax.tree.structure(like), found)
 
 
 def _fits(leaf: Any) -> bool:

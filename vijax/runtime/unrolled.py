@@ -1,0 +1,203 @@
+"""Work on rows of lanes as work on single lanes: a kernel of Triton knows neither slices nor joins of arrays.
+
+`unrolled` follows the traced work operation by operation. What it makes of an array [row, ..., lane] is a NumPy array
+of objects [row, ...], each of them a lane's worth, or one number where the lane makes no difference; slices, joins and
+the like are then NumPy's and leave nothing in the program.
+"""
+
+import itertools
+from collections.abc import Callable, Iterable
+from functools import partial, reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend import core
+
+# The work is traced for so many lanes: an axis of that length is theirs, and no other has it.
+_TRACED = 1009
+
+Rows = Any
+"""A NumPy array of objects: lanes, or numbers that are the same in all."""
+
+
+def unrolled(work: Callable[..., Any], lanes: list[Any]) -> list[Any]:
+    """Do `work` on lanes, arrays of one axis, without an operation on arrays of more; give its leaves.
+
+    Args:
+        work: On a list of such arrays; elementwise arithmetic, loops, and what changes, joins, cuts or sums up rows.
+        lanes: What it is done on.
+    """
+    shapes = [jax.ShapeDtypeStruct((_TRACED,), leaf.dtype) for leaf in lanes]
+    traced = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(work(list(leaves))))(*shapes)
+    count = lanes[0].shape[0]
+    found = _follow(traced.jaxpr, count, [_single(np.asarray(c)) for c in traced.consts], list(map(_single, lanes)))
+    return [
+        jnp.broadcast_to(jnp.asarray(rows.item(), out.aval.dtype), (count,))
+        for rows, out in zip(found, traced.jaxpr.outvars, strict=True)
+    ]
+
+
+def _single(value: Any) -> Rows:
+    """Make rows of a lane, or of an array of numbers."""
+    return _laid(value.ravel(), value.shape) if isinstance(value, np.ndarray) else _laid([value], ())
+
+
+def _laid(values: Iterable[Any], shape: tuple[int, ...]) -> Rows:
+    """Lay values out as rows, one by one: NumPy would look into those that are arrays."""
+    rows = np.empty(shape, object)
+    for place, value in zip(np.ndindex(shape), values, strict=True):
+        rows[place] = value
+    return rows
+
+
+def _wide(var: Any) -> bool:
+    """Say whether a value of the traced work has the axis of lanes."""
+    return var.aval.shape[-1:] == (_TRACED,)
+
+
+def _follow(jaxpr: core.Jaxpr, count: int, consts: list[Rows], given: list[Rows]) -> list[Rows]:
+    """Do what is traced, on rows."""
+    known: dict[Any, Rows] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *given], strict=True))
+
+    def read(var: Any) -> Rows:
+        if not isinstance(var, core.Literal):
+            return known[var]
+        kind: Any = var.aval
+        return _single(np.asarray(var.val, kind.dtype))
+
+    for eqn in jaxpr.eqns:
+        args = list(map(read, eqn.invars))
+        known |= dict(zip(eqn.outvars, _done(eqn, count, args), strict=True))
+    return list(map(read, jaxpr.outvars))
+
+
+def _done(eqn: Any, count: int, args: list[Rows]) -> list[Rows]:
+    """Do one operation."""
+    name, params = eqn.primitive.name, eqn.params
+    if name == "while":
+        return _loop(params, count, args, [var.aval for var in eqn.outvars])
+    if inner := params.get("jaxpr") or params.get("call_jaxpr"):
+        return _follow(inner.jaxpr, count, list(map(_single, map(np.asarray, inner.consts))), args)
+    if name == "unstack":
+        return list(np.moveaxis(args[0], params["axis"], 0))
+    if name in _REDUCTIONS:
+        return [_reduced(eqn, count, args[0])]
+    if name in _SHAPES:
+        return [_SHAPES[name](args, **_of_rows(eqn))]
+    if _wide(eqn.outvars[0]):
+        # A last axis of length one stands for all lanes.
+        args = [
+            rows if _wide(var) or not rows.ndim else rows[..., 0] for rows, var in zip(args, eqn.invars, strict=True)
+        ]
+    return [_each(partial(eqn.primitive.bind, **params), count, args)]
+
+
+def _of_rows(eqn: Any) -> dict[str, Any]:
+    """Give the parameters of an operation on shapes, without the axis of lanes."""
+    params = dict(eqn.params)
+    out = eqn.outvars[0]
+    params["shape"] = out.aval.shape[:-1] if _wide(out) else out.aval.shape
+    if eqn.primitive.name == "broadcast_in_dim" and _wide(out):
+        rows = len(params["shape"])
+        params["broadcast_dimensions"] = tuple(axis for axis in params["broadcast_dimensions"] if axis < rows)
+    if eqn.primitive.name == "slice" and _wide(out):
+        params |= {name: params[name] and params[name][:-1] for name in ("start_indices", "limit_indices", "strides")}
+    return params
+
+
+def _broadcast(args: list[Rows], *, shape: tuple[int, ...], broadcast_dimensions: tuple[int, ...], **_: Any) -> Rows:
+    rows = args[0]
+    # A last axis of length one that became that of the lanes is none of the rows.
+    rows = rows.reshape(rows.shape[: len(broadcast_dimensions)])
+    laid = np.expand_dims(rows, tuple(axis for axis in range(len(shape)) if axis not in broadcast_dimensions))
+    return np.broadcast_to(laid, shape)
+
+
+def _cut(args: list[Rows], *, start_indices: Any, limit_indices: Any, strides: Any, **_: Any) -> Rows:
+    steps = strides or (1,) * len(start_indices)
+    return args[0][tuple(map(slice, start_indices, limit_indices, steps))]
+
+
+_SHAPES: dict[str, Callable[..., Rows]] = {
+    "broadcast_in_dim": _broadcast,
+    "slice": _cut,
+    "squeeze": lambda args, *, dimensions, **_: np.squeeze(args[0], dimensions),
+    "reshape": lambda args, *, shape, **_: args[0].reshape(shape),
+    "concatenate": lambda args, *, dimension, **_: np.concatenate(args, dimension),
+    "stack": lambda args, *, axis, **_: np.stack(args, axis),
+    "iota": lambda args, *, shape, dimension, dtype, **_: _single(
+        np.broadcast_to(np.expand_dims(np.arange(shape[dimension], dtype=dtype), _others(shape, dimension)), shape)
+    ),
+}
+
+
+def _others(shape: tuple[int, ...], dimension: int) -> tuple[int, ...]:
+    return tuple(axis for axis in range(len(shape)) if axis != dimension)
+
+
+# How two rows become one, and all lanes one number.
+_REDUCTIONS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    "reduce_or": (lax.bitwise_or, lambda lanes: lanes.sum(dtype=jnp.int32) > 0),  # Triton knows no other way
+    "reduce_sum": (lax.add, jnp.sum),
+}
+
+
+def _reduced(eqn: Any, count: int, rows: Rows) -> Rows:
+    """Reduce rows one after another, and lanes where they are among the axes."""
+    join, across = _REDUCTIONS[eqn.primitive.name]
+    axes = eqn.params["axes"]
+    own = tuple(axis for axis in axes if axis < rows.ndim)
+    if own:
+        laid = np.moveaxis(rows, own, range(len(own)))
+        laid = laid.reshape(-1, *laid.shape[len(own) :])
+        rows = reduce(lambda one, other: _each(join, count, [one, other]), (laid[i, ...] for i in range(len(laid))))
+    return rows if len(own) == len(axes) else _each(across, count, [rows])
+
+
+def _each(work: Callable[..., Any], count: int, args: list[Rows]) -> Rows:
+    """Do elementwise arithmetic on every row."""
+    shape = np.broadcast_shapes(*(rows.shape for rows in args))
+    wide = [np.broadcast_to(rows, shape) for rows in args]
+    return _laid((_one(work, count, [rows[place] for rows in wide]) for place in np.ndindex(shape)), shape)
+
+
+def _one(work: Callable[..., Any], count: int, values: list[Any]) -> Any:
+    if all(isinstance(value, np.generic) for value in values):
+        with jax.ensure_compile_time_eval():
+            return np.asarray(work(*values))[()]
+    if any(value.ndim for value in values):
+        values = [jnp.broadcast_to(jnp.asarray(value), (count,)) for value in values]
+    return work(*values)
+
+
+def _loop(params: dict[str, Any], count: int, args: list[Rows], shapes: list[Any]) -> list[Rows]:
+    """Go on while the condition holds, with a flat list of lanes and numbers."""
+    first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    for_cond, for_body, start = args[:first], args[first:second], args[second:]
+    cond, body = params["cond_jaxpr"], params["body_jaxpr"]
+
+    def flat(carry: list[Rows]) -> list[Any]:
+        each = zip(carry, shapes, strict=True)
+        return [_full(value, aval, count) for rows, aval in each for value in rows.reshape(-1)]
+
+    def laid(values: Any) -> list[Rows]:
+        left = iter(values)
+        return [_laid(itertools.islice(left, rows.size), rows.shape) for rows in start]
+
+    def consts(jaxpr: Any) -> list[Rows]:
+        return [_single(np.asarray(const)) for const in jaxpr.consts]
+
+    found = lax.while_loop(
+        lambda values: _follow(cond.jaxpr, count, consts(cond), [*for_cond, *laid(values)])[0].item(),
+        lambda values: flat(_follow(body.jaxpr, count, consts(body), [*for_body, *laid(values)])),
+        flat(start),
+    )
+    return laid(found)
+
+
+def _full(value: Any, aval: Any, count: int) -> Any:
+    value = jnp.asarray(value, aval.dtype)
+    return jnp.broadcast_to(value, (count,)) if aval.shape[-1:] == (_TRACED,) else value
