@@ -21,9 +21,9 @@ from vijax.runtime.xla import on_cpu, put, whole_blocks
 # One lane in so many is served or refilled together, on an accelerator and on a CPU. A larger batch keeps slow cells
 # waiting; but to serve 16,384 lanes takes an accelerator no longer than to serve 4,096.
 _SHARE_ELSEWHERE, _SHARE, _FEWEST = 8, 32, 4
-# In a round of an accelerator a core flies so small a share of the cells that `run_most` leaves: while more than that
-# end in one, it goes on. Their number is averaged over so many rounds.
-_SHARE_OF_A_ROUND, _ROUNDS = 1 / 512, 16
+# An accelerator goes on with as few cells as `run_most` may leave while such a share of them ends in a round, on the
+# average of so many: others, who fly side by side, take as long for these as it does for a round.
+_SHARE_OF_A_ROUND, _ROUNDS = 1 / 256, 16
 
 
 class _Queue(NamedTuple):
