@@ -54,6 +54,30 @@ def test_a_record_comes_out_as_it_went_in(leading):
     assert found["code"].dtype == np.int32
 
 
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("written", [False, True])
+def test_what_comes_out_may_be_written_and_is_copied_only_where_it_must_be(order, written):
+    record = {"x": np.zeros(4), "code": np.zeros(4, np.int32)}
+    table = np.array(np.arange(8.0).reshape(4, 2), order=order)
+    table.flags.writeable = written
+    found = rows.unpack(table, record)
+    assert np.shares_memory(found["x"], table) == (written and order == "F")
+    assert found["x"].flags.c_contiguous
+    found["x"][1], found["code"][2] = -1.0, 7
+    np.testing.assert_array_equal(found["x"], [1, -1, 5, 7])
+    np.testing.assert_array_equal(found["code"], [0, 2, 7, 6])
+
+
+def test_an_accelerator_is_sent_once_what_is_the_same_in_all_rows(monkeypatch):
+    record = {"same": np.broadcast_to(2.5, 3), "own": np.arange(3.0), "one": np.ones(1)[:1].repeat(3)}
+    plain = np.asarray(rows.pack(record))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    sent = []
+    monkeypatch.setattr(rows.jnp, "broadcast_to", lambda x, shape: sent.append(float(x)) or np.broadcast_to(x, shape))
+    np.testing.assert_array_equal(np.asarray(rows.pack(record)), plain)
+    assert sent == [2.5]
+
+
 def test_a_table_of_another_width_is_no_record():
     record = {"x": np.ones(3), "y": np.ones(3)}
     with pytest.raises((TypeError, ValueError)):
