@@ -86,6 +86,18 @@ def test_nothing_of_several_axes_is_left(work):
     assert max(axes(jax.make_jaxpr(lambda *given: work(list(given)))(*lanes()).jaxpr)) > 1
 
 
+@pytest.mark.parametrize(
+    ("work", "name"),
+    [
+        (lambda given: [lax.sort(jnp.stack(given), dimension=0)], "sort"),
+        (lambda given: [lax.cumsum(given[0])], "cumsum"),
+    ],
+)
+def test_what_cannot_be_followed_is_named(work, name):
+    with pytest.raises(NotImplementedError, match=f"must not {name};"):
+        unrolled(work, lanes())
+
+
 def test_a_result_that_is_the_same_in_all_lanes_is_one_of_each():
     found = unrolled(lambda given: (jnp.zeros_like(given[0], bool), jnp.full_like(given[0], 3.0)), lanes())
     np.testing.assert_array_equal(found[0], np.zeros(LANES, bool))

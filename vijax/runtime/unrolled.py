@@ -92,6 +92,8 @@ def _done(eqn: Any, count: int, args: list[Rows]) -> list[Rows]:
         args = [
             rows if _wide(var) or not rows.ndim else rows[..., 0] for rows, var in zip(args, eqn.invars, strict=True)
         ]
+    if name not in _ELEMENTWISE:
+        raise NotImplementedError(f"work that is unrolled must not {name}; what it may do vijax.runtime.unrolled lists")
     return [_each(partial(eqn.primitive.bind, **params), count, args)]
 
 
@@ -138,6 +140,11 @@ def _others(shape: tuple[int, ...], dimension: int) -> tuple[int, ...]:
     return tuple(axis for axis in range(len(shape)) if axis != dimension)
 
 
+_ARITHMETIC = """
+    abs add and atan2 ceil clamp convert_element_type copy cos div eq exp expm1 floor ge gt integer_pow is_finite le log
+    log1p lt max min mul ne neg not or pow rem rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor
+"""
+_ELEMENTWISE = frozenset(_ARITHMETIC.split())
 # How two rows become one, and all lanes one number.
 _REDUCTIONS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     "reduce_or": (lax.bitwise_or, lambda lanes: lanes.sum(dtype=jnp.int32) > 0),  # Triton knows no other way
