@@ -60,7 +60,8 @@ class Program(NamedTuple):
         service: For the rare lane that declines a step.
         steps: How many are taken between two rounds.
         arithmetic: Whether all of it may be put in kernels, see `xla.kernel`.
-        numbers: Whether step and review are arithmetic of numbers, which may stay in registers, see `registers`.
+        numbers: Whether step and review are arithmetic of numbers, which may stay in registers, and a second try what
+            they can do of each lane; see `registers`.
     """
 
     load: Callable[[Float[Array, "row in"]], Carry]

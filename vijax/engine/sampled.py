@@ -158,8 +158,8 @@ def _step(c: _Contact, s: Zeros, w: Zeros, z: Zeros) -> tuple[Zeros, tuple[Zeros
 def _polish(c: _Contact, s: Zeros) -> tuple[Zeros, Zeros, tuple[Zeros, ...]]:
     """Find the exit, a zero of w, near the first row of s, and the crest, a zero of w', near its second, if any.
 
-    With the last step towards each, and the derivatives of w before that step. The second iteration's closed form is
-    the careful one, which loses nothing in short contacts and at resonance.
+    With the last step towards each, and the derivatives of w before that step. The last iteration's closed form is the
+    careful one, which loses nothing in short contacts and at resonance. With one before it, slow exits stay in doubt.
     """
     for _ in range(2):
         w, z = _state(c, _turned(c, s))
