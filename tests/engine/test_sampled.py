@@ -9,6 +9,7 @@ from benchmarks.yardstick import TILE, both_ways, long_contact, march, pairs, st
 from vijax.engine import exact, sampled
 from vijax.engine.impact import Arrival, Ball
 from vijax.model.records import State
+from vijax.runtime.unrolled import unrolled
 
 RESTITUTIONS, SLOPES = [0.05, 0.2, 0.5, 0.9, 0.99, 1.0], [0.0, 0.1, -0.5, 1.2]
 SURE = {"plane": 0.97, "wide": 0.65, "rigid": 0.65}  # least share of the impacts, a few per cent below the measured
@@ -147,6 +148,26 @@ def test_no_slow_exit_is_in_doubt():
     assert slow.sum() > 50
     assert np.all(sure[slow])
     np.testing.assert_allclose(hit.v_out[slow], impact.v_out[slow], rtol=1e-11)
+
+
+def test_an_accelerator_finds_the_same_lane_by_lane(monkeypatch):
+    """There the step is a kernel that knows single lanes alone, and looks samples up in another way."""
+    pair, u, v, t = pressed(np.random.default_rng(4))
+    given = jax.tree.map(jnp.asarray, pair), lanes(u, v, t)
+    plain = deep_step(*given)
+    leaves, tree = jax.tree.flatten(given)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+
+    @jax.jit
+    def lane_by_lane(*leaves):
+        return unrolled(lambda some: sampled.sampled_step(*jax.tree.unflatten(tree, some), deep=True), list(leaves))
+
+    hit, sure = jax.tree.unflatten(jax.tree.structure(plain), lane_by_lane(*leaves))
+    assert np.mean(plain[1]) > 0.5
+    np.testing.assert_array_equal(sure, plain[1])
+    for name in ("flight", "duration", "v_out", "depth", "work"):
+        got, want = (np.asarray(getattr(one, name))[np.asarray(sure)] for one in (hit, plain[0]))
+        np.testing.assert_allclose(got, want, rtol=1e-10, atol=1e-14)
 
 
 def test_flights_that_are_not_sure_are_sampled_where_asked_for():

@@ -91,6 +91,33 @@ PLANES = {
 }
 
 
+def test_a_store_is_compared_with_the_plane_unless_it_was_made_a_moment_ago(calls, out, monkeypatch):
+    compared, check_same = [], tiled_store.store_metadata.check_same
+    monkeypatch.setattr(
+        tiled_store.store_metadata, "check_same", lambda *given: compared.append(1) or check_same(*given)
+    )
+    sweep(**FEW, out=out)
+    assert not compared
+    sweep(**FEW, out=out)
+    assert len(compared) == 2  # before anything runs, and again when nobody else writes there
+    sweep(**FEW, out=out, overwrite=True)
+    assert len(compared) == 2
+
+
+def test_another_run_that_was_faster_is_not_taken_for_this_one(calls, out, monkeypatch):
+    other = sweep(**AXES, outputs=["period"], out=out.with_name("other.zarr"))
+    make = tiled_store._make
+
+    def slow(planned, birth, target):
+        shutil.copytree(out.with_name("other.zarr"), target)
+        make(planned, birth, target)
+
+    monkeypatch.setattr(tiled_store, "_make", slow)
+    with pytest.raises(FileExistsError, match="P is left out"):
+        sweep(**FEW, out=out)
+    assert load(out).identical(other.load())
+
+
 @pytest.mark.parametrize("axes", PLANES.values(), ids=PLANES)
 def test_a_study_holds_what_the_sweep_in_memory_returns(calls, out, axes):
     with warnings.catch_warnings():

@@ -177,22 +177,24 @@ def opened(planned: SweepPlan, path: str | Path, overwrite: bool = False) -> Ite
     Raises:
         As `check`.
     """
-    target = _target(path, overwrite)
+    target, birth = _target(path, overwrite), uuid.uuid4().hex
     if not target.exists():
-        _make(planned, target)
+        _make(planned, birth, target)
     elif overwrite:
         with _locked(target, overwrite), replacing_folder(target) as part:
-            _write_blank(planned, part)
+            _write_blank(planned, birth, part)
     with _locked(target):
-        _check_same(planned, target)
+        # What was made here a moment ago is known.
+        if _birth(target) != birth:
+            _check_same(planned, target)
         yield _found(planned, target)
 
 
-def _make(planned: SweepPlan, target: Path) -> None:
+def _make(planned: SweepPlan, birth: str, target: Path) -> None:
     """Make a store without any tile, unless another run was faster."""
     part = beside(target, "part")
     try:
-        _write_blank(planned, part)
+        _write_blank(planned, birth, part)
         part.rename(target)
     except OSError:
         if not target.exists():
@@ -201,8 +203,7 @@ def _make(planned: SweepPlan, target: Path) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _write_blank(planned: SweepPlan, path: Path) -> None:
-    birth = uuid.uuid4().hex
+def _write_blank(planned: SweepPlan, birth: str, path: Path) -> None:
     store_metadata.write(planned, blocks(planned.cells), birth, path)
     _lock(path).parent.mkdir()
     _lock(path).write_text(birth, encoding="utf-8")
