@@ -91,6 +91,7 @@ def test_nothing_of_several_axes_is_left(work):
     [
         (lambda given: [lax.sort(jnp.stack(given), dimension=0)], "sort"),
         (lambda given: [lax.cumsum(given[0])], "cumsum"),
+        (lambda given: [given[0] - given[0].sum()], "reduce_sum over lanes"),
     ],
 )
 def test_what_cannot_be_followed_is_named(work, name):

@@ -76,7 +76,7 @@ def sampled_answer(plan: Plan, request: Request) -> Answer:
     """Answer by certified sampling.
 
     On level ground the quick step is unsure of so few flights that none is sampled, but on an accelerator: there the
-    careful step, loops within loops, takes eight times as long as this one, however few lanes ask for it.
+    careful step, loops within loops, takes many times as long as this one, however few lanes ask for it.
     """
     unsure = plan.ground is not Ground.LEVEL or not xla.on_cpu()
     impact, sure = sampled.sampled_step(

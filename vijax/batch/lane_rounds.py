@@ -173,16 +173,15 @@ def _service_due(
     """
     at = AtWork(cell, carry)
     easy, hard = (lanes.sum() for lanes in asking(program, at))
-    going = able(program, at)
+    full, going = (easy >= width) | (hard >= _many(width)), able(program, at)
     if on_cpu():
-        return (easy >= width) | (hard >= width) | ((easy + hard > 0) & (easy + hard >= going))
-    full = (easy >= width) | (hard >= _many(width))
+        return full | ((easy + hard > 0) & (easy + hard >= going))
     return full | jnp.where(easy > 0, easy >= going, (hard > 0) & (going == 0))
 
 
 def _many(width: int) -> int:
-    """Say for how many lanes an accelerator makes a careful try."""
-    return max(width // 4, 1)
+    """Say how many hard lanes are not to wait for others."""
+    return width if on_cpu() else max(width // 4, 1)
 
 
 def asking(program: Program, at: AtWork) -> tuple[Bool[Array, "lane"], Bool[Array, "lane"]]:

@@ -116,6 +116,8 @@ def _run(program: Program, table: _Table, outputs: int, lanes: int, few: int) ->
         # Where the last cells are left to others nobody waits for a lane either, once no cell does.
         queue = _refill(program, table, width, queue, width if few else 1)
         new = queue._replace(at=queue.at._replace(carry=run_round(program, width, queue.at)))
+        if not few:
+            return new
         ended = (_flying(program, queue.at) - _flying(program, new.at)).astype(new.pace.dtype)
         return new._replace(pace=new.pace + (ended - new.pace) / _ROUNDS)
 

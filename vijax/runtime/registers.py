@@ -68,30 +68,20 @@ def each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], *, interpre
 
 def _of_each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], interpret: bool = False) -> T:
     from jax.experimental import pallas
-    from jax.experimental.pallas import triton
 
     leaves, tree = jax.tree.flatten(lanes)
-    like = jax.eval_shape(work, lanes)
+    like, results = jax.tree.flatten(jax.eval_shape(work, lanes))
 
-    def body(real, *refs):
-        @pallas.when(pallas.program_id(0) * FEW < real[0])
+    def body(*refs):
+        given, (count, *written) = refs[: len(leaves)], refs[len(leaves) :]
+
+        @pallas.when(pallas.program_id(0) * FEW < count[0])
         def _():
-            lanes = [ref[...] for ref in refs[: len(leaves)]]
-            found = unrolled(lambda lanes: work(jax.tree.unflatten(tree, lanes)), lanes)
-            for ref, value in zip(refs[len(leaves) :], found, strict=True):
+            found = unrolled(lambda some: work(jax.tree.unflatten(tree, some)), [ref[...] for ref in given])
+            for ref, value in zip(written, found, strict=True):
                 ref[...] = value
 
-    part = pallas.BlockSpec((FEW,), lambda i: (i,))
-    found = pallas.pallas_call(
-        body,
-        grid=(leaves[0].size // FEW,),
-        in_specs=[pallas.BlockSpec((1,), lambda _: (0,)), *(part for _ in leaves)],
-        out_specs=[part for _ in jax.tree.leaves(like)],
-        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(like)],
-        compiler_params=triton.CompilerParams(num_warps=FEW // _WARP),
-        interpret=interpret,
-    )(real.reshape(1), *leaves)
-    return jax.tree.unflatten(jax.tree.structure(like), found)
+    return jax.tree.unflatten(results, _by_blocks(body, FEW, (leaves, [real.reshape(1)], like), interpret))
 
 
 def _fits(leaf: Any) -> bool:
@@ -100,10 +90,6 @@ def _fits(leaf: Any) -> bool:
 
 
 def _in_one_kernel(work: Callable[[T], T], lanes: T, interpret: bool = False) -> T:
-    # Here, as importing vijax on a CPU must not load it.
-    from jax.experimental import pallas
-    from jax.experimental.pallas import triton
-
     leaves, tree = jax.tree.flatten(lanes)
     block = [jax.ShapeDtypeStruct((LANES, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
     traced = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(work(jax.tree.unflatten(tree, leaves))))(*block)
@@ -119,22 +105,48 @@ def _in_one_kernel(work: Callable[[T], T], lanes: T, interpret: bool = False) ->
         for ref, i in zip(written, moved, strict=True):
             ref[...] = found[i]
 
-    def part(leaf):
-        return pallas.BlockSpec((LANES, *leaf.shape[1:]), lambda i: (i, *[0] * (leaf.ndim - 1)))
-
-    def whole(leaf):
-        return pallas.BlockSpec(leaf.shape, lambda _: (0,) * leaf.ndim)
-
-    found = pallas.pallas_call(
-        body,
-        grid=(leaves[0].shape[0] // LANES,),
-        in_specs=[*map(part, leaves), *map(whole, traced.consts)],
-        out_specs=[part(leaves[i]) for i in moved],
-        out_shape=[jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in moved],
-        input_output_aliases={i: place for place, i in enumerate(moved)},
-        compiler_params=triton.CompilerParams(num_warps=LANES // _WARP),
-        interpret=interpret,
-    )(*leaves, *traced.consts)
+    kept = {i: place for place, i in enumerate(moved)}
+    found = _by_blocks(body, LANES, (leaves, traced.consts, [leaves[i] for i in moved]), interpret, kept)
     for i, value in zip(moved, found, strict=True):
         leaves[i] = value
     return jax.tree.unflatten(tree, leaves)
+
+
+def _by_blocks(
+    body: Callable[..., None],
+    block: int,
+    arrays: tuple[list[Any], list[Any], list[Any]],
+    interpret: bool,
+    kept: dict[int, int] | None = None,
+) -> list[Any]:
+    """Call a kernel on all blocks of lanes.
+
+    Args:
+        body: Its references are to a block of lanes, to what all blocks read, and to what a block writes.
+        block: Lanes of a block.
+        arrays: All lanes, what all blocks read, and what is written, which may be shapes.
+        interpret: As in `stay`.
+        kept: Which lanes are written over, and by which result.
+    """
+    # Here, as importing vijax on a CPU must not load it.
+    from jax.experimental import pallas
+    from jax.experimental.pallas import triton
+
+    lanes, read, written = arrays
+
+    def part(leaf: Any) -> Any:
+        return pallas.BlockSpec((block, *leaf.shape[1:]), lambda i: (i, *[0] * (leaf.ndim - 1)))
+
+    def whole(leaf: Any) -> Any:
+        return pallas.BlockSpec(leaf.shape, lambda _: (0,) * leaf.ndim)
+
+    return pallas.pallas_call(
+        body,
+        grid=(lanes[0].shape[0] // block,),
+        in_specs=[*map(part, lanes), *map(whole, read)],
+        out_specs=list(map(part, written)),
+        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in written],
+        input_output_aliases=kept or {},
+        compiler_params=triton.CompilerParams(num_warps=block // _WARP),
+        interpret=interpret,
+    )(*lanes, *read)

@@ -33,11 +33,8 @@ def unrolled(work: Callable[..., Any], lanes: list[Any]) -> list[Any]:
     shapes = [jax.ShapeDtypeStruct((_TRACED,), leaf.dtype) for leaf in lanes]
     traced = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(work(list(leaves))))(*shapes)
     count = lanes[0].shape[0]
-    found = _follow(traced.jaxpr, count, [_single(np.asarray(c)) for c in traced.consts], list(map(_single, lanes)))
-    return [
-        jnp.broadcast_to(jnp.asarray(rows.item(), out.aval.dtype), (count,))
-        for rows, out in zip(found, traced.jaxpr.outvars, strict=True)
-    ]
+    found = _follow(traced, count, list(map(_single, lanes)))
+    return [_full(rows.item(), aval, count) for rows, aval in zip(found, traced.out_avals, strict=True)]
 
 
 def _single(value: Any) -> Rows:
@@ -53,13 +50,20 @@ def _laid(values: Iterable[Any], shape: tuple[int, ...]) -> Rows:
     return rows
 
 
-def _wide(var: Any) -> bool:
+def _wide(aval: Any) -> bool:
     """Say whether a value of the traced work has the axis of lanes."""
-    return var.aval.shape[-1:] == (_TRACED,)
+    return aval.shape[-1:] == (_TRACED,)
 
 
-def _follow(jaxpr: core.Jaxpr, count: int, consts: list[Rows], given: list[Rows]) -> list[Rows]:
+def _full(value: Any, aval: Any, count: int) -> Any:
+    """Give a value that has the axis of lanes that axis, where it is the same in all."""
+    value = jnp.asarray(value, aval.dtype)
+    return jnp.broadcast_to(value, (count,)) if _wide(aval) else value
+
+
+def _follow(traced: core.ClosedJaxpr, count: int, given: list[Rows]) -> list[Rows]:
     """Do what is traced, on rows."""
+    jaxpr, consts = traced.jaxpr, [_single(np.asarray(const)) for const in traced.consts]
     known: dict[Any, Rows] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *given], strict=True))
 
     def read(var: Any) -> Rows:
@@ -80,28 +84,31 @@ def _done(eqn: Any, count: int, args: list[Rows]) -> list[Rows]:
     if name == "while":
         return _loop(params, count, args, [var.aval for var in eqn.outvars])
     if inner := params.get("jaxpr") or params.get("call_jaxpr"):
-        return _follow(inner.jaxpr, count, list(map(_single, map(np.asarray, inner.consts))), args)
+        return _follow(inner, count, args)
     if name == "unstack":
         return list(np.moveaxis(args[0], params["axis"], 0))
     if name in _REDUCTIONS:
         return [_reduced(eqn, count, args[0])]
     if name in _SHAPES:
         return [_SHAPES[name](args, **_of_rows(eqn))]
-    if _wide(eqn.outvars[0]):
-        # A last axis of length one stands for all lanes.
-        args = [
-            rows if _wide(var) or not rows.ndim else rows[..., 0] for rows, var in zip(args, eqn.invars, strict=True)
-        ]
     if name not in _ELEMENTWISE:
-        raise NotImplementedError(f"work that is unrolled must not {name}; what it may do vijax.runtime.unrolled lists")
+        raise _beyond(name)
+    if _wide(eqn.outvars[0].aval):
+        # A last axis of length one stands for all lanes.
+        each = zip(args, eqn.invars, strict=True)
+        args = [rows if _wide(var.aval) or not rows.ndim else rows[..., 0] for rows, var in each]
     return [_each(partial(eqn.primitive.bind, **params), count, args)]
+
+
+def _beyond(what: str) -> NotImplementedError:
+    return NotImplementedError(f"work that is unrolled must not {what}; what it may do vijax.runtime.unrolled lists")
 
 
 def _of_rows(eqn: Any) -> dict[str, Any]:
     """Give the parameters of an operation on shapes, without the axis of lanes."""
     params = dict(eqn.params)
-    out = eqn.outvars[0]
-    params["shape"] = out.aval.shape[:-1] if _wide(out) else out.aval.shape
+    out = eqn.outvars[0].aval
+    params["shape"] = out.shape[:-1] if _wide(out) else out.shape
     if eqn.primitive.name == "broadcast_in_dim" and _wide(out):
         rows = len(params["shape"])
         params["broadcast_dimensions"] = tuple(axis for axis in params["broadcast_dimensions"] if axis < rows)
@@ -145,23 +152,27 @@ _ARITHMETIC = """
     log1p lt max min mul ne neg not or pow rem rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor
 """
 _ELEMENTWISE = frozenset(_ARITHMETIC.split())
-# How two rows become one, and all lanes one number.
-_REDUCTIONS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
-    "reduce_or": (lax.bitwise_or, lambda lanes: lanes.sum(dtype=jnp.int32) > 0),  # Triton knows no other way
-    "reduce_sum": (lax.add, jnp.sum),
-}
+# How two rows become one.
+_REDUCTIONS: dict[str, Callable[..., Any]] = {"reduce_or": lax.bitwise_or, "reduce_sum": lax.add}
 
 
 def _reduced(eqn: Any, count: int, rows: Rows) -> Rows:
-    """Reduce rows one after another, and lanes where they are among the axes."""
-    join, across = _REDUCTIONS[eqn.primitive.name]
-    axes = eqn.params["axes"]
+    """Reduce rows one after another.
+
+    Lanes tell each other no more than whether any is to go on: anything else would depend on which are side by side.
+    """
+    name, axes = eqn.primitive.name, eqn.params["axes"]
     own = tuple(axis for axis in axes if axis < rows.ndim)
     if own:
         laid = np.moveaxis(rows, own, range(len(own)))
         laid = laid.reshape(-1, *laid.shape[len(own) :])
-        rows = reduce(lambda one, other: _each(join, count, [one, other]), (laid[i, ...] for i in range(len(laid))))
-    return rows if len(own) == len(axes) else _each(across, count, [rows])
+        join = partial(_each, _REDUCTIONS[name], count)
+        rows = reduce(lambda one, other: join([one, other]), (laid[i, ...] for i in range(len(laid))))
+    if len(own) == len(axes):
+        return rows
+    if name != "reduce_or":
+        raise _beyond(f"{name} over lanes")
+    return _each(lambda lanes: lanes.sum(dtype=jnp.int32) > 0, count, [rows])  # Triton knows no other way
 
 
 def _each(work: Callable[..., Any], count: int, args: list[Rows]) -> Rows:
@@ -184,7 +195,6 @@ def _loop(params: dict[str, Any], count: int, args: list[Rows], shapes: list[Any
     """Go on while the condition holds, with a flat list of lanes and numbers."""
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     for_cond, for_body, start = args[:first], args[first:second], args[second:]
-    cond, body = params["cond_jaxpr"], params["body_jaxpr"]
 
     def flat(carry: list[Rows]) -> list[Any]:
         each = zip(carry, shapes, strict=True)
@@ -194,17 +204,9 @@ def _loop(params: dict[str, Any], count: int, args: list[Rows], shapes: list[Any
         left = iter(values)
         return [_laid(itertools.islice(left, rows.size), rows.shape) for rows in start]
 
-    def consts(jaxpr: Any) -> list[Rows]:
-        return [_single(np.asarray(const)) for const in jaxpr.consts]
-
     found = lax.while_loop(
-        lambda values: _follow(cond.jaxpr, count, consts(cond), [*for_cond, *laid(values)])[0].item(),
-        lambda values: flat(_follow(body.jaxpr, count, consts(body), [*for_body, *laid(values)])),
+        lambda values: _follow(params["cond_jaxpr"], count, [*for_cond, *laid(values)])[0].item(),
+        lambda values: flat(_follow(params["body_jaxpr"], count, [*for_body, *laid(values)])),
         flat(start),
     )
     return laid(found)
-
-
-def _full(value: Any, aval: Any, count: int) -> Any:
-    value = jnp.asarray(value, aval.dtype)
-    return jnp.broadcast_to(value, (count,)) if aval.shape[-1:] == (_TRACED,) else value
