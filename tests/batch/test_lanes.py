@@ -187,6 +187,11 @@ def test_lanes_that_stay_in_registers_give_the_same_results(monkeypatch):
     found = jax.jit(lambda cells: lanes.run(PROGRAM, cells, jnp.asarray(600, jnp.int32), OUTPUTS, 256))(cells)
     assert blocks == [2, 1]
     assert np.array_equal(found, [plain(row) for row in cells])
+    # Second tries are what serves the others: a careful one would be seen.
+    spoiled = PROGRAM.service._replace(careful=lambda toy: Answer(-toy.hash, jnp.ones_like(toy.done)))
+    program, cells = PROGRAM._replace(service=spoiled), draw(600, [EASY, DECLINES])
+    found = jax.jit(lambda cells: lanes.run(program, cells, jnp.asarray(600, jnp.int32), OUTPUTS, 256))(cells)
+    assert np.array_equal(found, [plain(row) for row in cells])
 
 
 @pytest.mark.parametrize("count", [0, 1, 127, 128, 129, 599, 600])
