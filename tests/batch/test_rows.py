@@ -68,15 +68,27 @@ def test_what_comes_out_may_be_written_and_is_copied_only_where_it_must_be(order
     np.testing.assert_array_equal(found["code"], [0, 2, 7, 6])
 
 
+RECORD = {"same": np.broadcast_to(2.5, 3), "own": np.arange(3.0), "code": np.arange(3, dtype=np.int32), "none": None}
+
+
+def test_a_table_is_what_packing_makes_and_has_more_rows():
+    table = rows.laid_out(RECORD, 5)
+    assert isinstance(table, np.ndarray)  # JAX compiles whatever it does outside a program, for every number of rows
+    assert table.shape == (5, 3)
+    np.testing.assert_array_equal(table[:3], np.asarray(rows.pack(RECORD)))
+
+
 def test_an_accelerator_is_sent_once_what_is_the_same_in_all_rows(monkeypatch):
-    record = {"same": np.broadcast_to(2.5, 3), "own": np.arange(3.0), "one": np.ones(1)[:1].repeat(3)}
     sent = []
     monkeypatch.setattr(rows.jnp, "broadcast_to", lambda x, shape: sent.append(float(x)) or np.broadcast_to(x, shape))
-    plain = np.asarray(rows.pack(record))
-    assert not sent  # to a CPU nothing is sent, and a program for every shape would be compiled
+    plain = rows.laid_out(RECORD, 3)
+    assert not sent
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    np.testing.assert_array_equal(np.asarray(rows.pack(record)), plain)
+    np.testing.assert_array_equal(np.asarray(rows.laid_out(RECORD, 3)), plain)
     assert sent == [2.5]
+    longer = np.asarray(rows.laid_out(RECORD, 5))
+    assert longer.shape == (5, 3)
+    np.testing.assert_array_equal(longer[:3], plain)
 
 
 def test_a_table_of_another_width_is_no_record():

@@ -15,6 +15,7 @@ import vijax
 from scripts import grid
 from tests.helpers import SCRIPTS, cases
 from vijax.cli import main as command
+from vijax.cli import process
 from vijax.engine.method_choice import choose, record
 from vijax.orbits import orbit_search, switching
 from vijax.plots import branch_diagrams, orbit_diagrams
@@ -334,6 +335,37 @@ def test_a_run_that_came_to_no_end_is_left_at_once(code):
     busy = "import threading, time; threading.Thread(target=time.sleep, args=(60,)).start(); "
     line = f"{busy}from vijax.cli.process import leave; leave({code})"
     assert subprocess.run([sys.executable, "-c", line], timeout=30).returncode == code
+
+
+@pytest.mark.parametrize("code", [0, 2])
+def test_what_is_left_at_the_end_is_not_looked_through(code):
+    """A circle of records, of which a trace leaves a hundred thousand, is given back with the process."""
+    circle = "Circle = type('Circle', (), {'__del__': lambda self: print('found')}); one = Circle(); one.me = one; "
+    line = f"{circle}from vijax.cli.process import leave; leave({code})"
+    done = subprocess.run([sys.executable, "-c", line], timeout=30, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (code, "")
+
+
+ROLLED = "xla_cpu_disable_loop_unrolling"
+
+
+@pytest.mark.parametrize(
+    ("said", "meanwhile"),
+    [
+        (None, f"--xla_backend_extra_options={ROLLED}"),
+        ("--xla_flag=1", f"--xla_flag=1 --xla_backend_extra_options={ROLLED}"),
+        ("--xla_backend_extra_options=a", "--xla_backend_extra_options=a"),
+    ],
+)
+def test_the_compiler_leaves_loops_as_they_are_while_a_command_runs(said, meanwhile, monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    if said:
+        monkeypatch.setenv("XLA_FLAGS", said)
+    seen = []
+    look = click.Command("look", callback=lambda: seen.append(os.environ["XLA_FLAGS"]))
+    assert process.run(look, []) == 0
+    assert seen == [meanwhile]
+    assert os.environ.get("XLA_FLAGS") == said
 
 
 def test_bash_completes_after_the_line_of_the_pages(tmp_path):

@@ -1,6 +1,8 @@
 """Units: what a number with one is in SI, at every door that takes physical quantities, and what is refused."""
 
 import math
+import sys
+import types
 
 import numpy as np
 import pint
@@ -159,3 +161,10 @@ class _StopError(Exception):
 
 def _stop():
     raise _StopError
+
+
+def test_while_another_thread_imports_pint_numbers_pass(monkeypatch):
+    """A module is known before what is in it: tracing beside an import of zarr, which imports pint, once failed."""
+    monkeypatch.setitem(sys.modules, "pint", types.ModuleType("pint"))
+    assert units.plain("d", 0.2) == 0.2
+    assert units.plain("d", [0.2, 0.3]) == [0.2, 0.3]

@@ -22,6 +22,7 @@ from vijax.planes import sweep as sweeps
 from vijax.planes.axes import parse_axis
 from vijax.planes.cells import cells
 from vijax.planes.sweep import load, save, sweep
+from vijax.runtime import export_cache
 
 LONG = 40  # periods: enough for the 1:1 orbits of these tests
 ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "max_penetration", "max_impact_speed"}
@@ -494,6 +495,18 @@ def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
             got = other[name].sel(d=d).transpose("d", "kappa")
             wanted = mixed[name].sel(kappa=got["kappa"])
             np.testing.assert_array_equal(got, wanted, err_msg=f"{name}, {where}")
+
+
+def test_planes_of_every_size_share_one_program(tmp_path, monkeypatch):
+    made, jitted = [], export_cache.TracedProgram._jitted
+    monkeypatch.setattr(
+        export_cache.TracedProgram, "_jitted", lambda *args: made.append(args[0]._name) or jitted(*args)
+    )
+    simulate.compiled.cache_clear()
+    sweep(d=[0.2, 0.25], r=0.5, periods=1)
+    sweep(d=np.linspace(0.02, 0.6, 37), kappa=np.geomspace(2, 3000, 61), r=0.5, periods=1)
+    sweep(d=[0.2, 0.25], kappa=np.geomspace(2, 3000, 1000), r=0.5, periods=1, out=tmp_path / "plane.zarr")
+    assert len(made) == 1
 
 
 @pytest.mark.long

@@ -94,10 +94,12 @@ def test_the_program_that_leaves_its_last_cells_is_lowered_for_a_gpu(known, call
 
 def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):
     monkeypatch.delenv("VIJAX_TILE", raising=False)
-    assert (tile_size.largest(), lanes.width_of(10**6)) == (32_768, 512)
-    assert [lanes.width_of(cells) for cells in (10, 4_096, 16_384)] == [64, 64, 256]
+    assert tile_size.largest() == lanes.TABLE == 32_768
+    assert {lanes.width_of(cells) for cells in (10, 4_096, 10**6)} == {64}
+    assert [lanes.table_rows(cells) for cells in (10, 32_768, 10**6)] == [32_768, 32_768, 10**6]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert tile_size.largest() == 4_194_304
+    assert lanes.table_rows(10) == 10
     assert [lanes.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [100, 8_192, 12_500, 131_072]
 
 

@@ -81,13 +81,13 @@ def walls_of(pair: ImpactPair) -> dict[str, Any]:
 class Settings(eqx.Module):
     """What a run is asked for: the traced numbers, and the method that steps; None for the exact engine."""
 
-    periods: Float[Array, ""]
-    transient: Float[Array, ""]
+    periods: Float[AnyArray, ""]
+    transient: Float[AnyArray, ""]
     device: Harvester
     method: Method | None
-    length_variant: Float[Array, "variant"]
-    speed_variant: Float[Array, "variant"]
-    recorded_periods: Float[Array, ""] | None = None  # chained: periods at the end whose impacts are wanted
+    length_variant: Float[AnyArray, "variant"]
+    speed_variant: Float[AnyArray, "variant"]
+    recorded_periods: Float[AnyArray, ""] | None = None  # chained: periods at the end whose impacts are wanted
 
 
 class Entry(eqx.Module):

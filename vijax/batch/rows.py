@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vijax.runtime import xla
+from vijax.runtime.arrays import AnyArray
 
 Record = TypeVar("Record")
 
@@ -24,16 +25,39 @@ def pack(record: Any, leading: int = 1) -> Float[Array, "... column"]:
         leading: How many axes number the rows.
     """
     leaves = jax.tree.leaves(record)
-    kind = next(leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating))
-    flat = [leaf.reshape(*leaf.shape[:leading], -1).astype(kind, copy=False) for leaf in map(_sent, leaves)]
+    kind = _kind(leaves)
+    flat = [leaf.reshape(*leaf.shape[:leading], -1).astype(kind, copy=False) for leaf in leaves]
     return jnp.concatenate(flat, axis=-1)
 
 
-def _sent(leaf: Any) -> Any:
-    """Send an accelerator one number for all rows where NumPy's array repeats it: the way there is narrow."""
-    if xla.on_cpu() or not isinstance(leaf, np.ndarray) or leaf.size < 2 or any(leaf.strides):
-        return leaf
-    return jnp.broadcast_to(jnp.asarray(leaf.flat[0]), leaf.shape)
+def laid_out(record: Any, size: int) -> Float[AnyArray, "row column"]:
+    """Put the arrays of a record side by side, as `pack` does, in a table of so many rows for a compiled call.
+
+    For a CPU by NumPy, as what JAX does outside a program it compiles anew for every number of rows.
+
+    Args:
+        record: Arrays that share their first axis; all floating ones of one kind.
+        size: How many rows the table has; those past the record's own hold anything.
+    """
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(record)]
+    if not xla.on_cpu():
+        return pack([_sent(leaf, size) for leaf in leaves])
+    table: Any = np.zeros((size, width(leaves)), _kind(leaves))
+    columns = [leaf.reshape(leaf.shape[0], -1) for leaf in leaves]
+    np.concatenate(columns, axis=1, out=table[: leaves[0].shape[0]], casting="unsafe")
+    return table
+
+
+def _kind(leaves: list[Any]) -> Any:
+    """Find which floating numbers a record holds."""
+    return next(leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating))
+
+
+def _sent(leaf: np.ndarray, size: int) -> Any:
+    """Send an accelerator so many rows: one number for all where an array repeats it, as the way there is narrow."""
+    if leaf.size > 1 and not any(leaf.strides):
+        return jnp.broadcast_to(jnp.asarray(leaf.flat[0]), (size, *leaf.shape[1:]))
+    return jnp.asarray(np.resize(leaf, (size, *leaf.shape[1:])))
 
 
 def unpack(table: Any, like: Record) -> Record:

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from vijax.batch import chain, lanes, rows, stragglers
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, walls_of
@@ -125,7 +125,7 @@ def summarise(
         outputs: Names of `Summary` fields that must be there; what only others need is not computed.
         method: The stepping method (`method_choice.choose` makes it); None for the exact engine.
         count: How many cells are real, the rest being padding; all unless given. With 0 the program is compiled.
-        padded: How many rows the compiled call has, the first cell filling it up; as many as cells unless given.
+        padded: How many rows the compiled call has, at least; as many as cells unless given.
         on: The device that runs them; JAX's default unless given.
 
     Returns:
@@ -152,62 +152,59 @@ def summarise(
         tangent=until == "attractor" or "lyapunov" in outputs,
         variants=scale.length_variant.shape[0],
     )
-    cells = rows.pack(Entry(pair, scale.length, scale.speed, u0, v0, None))
     settings = Settings(
-        periods=jnp.asarray(periods, dtype),
-        transient=jnp.asarray(transient if until == "window" else jnp.floor(TRANSIENT_SHARE * periods), dtype),
+        periods=_numbers(dtype, periods),
+        transient=_numbers(dtype, transient if until == "window" else np.floor(TRANSIENT_SHARE * periods)),
         # Not what decides the motion, or what is admissible: a device with a limit needs no other program.
-        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), electrical(device)),
-        method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
-        length_variant=jnp.asarray(scale.length_variant, dtype),
-        speed_variant=jnp.asarray(scale.speed_variant, dtype),
+        device=_numbers(dtype, electrical(device)),
+        method=_numbers(dtype, method),
+        length_variant=_numbers(dtype, scale.length_variant),
+        speed_variant=_numbers(dtype, scale.speed_variant),
     )
-    if padded is not None:
-        cells = _filled_up(cells, checks.whole("padded", padded, cells.shape[0]))
-    number = jnp.asarray(count, jnp.int32)
+    size = pair.d.shape[0] if padded is None else checks.whole("padded", padded, pair.d.shape[0])
+    cells = rows.laid_out(Entry(pair, scale.length, scale.speed, u0, v0, None), lanes.table_rows(size))
+    number = _numbers(np.int32, count)
     if on is not None:
         cells, number, settings = jax.device_put((cells, number, settings), on)
-    return _run(plan, cells, number, settings, read=count > 0)
+    return _run(plan, cells, number, settings, count)
 
 
-def _filled_up(cells: Float[Array, "cell in"], size: int) -> Float[Array, "row in"]:
-    """Add copies of the first cell up to so many rows."""
-    more = size - cells.shape[0]
-    return jnp.concatenate([cells, jnp.broadcast_to(cells[:1], (more, cells.shape[1]))]) if more else cells
+def _numbers(kind: Any, tree: Any) -> Any:
+    """Turn numbers into NumPy's arrays of one kind: what makes them JAX's is a program, which is compiled."""
+    return jax.tree.map(lambda x: np.asarray(x, kind), tree)
 
 
 def _run(
     plan: Plan,
-    cells: Float[AnyArray, "cell in"],
+    cells: Float[AnyArray, "row in"],
     count: Int[AnyArray, ""],
     settings: Settings,
-    read: bool = True,
+    real: int,
 ) -> Summary:
-    """Make the summary of a tile, of NumPy's arrays; an empty one where it is not read."""
+    """Make the summary of the real cells of a tile, of NumPy's arrays."""
     width, like = lanes.width_of(cells.shape[0]), shapes(plan, cells.dtype)
-    nothing = np.zeros((0, rows.width(like)), cells.dtype)
     # What a lane of a method carries need not be a row of numbers.
     few = stragglers.most() if settings.method is None else 0
     if not few:
-        table = jax.block_until_ready(compiled(plan, width)(cells, count, settings))
-        return rows.unpack(np.asarray(table) if read else nothing, like)
+        table = np.asarray(compiled(plan, width)(cells, count, settings))
+        return rows.unpack(table[:real], like)
     with context.pool(1) as beside:
         ready = beside.submit(stragglers.prepare, plan, settings)  # compiled while the other program is
         columns, left = _compiled_most(plan, width, few)(cells, count, settings)
         ready.result()
-        if not read:
-            return rows.unpack(nothing, like)
+        if not real:
+            return rows.unpack(np.zeros((0, rows.width(like)), cells.dtype), like)
         # The system gives memory when it is first written to: while the accelerator works.
         table = np.empty(columns.shape, cells.dtype)
         table.fill(0)
         cell, lane = np.asarray(left.cell), np.asarray(left.lanes)
-        real = cell >= 0
-        last = beside.submit(stragglers.finish, plan, settings, lane[real])
+        there = cell >= 0
+        last = beside.submit(stragglers.finish, plan, settings, lane[there])
         table[...] = columns  # copied from the accelerator while the cores fly
-        found = rows.unpack(table.T, like)
+        found = rows.unpack(table.T[:real], like)
         rest = rows.unpack(last.result(), like)
     for field, values in zip(jax.tree.leaves(found), jax.tree.leaves(rest), strict=True):
-        field[cell[real]] = values
+        field[cell[there]] = values
     return found
 
 
@@ -226,7 +223,7 @@ def attractors(
     *,
     periods: int,
     recorded_periods: int,
-    count: int | None = None,
+    padded: int,
 ) -> Summary:
     """Run a tile of devices with soft walls, each until its attractor is certain, in one jitted call; with their ends.
 
@@ -236,7 +233,7 @@ def attractors(
         starts: At any phase, in contact too.
         periods: The most that the search for an attractor may take.
         recorded_periods: Periods at the end whose impacts will be wanted.
-        count: How many cells are real, the rest being padding; all unless given.
+        padded: How many rows the compiled call has, at least.
 
     Returns:
         The summary with its `handover`; energies are those of each cell's own device.
@@ -244,11 +241,12 @@ def attractors(
     length: Any = device.length_unit
     speed: Any = device.speed_unit
     own = electrical(device, unequal=pair.unequal)
-    cells = rows.pack(Entry(pair, length, speed, starts.u, starts.v, starts.t, own))
+    count = pair.d.shape[0]
+    entry = Entry(pair, length, speed, starts.u, starts.v, starts.t, own)
+    cells = rows.laid_out(entry, lanes.table_rows(max(padded, count)))
     plan = dataclasses.replace(_chained(pair), devices=True)
-    number = jnp.asarray(pair.d.shape[0] if count is None else count, jnp.int32)
     settings = _chained_settings(pair, Harvester(), periods, recorded_periods, None)
-    return _run(plan, cells, number, settings)
+    return _run(plan, cells, _numbers(np.int32, count), settings, count)
 
 
 def _chained(pair: ImpactPair) -> Plan:
@@ -259,16 +257,16 @@ def _chained(pair: ImpactPair) -> Plan:
 def _chained_settings(
     pair: ImpactPair, device: Harvester, periods: int, recorded_periods: int, method: Method | None
 ) -> Settings:
-    dtype = pair.d.dtype
-    one = jnp.ones(1, dtype)
+    numbers = partial(_numbers, pair.d.dtype)
+    one = numbers(np.ones(1))
     return Settings(
-        periods=jnp.asarray(periods, dtype),
-        transient=jnp.asarray(jnp.floor(TRANSIENT_SHARE * periods), dtype),
-        device=jax.tree.map(lambda x: jnp.asarray(x, dtype), electrical(device)),
-        method=jax.tree.map(lambda x: jnp.asarray(x, dtype), method),
+        periods=numbers(periods),
+        transient=numbers(np.floor(TRANSIENT_SHARE * periods)),
+        device=numbers(electrical(device)),
+        method=numbers(method),
         length_variant=one,
         speed_variant=one,
-        recorded_periods=jnp.asarray(recorded_periods, dtype),
+        recorded_periods=numbers(recorded_periods),
     )
 
 

@@ -131,9 +131,8 @@ def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, pe
     tiles = [np.arange(first, cells, number) for first in range(number)]
 
     def part(rows: np.ndarray) -> Any:
-        own = jax.tree.map(lambda x: jnp.asarray(x[np.resize(rows, size)]), (pair, device, starts))
-        summary = simulate.attractors(*own, periods=periods, recorded_periods=longest, count=rows.size)
-        return jax.tree.map(lambda x: x[: rows.size], summary)
+        own = jax.tree.map(lambda x: x[rows], (pair, device, starts))
+        return simulate.attractors(*own, periods=periods, recorded_periods=longest, padded=size)
 
     with context.pool(workers()) as pool:
         parts = list(pool.map(part, tiles))

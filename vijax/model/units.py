@@ -72,8 +72,9 @@ def plain(name: str, value: Any) -> Any:
 
 
 def _has_unit(value: Any) -> bool:
-    pint = sys.modules.get("pint")  # without it nobody has made a quantity
-    return pint is not None and isinstance(value, pint.Quantity)
+    # Without it, or while another thread is still importing it, nobody has made a quantity.
+    kind = getattr(sys.modules.get("pint"), "Quantity", None)
+    return kind is not None and isinstance(value, kind)
 
 
 @cache

@@ -170,9 +170,8 @@ def _summarise(
 ) -> Fields:
     """Compute fields for the first `count` of these cells, from the one start of each or from many."""
     planned = call.planned
-    # Where no cell is run, one is laid out; and JAX would compile the padding of every number of cells.
     of = planned.cells
-    rows = of.places(np.resize(index, call.rows) if count and index.size < call.rows else index)
+    rows = of.places(index)  # where no cell is run, one is laid out
     if planned.starts == 1:
         u0, v0 = (of.flat(of.quantities[name], rows) for name in ("u0", "v0"))
         return _run(call, rows, count, place, (u0, v0), planned.needs)

@@ -2,11 +2,12 @@
 
 import os
 
+from vijax.batch.lanes import TABLE
 from vijax.runtime import xla
 from vijax.runtime.pages import see
 
-# The largest take a core a second or two, large enough to keep lanes full and files few, small enough to lose.
-_LARGEST = 32768
+# The largest take a core half a second, large enough to keep lanes full and files few, small enough to lose.
+_LARGEST = TABLE
 # A call takes a GPU, with the cores that fly its last cells, a third of a second besides what grows with its cells.
 _LARGEST_ELSEWHERE = 1 << 22
 # Smaller ones leave lanes empty.
