@@ -89,6 +89,9 @@ def test_an_accelerator_is_sent_once_what_is_the_same_in_all_rows(monkeypatch):
     longer = np.asarray(rows.laid_out(RECORD, 5))
     assert longer.shape == (5, 3)
     np.testing.assert_array_equal(longer[:3], plain)
+    sent.clear()
+    rows.laid_out({"only": np.ones(1), "code": np.ones(1, np.int32)}, 5)  # where a program is compiled for no cell
+    assert sent == [1, 1]
 
 
 def test_a_table_of_another_width_is_no_record():

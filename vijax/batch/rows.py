@@ -55,8 +55,8 @@ def _kind(leaves: list[Any]) -> Any:
 
 def _sent(leaf: np.ndarray, size: int) -> Any:
     """Send an accelerator so many rows: one number for all where an array repeats it, as the way there is narrow."""
-    if leaf.size > 1 and not any(leaf.strides):
-        return jnp.broadcast_to(jnp.asarray(leaf.flat[0]), (size, *leaf.shape[1:]))
+    if leaf.shape[0] == 1 or not any(leaf.strides):
+        return jnp.broadcast_to(jnp.asarray(leaf[0]), (size, *leaf.shape[1:]))
     return jnp.asarray(np.resize(leaf, (size, *leaf.shape[1:])))
 
 
