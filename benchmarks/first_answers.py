@@ -40,7 +40,7 @@ QUESTIONS = {
     "trajectory": _PAIR + "vijax.trajectory(pair, 0.0, 0.3, periods=20)",
     "find_orbits": _ORBIT,
     "steady": _PAIR + "device = vijax.Harvester()\n"
-    "orbit = vijax.find_orbits(device.pair(), '1:1')[0]\n"
+    "orbit = vijax.find_orbits(device.pair(), '1:1')[1]\n"
     "jax.grad(lambda omega0: vijax.steady(dataclasses.replace(device, omega0=omega0), orbit).P)(device.omega0)",
     "sweep": "vijax.sweep(d=np.linspace(0.05, 0.3, 8), kappa=np.geomspace(3, 400, 8), r=0.5)",
     "follow_families": _ORBIT + "vijax.follow_families(orbit, 'kappa', (30.0, 80.0))",

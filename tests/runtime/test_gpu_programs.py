@@ -96,10 +96,11 @@ def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):
     monkeypatch.delenv("VIJAX_TILE", raising=False)
     assert tile_size.largest() == lanes.TABLE == 32_768
     assert {lanes.width_of(cells) for cells in (10, 4_096, 10**6)} == {64}
-    assert [lanes.table_rows(cells) for cells in (10, 32_768, 10**6)] == [32_768, 32_768, 10**6]
+    assert [lanes.table_rows(cells, 1) for cells in (10, 32_768, 10**6)] == [32_768, 32_768, 10**6]
+    assert [lanes.table_rows(cells, 64) for cells in (10, 1_024)] == [512, 1_024]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert tile_size.largest() == 4_194_304
-    assert lanes.table_rows(10) == 10
+    assert lanes.table_rows(10, 1) == 10
     assert [lanes.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [100, 8_192, 12_500, 131_072]
 
 

@@ -22,8 +22,7 @@ from vijax.runtime.xla import on_cpu, put, whole_blocks
 # waiting; but to serve 16,384 lanes takes an accelerator no longer than to serve 4,096.
 _SHARE_ELSEWHERE, _SHARE, _FEWEST = 8, 32, 4
 # Rows of a CPU's table, and its lanes, however many cells there are: one program, which takes as long to compile as to
-# run half a million cells, serves every plane. With fewer lanes for few cells, and eight times as many for many, these
-# would be run a thirtieth sooner.
+# run half a million cells, serves every plane. With 512 lanes planes of 10^5 cells would run a thirtieth sooner.
 TABLE, _LANES = 32_768, 64
 # An accelerator goes on with as few cells as `run_most` may leave while such a share of them ends in a round, on the
 # average of so many: others, who fly side by side, take as long for these as it does for a round.
@@ -56,9 +55,9 @@ def width_of(cells: int) -> int:
     return _LANES if on_cpu() else max(min(cells // 8, 131_072), min(cells, 8_192))
 
 
-def table_rows(cells: int) -> int:
-    """Choose how many rows the table of a tile has, at least."""
-    return max(cells, TABLE) if on_cpu() else cells
+def table_rows(cells: int, variants: int) -> int:
+    """Choose how many rows the table of a tile has, each with results for so many variants of a device."""
+    return max(cells, TABLE // variants) if on_cpu() else cells
 
 
 def _served(lanes: int) -> int:

@@ -162,7 +162,8 @@ def summarise(
         speed_variant=_numbers(dtype, scale.speed_variant),
     )
     size = pair.d.shape[0] if padded is None else checks.whole("padded", padded, pair.d.shape[0])
-    cells = rows.laid_out(Entry(pair, scale.length, scale.speed, u0, v0, None), lanes.table_rows(size))
+    entry = Entry(pair, scale.length, scale.speed, u0, v0, None)
+    cells = rows.laid_out(entry, lanes.table_rows(size, plan.variants))
     number = _numbers(np.int32, count)
     if on is not None:
         cells, number, settings = jax.device_put((cells, number, settings), on)
@@ -243,8 +244,8 @@ def attractors(
     own = electrical(device, unequal=pair.unequal)
     count = pair.d.shape[0]
     entry = Entry(pair, length, speed, starts.u, starts.v, starts.t, own)
-    cells = rows.laid_out(entry, lanes.table_rows(max(padded, count)))
     plan = dataclasses.replace(_chained(pair), devices=True)
+    cells = rows.laid_out(entry, lanes.table_rows(max(padded, count), plan.variants))
     settings = _chained_settings(pair, Harvester(), periods, recorded_periods, None)
     return _run(plan, cells, _numbers(np.int32, count), settings, count)
 

@@ -6,6 +6,7 @@ derivative that is asked for. Where the arguments are traced themselves, under `
 function is differentiated as JAX does.
 """
 
+import math
 from collections.abc import Callable, Hashable
 from functools import partial, wraps
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
+from jax.flatten_util import ravel_pytree
 
 from vijax.runtime import context, tiles
 from vijax.runtime.programs import begin, jitted
@@ -40,11 +42,14 @@ def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Call
 
     @partial(jitted, static=("kind",), name=f"slopes of {work.__module__}.{work.__qualname__}")
     def slopes(variables: Any, fixed: Any, found: Any, *, kind: Hashable) -> tuple[list[jax.Array], T]:
-        def numbers(variables):
-            result = work(variables, fixed, found, kind=kind)
+        # As one vector: what XLA cuts up in a program it computes once for every piece.
+        vector, tree = ravel_pytree(variables)
+
+        def numbers(vector):
+            result = work(tree(vector), fixed, found, kind=kind)
             return [leaf for leaf in jax.tree.leaves(result) if _varies(leaf)], result
 
-        return jax.jacfwd(numbers, has_aux=True)(variables)
+        return jax.jacfwd(numbers, has_aux=True)(vector)
 
     def both(then: Callable[..., Any], variables: Any, fixed: Any, kind: Hashable) -> Any:
         numbers = tiles.library((variables, fixed)) is np
@@ -70,7 +75,7 @@ def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Call
         with context.pool(1) as elsewhere:
             columns, result = elsewhere.submit(both, slopes, variables, fixed, kind).result()
         moved = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
-        rows = iter(columns)
+        rows = iter([_by_variable(np.asarray(column), variables) for column in columns])
         return result, jax.tree.map(lambda leaf: _along(leaf, rows, moved), result)
 
     return wraps(work)(lambda variables, fixed, *, kind: call(variables, fixed, kind))
@@ -85,6 +90,13 @@ def shared_slopes(value: Any) -> Any:
 @shared_slopes.defjvp
 def _shared_slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return shared_slopes(primals[0]), share(tangents[0])
+
+
+def _by_variable(column: np.ndarray, variables: Any) -> list[np.ndarray]:
+    """Cut the derivatives of a result, by all numbers of the variables, into those by each of them."""
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(variables)]
+    parts = np.split(column, np.cumsum([math.prod(shape) for shape in shapes])[:-1], axis=-1)
+    return [part.reshape((*column.shape[:-1], *shape)) for part, shape in zip(parts, shapes, strict=True)]
 
 
 def _varies(leaf: jax.Array) -> bool:
@@ -104,8 +116,6 @@ def _along(leaf: jax.Array, rows: Any, moved: list[Any]) -> Any:
     if not _varies(leaf):
         return np.zeros(leaf.shape, jax.dtypes.float0)
     # What nobody varies costs nothing.
-    parts = zip(jax.tree.leaves(next(rows)), moved, strict=True)
-    return sum(
-        (jnp.tensordot(row, step, jnp.ndim(step)) for row, step in parts if not _is_zero(step)),
-        start=jnp.zeros_like(leaf),
-    )
+    pairs = [(row, step) for row, step in zip(next(rows), moved, strict=True) if not _is_zero(step)]
+    parts = [jnp.tensordot(row, step, jnp.ndim(step)) for row, step in pairs]
+    return sum(parts[1:], start=parts[0]) if parts else jnp.zeros_like(leaf)
