@@ -232,5 +232,5 @@ def _run(
         on=place,
     )
     variants = of.factors(of.length).size
-    fields = {name: getattr(summary, name)[:count] for name in needs}
+    fields = {name: getattr(summary, name) for name in needs}
     return {name: field if field.ndim == 1 else field[:, :variants] for name, field in fields.items()}
