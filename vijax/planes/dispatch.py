@@ -40,7 +40,7 @@ _ALL = slice(None)
 
 
 class Call(NamedTuple):
-    """Cells of a plan by flat index, how many rows their call has, and which tile it is."""
+    """Cells of a plan by flat index, how many rows their call has at least, and which tile it is."""
 
     planned: SweepPlan
     cells: np.ndarray
@@ -49,12 +49,12 @@ class Call(NamedTuple):
 
 
 def rows_for(cells: int) -> int:
-    """Find how many rows the call for so many cells has: a power of two, so that few programs are compiled."""
+    """Find how many rows the call for so many cells has at least: a power of two, so that few programs are compiled."""
     return max(padded(cells), tile_size.smallest())
 
 
 def rows_each(cells: int) -> int:
-    """Find how many rows a call has where there are so many cells for all devices together."""
+    """Find how many rows a call has at least where there are so many cells for all devices together."""
     return min(rows_for(math.ceil(cells / len(places()))), tile_size.largest())
 
 
