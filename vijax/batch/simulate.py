@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from vijax.batch import chain, lanes, rows, stragglers
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, walls_of
@@ -162,12 +162,7 @@ def summarise(
         speed_variant=_numbers(dtype, scale.speed_variant),
     )
     size = pair.d.shape[0] if padded is None else checks.whole("padded", padded, pair.d.shape[0])
-    entry = Entry(pair, scale.length, scale.speed, u0, v0, None)
-    cells = rows.laid_out(entry, lanes.table_rows(size, plan.variants))
-    number = _numbers(np.int32, count)
-    if on is not None:
-        cells, number, settings = jax.device_put((cells, number, settings), on)
-    return _run(plan, cells, number, settings, count)
+    return _run(plan, Entry(pair, scale.length, scale.speed, u0, v0, None), settings, count, size, on)
 
 
 def _numbers(kind: Any, tree: Any) -> Any:
@@ -175,14 +170,11 @@ def _numbers(kind: Any, tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x, kind), tree)
 
 
-def _run(
-    plan: Plan,
-    cells: Float[AnyArray, "row in"],
-    count: Int[AnyArray, ""],
-    settings: Settings,
-    real: int,
-) -> Summary:
-    """Make the summary of the real cells of a tile, of NumPy's arrays."""
+def _run(plan: Plan, entry: Entry, settings: Settings, real: int, size: int, on: jax.Device | None = None) -> Summary:
+    """Make the summary of the real cells of a tile, in a table of so many rows at least, of NumPy's arrays."""
+    cells, count = rows.laid_out(entry, lanes.table_rows(size, plan.variants)), _numbers(np.int32, real)
+    if on is not None:
+        cells, count, settings = jax.device_put((cells, count, settings), on)
     width, like = lanes.width_of(cells.shape[0]), shapes(plan, cells.dtype)
     # What a lane of a method carries need not be a row of numbers.
     few = stragglers.most() if settings.method is None else 0
@@ -242,12 +234,10 @@ def attractors(
     length: Any = device.length_unit
     speed: Any = device.speed_unit
     own = electrical(device, unequal=pair.unequal)
-    count = pair.d.shape[0]
     entry = Entry(pair, length, speed, starts.u, starts.v, starts.t, own)
     plan = dataclasses.replace(_chained(pair), devices=True)
-    cells = rows.laid_out(entry, lanes.table_rows(max(padded, count), plan.variants))
     settings = _chained_settings(pair, Harvester(), periods, recorded_periods, None)
-    return _run(plan, cells, _numbers(np.int32, count), settings, count)
+    return _run(plan, entry, settings, pair.d.shape[0], padded)
 
 
 def _chained(pair: ImpactPair) -> Plan:
