@@ -70,6 +70,18 @@ def test_forward_reverse_second_and_batched_derivatives_agree():
     np.testing.assert_allclose(many, np.sum(GIVEN["x"] * ABOUT) * np.exp([0.1, 0.2]), rtol=1e-14)
 
 
+def test_slopes_by_variables_of_every_shape_are_told_apart():
+    weights = {"a": np.array([1.0, 2.0, 3.0]), "b": np.array(4.0), "c": np.array([[5.0, 6.0], [7.0, 8.0]])}
+
+    def load(moved, about, found, *, kind):
+        return about * sum((weights[name] * moved[name]).sum() for name in weights)
+
+    beam = differentiable(load, lambda moved, about, *, kind: about, np.asarray)
+    slopes = jax.grad(lambda moved: beam(moved, jnp.array(2.0), kind=None))(jax.tree.map(jnp.ones_like, weights))
+    for name, weight in weights.items():
+        np.testing.assert_allclose(slopes[name], 2 * weight, rtol=1e-15)
+
+
 def test_results_without_derivatives_have_none():
     result, moved = jax.jvp(lambda x: shape(GIVEN | {"x": x}, ABOUT, kind="plain"), (GIVEN["x"],), (jnp.ones(3),))
     assert int(result.rank) == 2
