@@ -24,6 +24,7 @@ os.environ["XLA_FLAGS"] = " ".join(
 )
 
 import jax
+import pytest
 from hypothesis import settings
 
 import vijax  # noqa: F401  switches x64 on before a test makes its first array
@@ -76,3 +77,15 @@ def pytest_collection_modifyitems(config, items):
     left = [item for item in items if "long" in item.keywords]
     items[:] = [item for item in items if "long" not in item.keywords]
     config.hook.pytest_deselected(items=left)
+
+
+@pytest.fixture
+def on_gpu(monkeypatch):
+    """Trace as for a GPU; what was traced for this CPU is forgotten before and after."""
+
+    def begin():
+        jax.clear_caches()
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+
+    yield begin
+    jax.clear_caches()

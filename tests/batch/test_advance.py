@@ -9,9 +9,11 @@ import pytest
 
 from vijax.batch import advance, cell_program
 from vijax.batch.cell import Entry, Plan, Settings
+from vijax.engine.ground import ground_of
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
 from vijax.runtime import xla
+from vijax.runtime.unrolled import unrolled
 
 CELLS, STEPS = 2048, 60
 PLAN = Plan(until="window", deep=True, tangent=False)
@@ -48,6 +50,30 @@ def declined():
     assert 100 < some.sum() < CELLS
     assert some.sum() > 0.7 * cell.declined.sum()
     return some, cell, sampled.event.impact, careful.event.impact
+
+
+@pytest.mark.parametrize(
+    "wall", [ImpactPair(0.2, 20.0, 0.5, 0.9), ImpactPair(0.2, None, 0.5, 0.9)], ids=["soft", "rigid"]
+)
+def test_an_accelerator_finds_the_careful_answer_lane_by_lane(on_gpu, wall):
+    """There it is a kernel, which knows single lanes alone, and goes round until the last of these is done."""
+    plan = Plan(rigid=wall.rigid, ground=ground_of(wall.gamma), deep=True)
+    rng, one = np.random.default_rng(4), jnp.ones(64)
+    pair = jax.tree.map(lambda x: x * one, wall)
+    u, v, t = (jnp.asarray(rng.uniform(-x, x, 64)) for x in (0.1, 0.5, 1.0))
+    entry = Entry(pair, length=one, speed=one, u=u, v=v, t=t)
+    request = advance.request(plan, SETTINGS, cell_program.load(plan, SETTINGS, entry))
+    plain = jax.jit(partial(advance.careful_answer, plan))(request)
+    assert plain.event.real.any()
+    leaves, tree = jax.tree.flatten(request)
+    on_gpu()
+
+    def answer(some):
+        return advance.careful_answer(plan, jax.tree.unflatten(tree, some))
+
+    found = jax.jit(lambda leaves: unrolled(answer, leaves))(leaves)
+    for got, want in zip(found, jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-10, atol=1e-12)
 
 
 def test_the_kept_arrival_is_that_of_where_the_lane_stands(declined):

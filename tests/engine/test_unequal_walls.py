@@ -103,9 +103,9 @@ def drawn(walls):
 def careful(pair, ball):
     state = State(ball.u, ball.v, ball.t, jnp.zeros(LANES, jnp.int32), jnp.zeros(LANES, jnp.int32))
     out = jax.vmap(lambda pair, state: exact.step(pair, state, jnp.asarray(HORIZON)))(pair, state)
-    hit, tangent = out.impact, jax.vmap(exact.tangent)(pair, out)
+    hit, tangent = out.impact, exact.tangent(pair, out)
     clock = 2 * hit.n.astype(float) + hit.t
-    told = (clock, hit.v_in, hit.v_out, hit.duration, hit.depth, hit.work, *tangent.reshape(-1, 4).T)
+    told = (clock, hit.v_in, hit.v_out, hit.duration, hit.depth, hit.work, *tangent.reshape(4, -1))
     return hit.side, told, hit.side != 0
 
 
@@ -140,6 +140,20 @@ def test_every_impact_is_that_of_a_pair_with_two_such_walls(step, walls):
                 assert (got[here] == 0).all()
                 continue
             np.testing.assert_allclose(got[here], want[here], rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("walls", ["soft", "rigid", "rigid_right"])
+def test_tangent_maps_of_many_balls_at_once_are_those_of_each(walls):
+    pair, _, ball = drawn(walls)
+
+    def maps(pair, ball):
+        states = State(ball.u, ball.v, ball.t, jnp.zeros(LANES, jnp.int32), jnp.zeros(LANES, jnp.int32))
+        out = jax.vmap(lambda pair, state: exact.step(pair, state, jnp.asarray(HORIZON)))(pair, states)
+        return exact.tangent(pair, out), jax.vmap(exact.tangent, out_axes=-1)(pair, out)
+
+    at_once, each = jax.jit(maps)(pair, ball)
+    assert np.ptp(np.asarray(each)[0, 0]) > 0.1
+    np.testing.assert_allclose(at_once, each, rtol=1e-13, atol=1e-13)
 
 
 def test_walls_that_are_exchanged_mirror_the_motion():

@@ -27,7 +27,12 @@ WITHOUT = (
 PROGRAMS = [name for name in CALLS if name not in WITHOUT]
 # What CI lowers, the others taking minutes: a plane, a motion, an orbit, its search.
 FEW = ("sweep", "trajectory, periods", "steady", "orbit_search.search")
-PLANES = {"rigid": {"wall": "rigid"}, "level": {"kappa": 40.0}, "inclined": {"kappa": 40.0, "gamma": 0.3}}
+PLANES = {
+    "rigid": {"wall": "rigid"},
+    "level": {"kappa": 40.0},
+    "inclined": {"kappa": 40.0, "gamma": 0.3},
+    "held": {"kappa": 40.0, "gamma": 1.2},
+}
 
 
 @pytest.fixture
@@ -43,18 +48,6 @@ def called(monkeypatch):
 
     monkeypatch.setattr(TracedProgram, "__call__", noted)
     return found
-
-
-@pytest.fixture
-def on_gpu(monkeypatch):
-    """Trace as for a GPU; what was traced for this CPU is forgotten before and after."""
-
-    def begin():
-        jax.clear_caches()
-        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-
-    yield begin
-    jax.clear_caches()
 
 
 @pytest.mark.parametrize("name", cases(PROGRAMS, long=tuple(set(PROGRAMS) - set(FEW))))
@@ -101,7 +94,7 @@ def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert tile_size.largest() == 4_194_304
     assert lanes.table_rows(10, 1) == 10
-    assert [lanes.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [100, 8_192, 12_500, 131_072]
+    assert [lanes.width_of(cells) for cells in (100, 10**4, 10**5, 10**7)] == [256, 8_192, 12_544, 131_072]
 
 
 def test_a_gpu_is_given_what_it_is_asked_for_in_xla_flags(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 
 from vijax.runtime import registers, xla
-from vijax.runtime.registers import FEW, LANES, each, stay
+from vijax.runtime.registers import LANES, each, stay
 
 BLOCKS = 3
 COUNT = BLOCKS * LANES
@@ -60,10 +60,44 @@ def test_what_has_no_blocks_is_done_as_it_stands(lanes):
     np.testing.assert_array_equal(found["trips"], 9)
 
 
+def calls(work, *given):
+    """List for every kernel of a program how many arrays it reads and writes."""
+    traced = jax.make_jaxpr(work)(*given)
+    kernels = [eqn for eqn in traced.jaxpr.eqns if eqn.primitive.name == "pallas_call"]
+    return [(len(eqn.invars), len(eqn.outvars)) for eqn in kernels]
+
+
+def test_a_kernel_reads_and_writes_few_tables():
+    """Its compiler takes seconds for each array: of 40 columns that change and 3 that do not three tables are made."""
+    lanes = [jnp.full(COUNT, float(i)) for i in range(43)]
+
+    def work(lanes):
+        return [x + lanes[-1] for x in lanes[:40]] + lanes[40:]
+
+    assert calls(lambda lanes: stay(work, lanes, interpret=True), lanes) == [(3, 2), (2, 40)]
+    found = stay(work, lanes, interpret=True)
+    np.testing.assert_array_equal(np.stack(found)[:, -1], [*(np.arange(40) + 42.0), 40, 41, 42])
+    assert calls(lambda lanes: each(work, lanes, jnp.int32(5), interpret=True), lanes) == [(4, 3), (3, 43)]
+
+
+@pytest.mark.parametrize(
+    ("columns", "sizes"), [(1, [1]), (2, [2]), (3, [4]), (5, [4, 1]), (40, [32, 8]), (61, [64]), (88, [64, 32])]
+)
+def test_columns_are_cut_into_tables_of_a_power_of_two_few_of_them_void(columns, sizes):
+    assert registers._sizes(columns) == sizes
+
+
+@pytest.mark.parametrize(("lanes", "whole"), [(1, 256), (256, 256), (12_500, 12_544), (131_072, 131_072)])
+def test_lanes_are_as_many_as_whole_blocks_have(lanes, whole):
+    assert registers.whole_blocks(lanes, 8) == whole
+    assert whole % (8 * LANES) == 0
+
+
 def test_a_cuda_gpu_has_one_kernel_and_others_none():
     work = jax.jit(lambda lanes: stay(falls(0.5), lanes))
     traced = work.trace(some_lanes())
-    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 1
+    # One that reads tables and writes them, and one that takes these apart.
+    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 2
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
     np.testing.assert_array_equal(work(some_lanes())["trips"], 9)
 
@@ -80,9 +114,9 @@ def pairs(count):
     return {"x": jnp.asarray(row), "least": jnp.asarray(row[::-1].copy())}
 
 
-@pytest.mark.parametrize("real", [1, FEW, 2 * FEW + 1, 3 * FEW])
+@pytest.mark.parametrize("real", [1, LANES, 2 * LANES + 1, 3 * LANES])
 def test_each_real_lane_gives_its_own(real):
-    given = pairs(3 * FEW)
+    given = pairs(3 * LANES)
     found = jax.jit(lambda given, real: each(most_of, given, real, interpret=True))(given, jnp.int32(real))
     plain = most_of(given)
     for name, values in plain.items():
@@ -91,24 +125,24 @@ def test_each_real_lane_gives_its_own(real):
 
 
 def test_blocks_without_a_real_lane_are_left_alone():
-    given = pairs(3 * FEW)
-    found = registers._of_each(lambda given: 2.0 * given["x"], given, jnp.int32(FEW + 1), interpret=True)
-    np.testing.assert_array_equal(found[: 2 * FEW], 2.0 * np.asarray(given["x"])[: 2 * FEW])
-    assert not np.array_equal(found[2 * FEW :], 2.0 * np.asarray(given["x"])[2 * FEW :])
+    given = pairs(3 * LANES)
+    found = registers._of_each(lambda given: 2.0 * given["x"], given, jnp.int32(LANES + 1), interpret=True)
+    np.testing.assert_array_equal(found[: 2 * LANES], 2.0 * np.asarray(given["x"])[: 2 * LANES])
+    assert not np.array_equal(found[2 * LANES :], 2.0 * np.asarray(given["x"])[2 * LANES :])
 
 
-@pytest.mark.parametrize("count", [FEW - 1, FEW + 1])
+@pytest.mark.parametrize("count", [LANES - 1, LANES + 1])
 def test_lanes_that_are_no_whole_blocks_are_done_as_they_stand(count):
     found = each(most_of, pairs(count), jnp.int32(count), interpret=True)
     np.testing.assert_array_equal(found["total"], most_of(pairs(count))["total"])
 
 
 def test_a_cuda_gpu_has_one_kernel_of_each_and_others_none():
-    work = jax.jit(lambda given: each(most_of, given, jnp.int32(FEW)))
-    traced = work.trace(pairs(FEW))
-    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 1
+    work = jax.jit(lambda given: each(most_of, given, jnp.int32(LANES)))
+    traced = work.trace(pairs(LANES))
+    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 2
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
-    np.testing.assert_array_equal(work(pairs(FEW))["many"], most_of(pairs(FEW))["many"])
+    np.testing.assert_array_equal(work(pairs(LANES))["many"], most_of(pairs(LANES))["many"])
 
 
 def test_they_stay_where_there_is_a_gpu_and_kernels_are_wanted(monkeypatch):

@@ -61,7 +61,27 @@ def inner(given):
     return scale(given[0]), jnp.exp(-given[1]) + 2.0
 
 
-@pytest.mark.parametrize("work", [powers, turns, halves, inner])
+def own(given):
+    """Halve a number of one ball, as often as it needs, for many balls at once: each ends by itself."""
+    x, y, _ = given
+
+    def one(x, y):
+        small = 0.1 * y
+        return lax.while_loop(lambda carry: carry[0] > small, lambda carry: (0.5 * carry[0], carry[1] + 1.0), (x, y))
+
+    return jax.vmap(one)(x, y)
+
+
+def trips(given):
+    """Go round so often, as is known beforehand."""
+    x, y, _ = given
+    rows, sums = lax.fori_loop(
+        0, 3, lambda i, both: (both[0] * y, both[1] + i * both[0][1]), (jnp.stack([x, y]), 0 * x)
+    )
+    return rows[0], rows[1], sums, jnp.arccos(0.4 * x)
+
+
+@pytest.mark.parametrize("work", [powers, turns, halves, inner, own, trips])
 def test_lane_by_lane_it_comes_out_the_same(work):
     given = lanes()
     found = jax.jit(lambda *given: unrolled(work, list(given)))(*given)
@@ -79,7 +99,7 @@ def axes(jaxpr):
                 yield from axes(eqn.params[name].jaxpr)
 
 
-@pytest.mark.parametrize("work", [powers, turns, halves, inner])
+@pytest.mark.parametrize("work", [powers, turns, halves, inner, trips])
 def test_nothing_of_several_axes_is_left(work):
     traced = jax.make_jaxpr(lambda *given: unrolled(work, list(given)))(*lanes())
     assert max(axes(traced.jaxpr)) == 1
@@ -92,6 +112,8 @@ def test_nothing_of_several_axes_is_left(work):
         (lambda given: [lax.sort(jnp.stack(given), dimension=0)], "sort"),
         (lambda given: [lax.cumsum(given[0])], "cumsum"),
         (lambda given: [given[0] - given[0].sum()], "reduce_sum over lanes"),
+        (lambda given: [lax.scan(lambda sums, row: (sums + row, None), given[0], jnp.stack(given))[0]], "scan rows"),
+        (lambda given: lax.scan(lambda x, _: (2 * x, x), given[0], length=3), "scan rows"),
     ],
 )
 def test_what_cannot_be_followed_is_named(work, name):

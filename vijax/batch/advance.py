@@ -95,8 +95,8 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
     out = jax.vmap(partial(exact.step, deep=plan.deep))(pair, state, horizon)
     matrix = None
     if plan.tangent:
-        rows = jax.vmap(exact.tangent)(pair, out)
-        matrix = (rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 0], rows[:, 1, 1])
+        rows = exact.tangent(pair, out)
+        matrix = (rows[0, 0], rows[0, 1], rows[1, 0], rows[1, 1])
     after = out.state
     # A flight that drifts comes to a wall after the horizon.
     late = out.quiet & ~neutral(pair, mean_velocity(sine(ball.t), ball.v))

@@ -60,7 +60,7 @@ class Program(NamedTuple):
         service: For the rare lane that declines a step.
         steps: How many are taken between two rounds.
         arithmetic: Whether all of it may be put in kernels, see `xla.kernel`.
-        numbers: Whether step and review are arithmetic of numbers, which may stay in registers, and a second try what
+        numbers: Whether step and review are arithmetic of numbers, which may stay in registers, and both tries what
             they can do of each lane; see `registers`.
     """
 
@@ -150,9 +150,15 @@ def _held_steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Car
         return at._replace(carry=program.review(at.carry))
 
     def all_steps(at: AtWork) -> AtWork:
-        return up_to(some_steps, program.steps // _UNREVIEWED, partial(_goes_on, program, able(program, at)), at)
+        first = _moving(program, at)
+        return up_to(some_steps, program.steps // _UNREVIEWED, lambda at: 2 * _moving(program, at) > first, at)
 
     return registers.stay(all_steps, AtWork(cell, carry)).carry
+
+
+def _moving(program: Program, at: AtWork) -> Int[Array, ""]:
+    """Count the lanes that the next steps or their review would move: one that an answer stopped is to be reviewed."""
+    return ((at.cell >= 0) & ~_declined(program, at) & ~program.done(at.carry)).sum()
 
 
 def _step(program: Program, at: AtWork) -> AtWork:
@@ -168,8 +174,8 @@ def _service_due(
 ) -> Bool[Array, ""]:
     """Say whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one.
 
-    On an accelerator a careful try, however many lanes have one, takes longer than a thousand steps: those who need it
-    wait for many others, or until nobody else goes on.
+    On an accelerator a careful try takes as long however many lanes have one: those who need it wait for many others,
+    or until nobody else goes on.
     """
     at = AtWork(cell, carry)
     easy, hard = (lanes.sum() for lanes in asking(program, at))
@@ -181,7 +187,7 @@ def _service_due(
 
 def _many(width: int) -> int:
     """Say how many hard lanes are not to wait for others."""
-    return width if on_cpu() else max(width // 4, 1)
+    return width if on_cpu() else max(width // 16, 1)
 
 
 def asking(program: Program, at: AtWork) -> tuple[Bool[Array, "lane"], Bool[Array, "lane"]]:
@@ -194,8 +200,11 @@ def asking(program: Program, at: AtWork) -> tuple[Bool[Array, "lane"], Bool[Arra
 def _serve(program: Program, service: Service, width: int, held: bool, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Give a batch of easy lanes their second try, or a batch of hard ones the careful try."""
     easy, batch, requests = program.kernel(partial(_ask, program, service, width))(cell, carry)
-    second = partial(registers.each, service.second, real=batch.real) if held else program.kernel(service.second)
-    answers = lax.cond(easy, second, program.kernel(service.careful), requests)
+    second, careful = (
+        partial(registers.each, work, real=batch.real) if held else program.kernel(work)
+        for work in (service.second, service.careful)
+    )
+    answers = lax.cond(easy, second, careful, requests)
     return program.kernel(partial(_settle, service))(carry, answers, batch)
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vijax.batch import rows
 from vijax.batch.lane_rounds import AtWork, Carry, Program, able, batch_of, run_round, take
+from vijax.runtime import registers
 from vijax.runtime.arrays import choose
 from vijax.runtime.xla import on_cpu, put, whole_blocks
 
@@ -52,7 +53,9 @@ def width_of(cells: int) -> int:
     takes nearly as long for a step of 8,192 lanes as for one of 32,768, and beyond in proportion; at the end of a tile
     few lanes are left, and the steps of all are waited for.
     """
-    return _LANES if on_cpu() else max(min(cells // 8, 131_072), min(cells, 8_192))
+    if on_cpu():
+        return _LANES
+    return registers.whole_blocks(max(min(cells // 8, 131_072), min(cells, 8_192)), _SHARE_ELSEWHERE)
 
 
 def table_rows(cells: int, variants: int) -> int:

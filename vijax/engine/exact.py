@@ -198,20 +198,22 @@ def start_mode(pair: ImpactPair, u: Values, v: Values, t: Values) -> Values:
     return jnp.where(resting | (entered & ~pair.hard(side)), side, 0.0)
 
 
-def tangent(pair: ImpactPair, outcome: Outcome) -> Float[Array, "2 2"]:
+def tangent(pair: ImpactPair, outcome: Outcome) -> Float[Array, "2 2 *lane"]:
     """Compute the tangent map of a step in (du, du') at fixed times, from flight to flight, saltations included.
 
-    A stuck ball forgets how it came: the zero matrix.
+    A stuck ball forgets how it came: the zero matrix. Steps may be those of many balls at once.
     """
 
-    def rigid(wall: ImpactPair) -> Float[Array, "2 2"]:
+    def rigid(wall: ImpactPair) -> list[Values]:
         push = flow.acceleration(pair.gamma, outcome.impact.t)
-        return jnp.where(outcome.stuck, 0.0, flow.rigid_matrix(wall.r, push, outcome.impact.v_in))
+        matrix = jnp.where(outcome.stuck, 0.0, flow.rigid_matrix(wall.r, push, outcome.impact.v_in))
+        return [*matrix[0], *matrix[1]]
 
-    def soft(wall: ImpactPair) -> Float[Array, "2 2"]:
-        return flow.contact_matrix(flow.membrane(wall), outcome.stay)
+    def soft(wall: ImpactPair) -> list[Values]:
+        matrix = flow.contact_matrix(flow.membrane(wall), outcome.stay)
+        return [*matrix[0], *matrix[1]]
 
-    contact = pair.met(outcome.state.u, rigid, soft)  # the ball has just left the wall
-    # Times `flow.flight_matrix`, column by column: an accelerator is slow at many products of small matrices.
-    first, second = contact[:, 0], contact[:, 1]
-    return jnp.stack([first, first * outcome.flight + second], axis=1)
+    # The ball has just left the wall. Times `flow.flight_matrix`, number by number: an accelerator is slow at many
+    # products of small matrices.
+    a, b, c, d = pair.met(outcome.state.u, rigid, soft)
+    return jnp.array([[a, a * outcome.flight + b], [c, c * outcome.flight + d]])

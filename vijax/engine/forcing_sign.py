@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from vijax.model.flow import PI, Force
-from vijax.runtime.arrays import Flags, Values
+from vijax.runtime.arrays import Flags, Values, nearest
 from vijax.runtime.xla import once
 
 
@@ -35,7 +35,7 @@ def spell_after(force: Force, s: Values) -> Spell:
     """Find the sign of the forcing just after s, and the end of that stretch; an end within rounding of s is past."""
     half = _half_width(force)
     x = s + jnp.arctan2(force.q, force.c) / PI
-    x = x - 2 * jnp.round(0.5 * x)  # the positive stretch is |x| < half
+    x = x - 2 * nearest(0.5 * x)  # the positive stretch is |x| < half
     inside = jnp.abs(x) < half
     left = jnp.where(inside, half - x, jnp.where(x < 0, -half - x, 2 - half - x))
     over = left < snap(s.dtype) * (1 + jnp.abs(s))

@@ -4,7 +4,9 @@ XLA makes a loop of kernels, and each stores all that the next one reads of a la
 GPU longer than to compute them. Here a thread has a lane, reads it once and writes it once, and a block of lanes does
 not wait for the others.
 
-By Pallas' way to Triton, as the way to Mosaic GPU knows no float64.
+By Pallas' way to Triton, as the way to Mosaic GPU knows no float64. A kernel reads and writes a few tables, not the
+eighty arrays that lanes are: Triton's compiler looks at all of a kernel for each of its loads and stores, and was done
+in 32 seconds where it now is in 4.
 """
 
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
@@ -20,11 +23,8 @@ from vijax.runtime.unrolled import unrolled
 
 T = TypeVar("T")
 
-# Lanes of a block, a thread each. A power of two, as all of Triton's blocks are.
-LANES = 128
-_WARP = 32  # threads that a GPU runs in step
-# Lanes of a block where each is worked on once: as few as may be, as blocks are not many for all of a GPU's parts.
-FEW = _WARP
+# Lanes of a block, a thread each: those that a GPU runs in step anyway.
+LANES = 32
 
 
 def used() -> bool:
@@ -59,29 +59,16 @@ def each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], *, interpre
         interpret: As in `stay`.
     """
     leaves = jax.tree.leaves(lanes)
-    if any(leaf.ndim != 1 or leaf.size % FEW for leaf in leaves):
+    if any(leaf.ndim != 1 or leaf.size % LANES for leaf in leaves):
         return work(lanes)
     if interpret:
         return _of_each(work, lanes, real, interpret=True)
     return lax.platform_dependent(lanes, real, cuda=partial(_of_each, work), default=lambda lanes, _: work(lanes))
 
 
-def _of_each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], interpret: bool = False) -> T:
-    from jax.experimental import pallas
-
-    leaves, tree = jax.tree.flatten(lanes)
-    like, results = jax.tree.flatten(jax.eval_shape(work, lanes))
-
-    def body(*refs):
-        given, (count, *written) = refs[: len(leaves)], refs[len(leaves) :]
-
-        @pallas.when(pallas.program_id(0) * FEW < count[0])
-        def _():
-            found = unrolled(lambda some: work(jax.tree.unflatten(tree, some)), [ref[...] for ref in given])
-            for ref, value in zip(written, found, strict=True):
-                ref[...] = value
-
-    return jax.tree.unflatten(results, _by_blocks(body, FEW, (leaves, [real.reshape(1)], like), interpret))
+def whole_blocks(lanes: int, parts: int) -> int:
+    """Round lanes up so that each of so many parts of them is of whole blocks."""
+    return -(-lanes // (parts * LANES)) * parts * LANES
 
 
 def _fits(leaf: Any) -> bool:
@@ -94,27 +81,44 @@ def _in_one_kernel(work: Callable[[T], T], lanes: T, interpret: bool = False) ->
     block = [jax.ShapeDtypeStruct((LANES, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
     traced = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(work(jax.tree.unflatten(tree, leaves))))(*block)
     # What comes out as it went in is not written.
-    moved = [
-        i for i, (old, new) in enumerate(zip(traced.jaxpr.invars, traced.jaxpr.outvars, strict=True)) if old is not new
-    ]
+    pairs = zip(traced.jaxpr.invars, traced.jaxpr.outvars, strict=True)
+    moved = [i for i, (old, new) in enumerate(pairs) if old is not new]
+    fixed = [i for i in range(len(leaves)) if i not in moved]
+    written, others = _tables([leaves[i] for i in moved]), _tables([leaves[i] for i in fixed])
 
-    def body(*refs):
-        given, written = refs[: len(leaves) + len(traced.consts)], refs[len(leaves) + len(traced.consts) :]
-        values = [ref[...] for ref in given]
-        found = jax.core.eval_jaxpr(traced.jaxpr, values[len(leaves) :], *values[: len(leaves)])
-        for ref, i in zip(written, moved, strict=True):
-            ref[...] = found[i]
+    def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
+        columns = _columns(given[: len(written)], [block[i] for i in moved])
+        columns += _columns(given[len(written) :], [block[i] for i in fixed])
+        values = dict(zip([*moved, *fixed], columns, strict=True))
+        found = jax.core.eval_jaxpr(traced.jaxpr, [ref[...] for ref in read], *map(values.get, range(len(leaves))))
+        _write([found[i] for i in moved], written)
 
-    kept = {i: place for place, i in enumerate(moved)}
-    found = _by_blocks(body, LANES, (leaves, traced.consts, [leaves[i] for i in moved]), interpret, kept)
-    for i, value in zip(moved, found, strict=True):
+    kept = {i: i for i in range(len(written))}
+    found = _by_blocks(body, (written + others, traced.consts, written), interpret, kept)
+    for i, value in zip(moved, _apart(found, [leaves[i] for i in moved], interpret), strict=True):
         leaves[i] = value
     return jax.tree.unflatten(tree, leaves)
 
 
+def _of_each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], interpret: bool = False) -> T:
+    from jax.experimental import pallas
+
+    leaves, tree = jax.tree.flatten(lanes)
+    block = [jax.ShapeDtypeStruct((LANES,), leaf.dtype) for leaf in leaves]
+    like, results = jax.tree.flatten(jax.eval_shape(work, lanes))
+
+    def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
+        @pallas.when(pallas.program_id(0) * LANES < read[0][0])
+        def _():
+            _write(unrolled(lambda some: work(jax.tree.unflatten(tree, some)), _columns(given, block)), written)
+
+    shapes = [jax.ShapeDtypeStruct((size, leaves[0].size), _kind(leaves)) for size in _sizes(len(like))]
+    found = _by_blocks(body, (_tables(leaves), [real.reshape(1)], shapes), interpret)
+    return jax.tree.unflatten(results, _apart(found, like, interpret))
+
+
 def _by_blocks(
-    body: Callable[..., None],
-    block: int,
+    body: Callable[[list[Any], list[Any], list[Any]], None],
     arrays: tuple[list[Any], list[Any], list[Any]],
     interpret: bool,
     kept: dict[int, int] | None = None,
@@ -122,31 +126,125 @@ def _by_blocks(
     """Call a kernel on all blocks of lanes.
 
     Args:
-        body: Its references are to a block of lanes, to what all blocks read, and to what a block writes.
-        block: Lanes of a block.
-        arrays: All lanes, what all blocks read, and what is written, which may be shapes.
+        body: On references to what a block is given, to what all blocks read, and to what a block writes.
+        arrays: Those that blocks have parts of, by their last axis; what all blocks read; and what is written, which
+            may be shapes.
         interpret: As in `stay`.
-        kept: Which lanes are written over, and by which result.
+        kept: Which arrays are written over, and by which result.
     """
     # Here, as importing vijax on a CPU must not load it.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
-    lanes, read, written = arrays
+    given, read, written = arrays
 
-    def part(leaf: Any) -> Any:
-        return pallas.BlockSpec((block, *leaf.shape[1:]), lambda i: (i, *[0] * (leaf.ndim - 1)))
+    def part(array: Any) -> Any:
+        return pallas.BlockSpec((*array.shape[:-1], LANES), lambda i: (*[0] * (array.ndim - 1), i))
 
-    def whole(leaf: Any) -> Any:
-        return pallas.BlockSpec(leaf.shape, lambda _: (0,) * leaf.ndim)
+    def whole(array: Any) -> Any:
+        return pallas.BlockSpec(array.shape, lambda _: (0,) * array.ndim)
+
+    def on_refs(*refs: Any) -> None:
+        first, second = len(given), len(given) + len(read)
+        body(list(refs[:first]), list(refs[first:second]), list(refs[second:]))
 
     return pallas.pallas_call(
-        body,
-        grid=(lanes[0].shape[0] // block,),
-        in_specs=[*map(part, lanes), *map(whole, read)],
+        on_refs,
+        grid=(given[0].shape[-1] // LANES,),
+        in_specs=[*map(part, given), *map(whole, read)],
         out_specs=list(map(part, written)),
-        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in written],
+        out_shape=[jax.ShapeDtypeStruct(array.shape, array.dtype) for array in written],
         input_output_aliases=kept or {},
-        compiler_params=triton.CompilerParams(num_warps=block // _WARP),
+        compiler_params=triton.CompilerParams(num_warps=1),
         interpret=interpret,
-    )(*lanes, *read)
+    )(*given, *read)
+
+
+# --- tables [column, lane] -------------------------------------------------------------------------------------------
+
+
+def _kind(leaves: list[Any]) -> Any:
+    """Find which floating numbers lanes hold: all of a table are of that kind."""
+    return next(leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating))
+
+
+def _sizes(columns: int) -> list[int]:
+    """Cut columns into tables, each of a power of two of them, as Triton wants it: few tables, and few void columns."""
+    if not columns:
+        return []
+    size = 1 << (columns - 1).bit_length()
+    return [size] if 4 * columns >= 3 * size else [size // 2, *_sizes(columns - size // 2)]
+
+
+def _tables(leaves: list[Any]) -> list[Any]:
+    """Lay lanes out as few tables."""
+    rows = [leaf.reshape(leaf.shape[0], -1).astype(_kind(leaves)) for leaf in leaves]
+    columns = [some[:, i] for some in rows for i in range(some.shape[1])]
+    tables = []
+    for size in _sizes(len(columns)):
+        some, columns = columns[:size], columns[size:]
+        tables.append(jnp.stack(some + some[:1] * (size - len(some))))
+    return tables
+
+
+def _typed(value: Any, like: Any) -> Any:
+    """Give floating numbers the kind of a leaf."""
+    return value != 0 if like.dtype == bool else value.astype(like.dtype)
+
+
+def _columns(refs: list[Any], like: list[Any]) -> list[Any]:
+    """Read the leaves of a block."""
+    columns: list[Any] = []
+    for ref in refs:
+        table = ref[...]
+        parts = lax.split(table, (1,) * len(table)) if len(table) > 1 else [table]
+        columns += [part.reshape(LANES) for part in parts]
+    leaves = []
+    for leaf in like:
+        width = leaf.size // LANES
+        some, columns = columns[:width], columns[width:]
+        leaves.append(_typed(_joined(some).reshape(leaf.shape), leaf))
+    return leaves
+
+
+def _write(values: list[Any], refs: list[Any]) -> None:
+    """Write the leaves of a block."""
+    columns: list[Any] = []
+    for value in values:
+        rows = value.reshape(LANES, -1).astype(refs[0].dtype)
+        parts = lax.split(rows, (1,) * rows.shape[1], axis=1) if rows.shape[1] > 1 else [rows]
+        columns += [part.reshape(LANES) for part in parts]
+    for ref in refs:
+        size = ref.shape[0]
+        some, columns = columns[:size], columns[size:]
+        joined = _joined(some + some[:1] * (size - len(some)))
+        ref[...] = lax.transpose(joined.reshape(LANES, size), (1, 0))
+
+
+def _joined(columns: list[Any]) -> Any:
+    """Join columns to an array [lane, 2, ..., 2]: Triton joins two at a time, along a new last axis."""
+    if len(columns) == 1:
+        return columns[0]
+    return jnp.concatenate([_joined(columns[half::2])[..., None] for half in (0, 1)], axis=-1)
+
+
+def _apart(tables: list[Any], like: list[Any], interpret: bool) -> list[Any]:
+    """Make arrays of the columns of tables, in one kernel: XLA would copy them one by one."""
+    widths = [leaf.size // leaf.shape[0] for leaf in like]
+    flat = [
+        jax.ShapeDtypeStruct(leaf.shape[:1], leaf.dtype)
+        for leaf, width in zip(like, widths, strict=True)
+        for _ in range(width)
+    ]
+
+    def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
+        rows = [(ref, i) for ref in given for i in range(ref.shape[0])]
+        for (ref, i), out in zip(rows, written, strict=False):
+            out[...] = _typed(ref[i, :], out)
+
+    columns = _by_blocks(body, (tables, [], flat), interpret)
+    leaves = []
+    for leaf, width in zip(like, widths, strict=True):
+        some, columns = columns[:width], columns[width:]
+        leaves.append(jnp.stack(some, axis=-1).reshape(leaf.shape))
+    return leaves

@@ -83,6 +83,8 @@ def _done(eqn: Any, count: int, args: list[Rows]) -> list[Rows]:
     name, params = eqn.primitive.name, eqn.params
     if name == "while":
         return _loop(params, count, args, [var.aval for var in eqn.outvars])
+    if name == "scan":
+        return _trips(params, count, args)
     if inner := params.get("jaxpr") or params.get("call_jaxpr"):
         return _follow(inner, count, args)
     if name == "unstack":
@@ -148,8 +150,8 @@ def _others(shape: tuple[int, ...], dimension: int) -> tuple[int, ...]:
 
 
 _ARITHMETIC = """
-    abs add and atan2 ceil clamp convert_element_type copy cos div eq exp expm1 floor ge gt integer_pow is_finite le log
-    log1p lt max min mul ne neg not or pow rem rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor
+    abs acos add and atan2 ceil clamp convert_element_type copy cos div eq exp expm1 floor ge gt integer_pow is_finite
+    le log log1p lt max min mul ne neg not or pow rem rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor
 """
 _ELEMENTWISE = frozenset(_ARITHMETIC.split())
 # How two rows become one.
@@ -172,7 +174,7 @@ def _reduced(eqn: Any, count: int, rows: Rows) -> Rows:
         return rows
     if name != "reduce_or":
         raise _beyond(f"{name} over lanes")
-    return _each(lambda lanes: lanes.sum(dtype=jnp.int32) > 0, count, [rows])  # Triton knows no other way
+    return _each(_any, count, [rows])
 
 
 def _each(work: Callable[..., Any], count: int, args: list[Rows]) -> Rows:
@@ -191,8 +193,18 @@ def _one(work: Callable[..., Any], count: int, values: list[Any]) -> Any:
     return work(*values)
 
 
+def _trips(params: dict[str, Any], count: int, args: list[Rows]) -> list[Rows]:
+    """Do a loop whose trips are known as so many pieces of work; one over rows is none of these."""
+    consts, carry = args[: params["num_consts"]], args[params["num_consts"] :]
+    if len(carry) > params["num_carry"] or len(params["jaxpr"].out_avals) > params["num_carry"]:
+        raise _beyond("scan rows")
+    for _ in range(params["length"]):
+        carry = _follow(params["jaxpr"], count, [*consts, *carry])
+    return carry
+
+
 def _loop(params: dict[str, Any], count: int, args: list[Rows], shapes: list[Any]) -> list[Rows]:
-    """Go on while the condition holds, with a flat list of lanes and numbers."""
+    """Go on while the condition holds, with a flat list of lanes and numbers; each lane on its own if it is one's."""
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
     for_cond, for_body, start = args[:first], args[first:second], args[second:]
 
@@ -204,9 +216,23 @@ def _loop(params: dict[str, Any], count: int, args: list[Rows], shapes: list[Any
         left = iter(values)
         return [_laid(itertools.islice(left, rows.size), rows.shape) for rows in start]
 
-    found = lax.while_loop(
-        lambda values: _follow(params["cond_jaxpr"], count, [*for_cond, *laid(values)])[0].item(),
-        lambda values: flat(_follow(params["body_jaxpr"], count, [*for_body, *laid(values)])),
-        flat(start),
-    )
-    return laid(found)
+    own = _wide(params["cond_jaxpr"].out_avals[0])
+
+    def going(values: list[Any]) -> Any:
+        return _follow(params["cond_jaxpr"], count, [*for_cond, *laid(values)])[0].item()
+
+    def trip(values: list[Any]) -> list[Any]:
+        new = flat(_follow(params["body_jaxpr"], count, [*for_body, *laid(values)]))
+        if not own:
+            return new
+        goes = going(values)
+        return [lax.select(goes, after, before) for after, before in zip(new, values, strict=True)]
+
+    def goes_on(values: list[Any]) -> Any:
+        return _any(going(values)) if own else going(values)
+
+    return laid(lax.while_loop(goes_on, trip, flat(start)))
+
+
+def _any(lanes: Any) -> Any:
+    return lanes.sum(dtype=jnp.int32) > 0  # Triton knows no other way
