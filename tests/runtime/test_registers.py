@@ -80,6 +80,19 @@ def test_a_kernel_reads_and_writes_few_tables():
     assert calls(lambda lanes: each(work, lanes, jnp.int32(5), interpret=True), lanes) == [(4, 3), (3, 43)]
 
 
+def test_whatever_changes_and_whatever_stays():
+    lanes = {"name": jnp.arange(COUNT), "odd": jnp.arange(COUNT) % 2 == 1, "sum": jnp.ones(COUNT)}
+    for changed in ("name", "odd", "sum"):
+
+        def work(lanes, changed=changed):
+            return lanes | {changed: ~lanes[changed] if changed == "odd" else lanes[changed] + 1}
+
+        found = stay(work, lanes, interpret=True)
+        for name, values in work(lanes).items():
+            assert found[name].dtype == values.dtype
+            np.testing.assert_array_equal(found[name], values)
+
+
 @pytest.mark.parametrize(
     ("columns", "sizes"), [(1, [1]), (2, [2]), (3, [4]), (5, [4, 1]), (40, [32, 8]), (61, [64]), (88, [64, 32])]
 )

@@ -83,19 +83,15 @@ def _in_one_kernel(work: Callable[[T], T], lanes: T, interpret: bool = False) ->
     # What comes out as it went in is not written.
     pairs = zip(traced.jaxpr.invars, traced.jaxpr.outvars, strict=True)
     moved = [i for i, (old, new) in enumerate(pairs) if old is not new]
-    fixed = [i for i in range(len(leaves)) if i not in moved]
-    written, others = _tables([leaves[i] for i in moved]), _tables([leaves[i] for i in fixed])
+    like = [leaves[i] for i in moved]
 
     def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
-        columns = _columns(given[: len(written)], [block[i] for i in moved])
-        columns += _columns(given[len(written) :], [block[i] for i in fixed])
-        values = dict(zip([*moved, *fixed], columns, strict=True))
-        found = jax.core.eval_jaxpr(traced.jaxpr, [ref[...] for ref in read], *map(values.get, range(len(leaves))))
+        found = jax.core.eval_jaxpr(traced.jaxpr, [ref[...] for ref in read], *_columns(given, block))
         _write([found[i] for i in moved], written)
 
-    kept = {i: i for i in range(len(written))}
-    found = _by_blocks(body, (written + others, traced.consts, written), interpret, kept)
-    for i, value in zip(moved, _apart(found, [leaves[i] for i in moved], interpret), strict=True):
+    kind = _kind(leaves)
+    found = _by_blocks(body, (_tables(leaves, kind), traced.consts, _shapes(like, kind)), interpret)
+    for i, value in zip(moved, _apart(found, like, interpret), strict=True):
         leaves[i] = value
     return jax.tree.unflatten(tree, leaves)
 
@@ -112,8 +108,8 @@ def _of_each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], interpr
         def _():
             _write(unrolled(lambda some: work(jax.tree.unflatten(tree, some)), _columns(given, block)), written)
 
-    shapes = [jax.ShapeDtypeStruct((size, leaves[0].size), _kind(leaves)) for size in _sizes(len(like))]
-    found = _by_blocks(body, (_tables(leaves), [real.reshape(1)], shapes), interpret)
+    kind = _kind(leaves)
+    found = _by_blocks(body, (_tables(leaves, kind), [real.reshape(1)], _shapes(like, kind)), interpret)
     return jax.tree.unflatten(results, _apart(found, like, interpret))
 
 
@@ -121,16 +117,14 @@ def _by_blocks(
     body: Callable[[list[Any], list[Any], list[Any]], None],
     arrays: tuple[list[Any], list[Any], list[Any]],
     interpret: bool,
-    kept: dict[int, int] | None = None,
 ) -> list[Any]:
     """Call a kernel on all blocks of lanes.
 
     Args:
         body: On references to what a block is given, to what all blocks read, and to what a block writes.
-        arrays: Those that blocks have parts of, by their last axis; what all blocks read; and what is written, which
-            may be shapes.
+        arrays: Those that blocks have parts of, by their last axis; what all blocks read; and the shapes of what is
+            written.
         interpret: As in `stay`.
-        kept: Which arrays are written over, and by which result.
     """
     # Here, as importing vijax on a CPU must not load it.
     from jax.experimental import pallas
@@ -154,7 +148,6 @@ def _by_blocks(
         in_specs=[*map(part, given), *map(whole, read)],
         out_specs=list(map(part, written)),
         out_shape=[jax.ShapeDtypeStruct(array.shape, array.dtype) for array in written],
-        input_output_aliases=kept or {},
         compiler_params=triton.CompilerParams(num_warps=1),
         interpret=interpret,
     )(*given, *read)
@@ -164,7 +157,7 @@ def _by_blocks(
 
 
 def _kind(leaves: list[Any]) -> Any:
-    """Find which floating numbers lanes hold: all of a table are of that kind."""
+    """Find which floating numbers lanes hold."""
     return next(leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating))
 
 
@@ -176,20 +169,22 @@ def _sizes(columns: int) -> list[int]:
     return [size] if 4 * columns >= 3 * size else [size // 2, *_sizes(columns - size // 2)]
 
 
-def _tables(leaves: list[Any]) -> list[Any]:
-    """Lay lanes out as few tables."""
-    rows = [leaf.reshape(leaf.shape[0], -1).astype(_kind(leaves)) for leaf in leaves]
+def _shapes(leaves: list[Any], kind: Any) -> list[Any]:
+    """Give the shapes of the tables of lanes."""
+    lanes = leaves[0].shape[0]
+    columns = sum(leaf.size for leaf in leaves) // lanes
+    return [jax.ShapeDtypeStruct((size, lanes), kind) for size in _sizes(columns)]
+
+
+def _tables(leaves: list[Any], kind: Any) -> list[Any]:
+    """Lay lanes out as few tables of floating numbers of a kind."""
+    rows = [leaf.reshape(leaf.shape[0], -1).astype(kind) for leaf in leaves]
     columns = [some[:, i] for some in rows for i in range(some.shape[1])]
     tables = []
     for size in _sizes(len(columns)):
         some, columns = columns[:size], columns[size:]
         tables.append(jnp.stack(some + some[:1] * (size - len(some))))
     return tables
-
-
-def _typed(value: Any, like: Any) -> Any:
-    """Give floating numbers the kind of a leaf."""
-    return value != 0 if like.dtype == bool else value.astype(like.dtype)
 
 
 def _columns(refs: list[Any], like: list[Any]) -> list[Any]:
@@ -203,7 +198,7 @@ def _columns(refs: list[Any], like: list[Any]) -> list[Any]:
     for leaf in like:
         width = leaf.size // LANES
         some, columns = columns[:width], columns[width:]
-        leaves.append(_typed(_joined(some).reshape(leaf.shape), leaf))
+        leaves.append(_joined(some).reshape(leaf.shape).astype(leaf.dtype))
     return leaves
 
 
@@ -240,7 +235,7 @@ def _apart(tables: list[Any], like: list[Any], interpret: bool) -> list[Any]:
     def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
         rows = [(ref, i) for ref in given for i in range(ref.shape[0])]
         for (ref, i), out in zip(rows, written, strict=False):
-            out[...] = _typed(ref[i, :], out)
+            out[...] = ref[i, :].astype(out.dtype)
 
     columns = _by_blocks(body, (tables, [], flat), interpret)
     leaves = []
