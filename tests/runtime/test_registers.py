@@ -137,9 +137,10 @@ def test_each_real_lane_gives_its_own(real):
         np.testing.assert_allclose(found[name][:real], values[:real], rtol=1e-15, atol=0)
 
 
-def test_blocks_without_a_real_lane_are_left_alone():
+@pytest.mark.parametrize("real", [LANES + 1, 2 * LANES])
+def test_blocks_without_a_real_lane_are_left_alone(real):
     given = pairs(3 * LANES)
-    found = registers._of_each(lambda given: 2.0 * given["x"], given, jnp.int32(LANES + 1), interpret=True)
+    found = registers._of_each(lambda given: 2.0 * given["x"], given, jnp.int32(real), interpret=True)
     np.testing.assert_array_equal(found[: 2 * LANES], 2.0 * np.asarray(given["x"])[: 2 * LANES])
     assert not np.array_equal(found[2 * LANES :], 2.0 * np.asarray(given["x"])[2 * LANES :])
 
