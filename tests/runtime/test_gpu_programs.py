@@ -27,11 +27,11 @@ WITHOUT = (
 PROGRAMS = [name for name in CALLS if name not in WITHOUT]
 # What CI lowers, the others taking minutes: a plane, a motion, an orbit, its search.
 FEW = ("sweep", "trajectory, periods", "steady", "orbit_search.search")
+# Of the inclined ones half are those on which gravity holds the ball, which a GPU once never came back from.
 PLANES = {
     "rigid": {"wall": "rigid"},
     "level": {"kappa": 40.0},
-    "inclined": {"kappa": 40.0, "gamma": 0.3},
-    "held": {"kappa": 40.0, "gamma": 1.2},
+    "inclined": {"kappa": 40.0, "gamma": np.array([0.3, 1.2])},
 }
 
 
