@@ -271,13 +271,13 @@ def steady_response(m: Membrane, force: Force) -> Force:
     )
 
 
-def flight_matrix(s: Values) -> Float[Array, "2 2"]:
+def flight_matrix(s: Values) -> Float[Array, "2 2 *lane"]:
     """Compute the tangent map of a flight of length s in (du, du')."""
     one, zero = jnp.ones_like(s), jnp.zeros_like(s)
     return jnp.array([[one, s], [zero, one]])
 
 
-def contact_matrix(m: Membrane, s: Values) -> Float[Array, "2 2"]:
+def contact_matrix(m: Membrane, s: Values) -> Float[Array, "2 2 *lane"]:
     """Compute the tangent map of a whole contact in (du, du'), from flight to flight; its determinant is exp(-mu s).
 
     The saltations at onset [[1, 0], [-mu, 1]] and exit [[1, 0], [mu, 1]] (physics.md) around the fundamental matrix
@@ -287,6 +287,6 @@ def contact_matrix(m: Membrane, s: Values) -> Float[Array, "2 2"]:
     return jnp.array([[slope, h], [-m.kappa * m.kappa * h, slope + m.mu * h]])
 
 
-def rigid_matrix(r: Values, a: Values, v_in: Values) -> Float[Array, "2 2"]:
+def rigid_matrix(r: Values, a: Values, v_in: Values) -> Float[Array, "2 2 *lane"]:
     """Compute the saltation matrix of a rigid impact in (du, du'): det = r^2, and it grows as 1/v_in at grazing."""
     return jnp.array([[-r, jnp.zeros_like(r)], [(1 + r) * a / v_in, -r]])

@@ -38,6 +38,7 @@ def stay(work: Callable[[T], T], lanes: T, *, interpret: bool = False) -> T:
     Args:
         work: On lanes, arrays of one leading axis; elementwise arithmetic, sums over lanes and loops, nothing else.
             Where further axes are not of a power of two, or lanes are not whole blocks, it is not in one kernel.
+            Whole numbers pass as floating ones, and must be so small that these hold them.
         lanes: What it is done on.
         interpret: Whether to run the kernel here whatever this machine is, operation by operation: for tests.
     """
