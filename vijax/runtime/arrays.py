@@ -37,8 +37,8 @@ def present(value: T | None) -> T:
     return value
 
 
-def choose(mask: Bool[Array, "lane"], new: T, old: T) -> T:
-    """Take `new` where the mask is true, else `old`, leaf by leaf and lane by lane."""
+def choose(mask: Bool[Array, "*lane"], new: T, old: T) -> T:
+    """Take `new` where the mask is true, else `old`, leaf by leaf and lane by lane; there may be one ball alone."""
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b), new, old)
 
 
