@@ -9,7 +9,7 @@ eighty arrays that lanes are: Triton's compiler looks at all of a kernel for eac
 in 32 seconds where it now is in 4.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, TypeVar
 
@@ -180,12 +180,22 @@ def _shapes(leaves: list[Any], kind: Any) -> list[Any]:
 def _tables(leaves: list[Any], kind: Any) -> list[Any]:
     """Lay lanes out as few tables of floating numbers of a kind."""
     rows = [leaf.reshape(leaf.shape[0], -1).astype(kind) for leaf in leaves]
-    columns = [some[:, i] for some in rows for i in range(some.shape[1])]
-    tables = []
+    return list(map(jnp.stack, _by_table([some[:, i] for some in rows for i in range(some.shape[1])])))
+
+
+def _by_table(columns: list[Any]) -> Iterator[list[Any]]:
+    """Give the columns of each table, void ones too."""
     for size in _sizes(len(columns)):
         some, columns = columns[:size], columns[size:]
-        tables.append(jnp.stack(some + some[:1] * (size - len(some))))
-    return tables
+        yield some + some[:1] * (size - len(some))
+
+
+def _by_leaf(columns: list[Any], like: list[Any]) -> Iterator[tuple[list[Any], Any]]:
+    """Give the columns of each leaf, with the leaf."""
+    for leaf in like:
+        width = leaf.size // leaf.shape[0]
+        some, columns = columns[:width], columns[width:]
+        yield some, leaf
 
 
 def _columns(refs: list[Any], like: list[Any]) -> list[Any]:
@@ -195,12 +205,7 @@ def _columns(refs: list[Any], like: list[Any]) -> list[Any]:
         table = ref[...]
         parts = lax.split(table, (1,) * len(table)) if len(table) > 1 else [table]
         columns += [part.reshape(LANES) for part in parts]
-    leaves = []
-    for leaf in like:
-        width = leaf.size // LANES
-        some, columns = columns[:width], columns[width:]
-        leaves.append(_joined(some).reshape(leaf.shape).astype(leaf.dtype))
-    return leaves
+    return [_joined(some).reshape(leaf.shape).astype(leaf.dtype) for some, leaf in _by_leaf(columns, like)]
 
 
 def _write(values: list[Any], refs: list[Any]) -> None:
@@ -210,11 +215,8 @@ def _write(values: list[Any], refs: list[Any]) -> None:
         rows = value.reshape(LANES, -1).astype(refs[0].dtype)
         parts = lax.split(rows, (1,) * rows.shape[1], axis=1) if rows.shape[1] > 1 else [rows]
         columns += [part.reshape(LANES) for part in parts]
-    for ref in refs:
-        size = ref.shape[0]
-        some, columns = columns[:size], columns[size:]
-        joined = _joined(some + some[:1] * (size - len(some)))
-        ref[...] = lax.transpose(joined.reshape(LANES, size), (1, 0))
+    for ref, some in zip(refs, _by_table(columns), strict=True):
+        ref[...] = lax.transpose(_joined(some).reshape(LANES, len(some)), (1, 0))
 
 
 def _joined(columns: list[Any]) -> Any:
@@ -226,11 +228,8 @@ def _joined(columns: list[Any]) -> Any:
 
 def _apart(tables: list[Any], like: list[Any], interpret: bool) -> list[Any]:
     """Make arrays of the columns of tables, in one kernel: XLA would copy them one by one."""
-    widths = [leaf.size // leaf.shape[0] for leaf in like]
     flat = [
-        jax.ShapeDtypeStruct(leaf.shape[:1], leaf.dtype)
-        for leaf, width in zip(like, widths, strict=True)
-        for _ in range(width)
+        jax.ShapeDtypeStruct(leaf.shape[:1], leaf.dtype) for leaf in like for _ in range(leaf.size // leaf.shape[0])
     ]
 
     def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
@@ -239,8 +238,4 @@ def _apart(tables: list[Any], like: list[Any], interpret: bool) -> list[Any]:
             out[...] = ref[i, :].astype(out.dtype)
 
     columns = _by_blocks(body, (tables, [], flat), interpret)
-    leaves = []
-    for leaf, width in zip(like, widths, strict=True):
-        some, columns = columns[:width], columns[width:]
-        leaves.append(jnp.stack(some, axis=-1).reshape(leaf.shape))
-    return leaves
+    return [jnp.stack(some, axis=-1).reshape(leaf.shape) for some, leaf in _by_leaf(columns, like)]

@@ -216,22 +216,22 @@ def _loop(params: dict[str, Any], count: int, args: list[Rows], shapes: list[Any
         left = iter(values)
         return [_laid(itertools.islice(left, rows.size), rows.shape) for rows in start]
 
-    own = _wide(params["cond_jaxpr"].out_avals[0])
-
     def going(values: list[Any]) -> Any:
         return _follow(params["cond_jaxpr"], count, [*for_cond, *laid(values)])[0].item()
 
     def trip(values: list[Any]) -> list[Any]:
-        new = flat(_follow(params["body_jaxpr"], count, [*for_body, *laid(values)]))
-        if not own:
-            return new
-        goes = going(values)
-        return [lax.select(goes, after, before) for after, before in zip(new, values, strict=True)]
+        return flat(_follow(params["body_jaxpr"], count, [*for_body, *laid(values)]))
 
-    def goes_on(values: list[Any]) -> Any:
-        return _any(going(values)) if own else going(values)
+    if not _wide(params["cond_jaxpr"].out_avals[0]):
+        return laid(lax.while_loop(going, trip, flat(start)))
 
-    return laid(lax.while_loop(goes_on, trip, flat(start)))
+    def own_trip(state: tuple[Any, list[Any]]) -> tuple[Any, list[Any]]:
+        goes, values = state
+        values = [lax.select(goes, after, before) for after, before in zip(trip(values), values, strict=True)]
+        return going(values), values
+
+    values = flat(start)
+    return laid(lax.while_loop(lambda state: _any(state[0]), own_trip, (going(values), values))[1])
 
 
 def _any(lanes: Any) -> Any:
