@@ -271,8 +271,9 @@ def test_depth_and_work_come_with_the_contact(kind, least, grain):
     pair, u, v, t = kind(np.random.default_rng(6))
     hit, _, sure = fly(pair, u, v, t, deep_step)
     assert sure.mean() > least
+    long = hit.duration * pair.kappa > 9
+    sure = sure & (long == (kind is pressed))
     if kind is pressed:
-        sure = sure & (hit.duration * pair.kappa > 9)
         assert sure.mean() > 0.03
     few = np.flatnonzero(sure)[: 64 if kind is after_impacts else 512]
     cell, hit = jax.tree.map(lambda x: x[few, None], (pair, hit))

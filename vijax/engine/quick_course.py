@@ -1,4 +1,4 @@
-"""The course of a contact in closed form, as seen from a reference time, by polynomials that hold about it."""
+"""The course of a contact in closed form, as seen from its onset, or from a reference time by polynomials about it."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,9 +6,10 @@ from jaxtyping import Array, Bool
 
 from vijax.engine.impact import Lane
 from vijax.engine.polynomial import EXP_REACH, REACH, exp, sine_cosine
+from vijax.engine.quick_flight import Flight
 from vijax.engine.quick_wall import SoftWall
 from vijax.model.flow import PI
-from vijax.runtime.xla import once
+from vijax.runtime.xla import once, shared
 
 
 class ContactState(eqx.Module):
@@ -75,3 +76,62 @@ def at_reference(wall: SoftWall, course: ContactCourse) -> ContactState:
 def in_reach(wall: SoftWall, s: Lane) -> Bool[Array, "lane"]:
     """Say whether the polynomials of `motion` hold at s."""
     return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
+
+
+class ContactEntry(eqx.Module):
+    """A contact at its onset: speed into the wall, forcing and steady response in phase and a quarter turn behind."""
+
+    speed: Lane
+    force_cos: Lane
+    force_sin: Lane
+    steady_cos: Lane
+    steady_sin: Lane
+    free_cos: Lane
+    free_sin: Lane
+    pressure: Lane | None  # Gravity presses the ball into the wall by this much; None on level ground.
+    rest: Lane | None  # The membrane's steady response to that pressure.
+
+    def penetration(self, at: ContactState) -> Lane:
+        """All of w."""
+        return at.w if self.rest is None else at.w + self.rest
+
+    @property
+    def force(self) -> Lane:
+        """All of the forcing at the onset."""
+        return self.force_cos if self.pressure is None else self.force_cos + self.pressure
+
+    @property
+    def parts(self) -> tuple[Lane, ...]:
+        """Give what `course_at` rotates."""
+        return self.steady_cos, self.steady_sin, self.force_cos, self.force_sin
+
+
+@shared
+def entry_of(wall: SoftWall, flight: Flight) -> ContactEntry:
+    """Find forcing and steady response as the contact begins.
+
+    The forcing is force_cos cos(pi s) - force_sin sin(pi s), its steady response steady_cos cos + steady_sin sin.
+    """
+    force_cos, force_sin = -flight.sine, flight.cosine
+    steady_cos = wall.gain_in * force_cos + wall.gain_out * force_sin
+    steady_sin = wall.gain_out * force_cos - wall.gain_in * force_sin
+    pressure, rest, steady = None, None, steady_cos
+    if wall.incline is not None:
+        pressure = -flight.flip * flight.wall * wall.incline.gamma
+        rest = pressure / (wall.kappa * wall.kappa)
+        steady = steady_cos + rest
+    free_sin = (flight.speed - PI * steady_sin - wall.zeta * steady) / wall.omega1
+    return ContactEntry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady, free_sin, pressure, rest)
+
+
+def course_at(entry: ContactEntry, cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> ContactCourse:
+    """Rotate the contact to a reference time of given cos and sin of pi s; `free` is its free part there."""
+    steady_cos, steady_sin, force_cos, force_sin = entry.parts
+    return ContactCourse(
+        steady_cos * cosine + steady_sin * sine,
+        steady_sin * cosine - steady_cos * sine,
+        force_cos * cosine - force_sin * sine,
+        force_cos * sine + force_sin * cosine,
+        *free,
+        decay,
+    )
