@@ -88,8 +88,8 @@ def lasts(wall: SoftWall, entry: ContactEntry, when: Lane) -> Lasting:
     """Say whether a contact is sure to outlast the free one, `when` being the end of its steady response R.
 
     w is positive for the time of a free contact since the forcing is (Duhamel with h > 0). The swing a e^(-zeta s)
-    cos(omega1 s - f) falls from then on until its phase is a crest's beyond a quarter turn, f one or more, and is there
-    its envelope times omega1/kappa: its low. R, a sine above a constant, rises before it falls.
+    cos(omega1 s - f), f a quarter turn or more, falls from then on until its phase is a quarter turn and that of a free
+    crest. Its low is there, the envelope times omega1/kappa. R, a sine above a constant, rises before it falls.
 
     If R is above the low as the free contact ends, w is positive from then until any time before the low at which it is
     so: it is above what it is then, or above what R was less the low. A contact that ends about there dips. Where R is
@@ -109,7 +109,7 @@ def lasts(wall: SoftWall, entry: ContactEntry, when: Lane) -> Lasting:
     force = entry.force_cos * wall.cos_span - entry.force_sin * wall.sin_span + pressure
     drive = entry.force_sin * wall.cos_span + entry.force_cos * wall.sin_span
     held = (entry.force > DOUBT) & (force > DOUBT) & ((entry.force_sin <= 0) | (drive >= 0)) & (wall.span < 1)
-    # By how much f is beyond a quarter turn: by its sine at least, and by this at most.
+    # By how much f is beyond a quarter turn: by the sine of that at least, and by this at most.
     sine, decay = share((-entry.free_cos / swing, wall.zeta / wall.omega1))
     turn = sine * (1 + (0.5 * PI - 1) * sine * sine)
     envelope = swing * wall.r * wall.crest_decay / (1 + decay * sine)
