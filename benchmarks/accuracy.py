@@ -138,8 +138,7 @@ def audit(share: float) -> None:
         if soft:
             below = yardstick.audit_contacts(pair, ran)
             contacts += len(below)
-            # A forcing near zero has the rounding of 1 all the same: 66 roundings are met at kappa 19,000.
-            bad_contact += int(np.sum(~(below < 256 * yardstick.EPS)))
+            bad_contact += int(np.sum(~(below < 64 * yardstick.EPS)))
         with np.errstate(invalid="ignore", over="ignore"):
             determinant = max(determinant, float(np.nanmax(yardstick.determinants(pair, ran, 4))))
     say("missed wall crossings", bad_flight, 0, f"{flights:,} flights over random parameters")

@@ -22,8 +22,8 @@ from vijax.engine.impact import Ball
 
 COUNT = 4096
 SLOPES = [0.0, 1e-12, -1e-12, 0.01, 0.1, -0.3, 0.5, -0.7, 0.9, -0.99, 1.0, -1.5]
-# Least share of sure steps of balls on planes, a few per cent below the measured.
-SURE = {0.0: 0.97, 0.1: 0.97, -0.3: 0.95, 0.5: 0.95}
+# Least share of sure steps of balls on planes, a little below the measured.
+SURE = {0.0: 0.97, 0.1: 0.98, -0.3: 0.975, 0.5: 0.965}
 
 
 @jax.jit
@@ -271,13 +271,13 @@ def test_depth_and_work_come_with_the_contact(kind, least, grain):
     pair, u, v, t = kind(np.random.default_rng(6))
     hit, _, sure = fly(pair, u, v, t, deep_step)
     assert sure.mean() > least
-    long = hit.duration * pair.kappa > 9
-    sure = sure & (long == (kind is pressed))
     if kind is pressed:
+        sure = sure & (hit.duration * pair.kappa > 9)
         assert sure.mean() > 0.03
     few = np.flatnonzero(sure)[: 64 if kind is after_impacts else 512]
     cell, hit = jax.tree.map(lambda x: x[few, None], (pair, hit))
-    s = hit.duration * np.linspace(0, 1, 4001)
+    # A few of those after impacts swing dozens of times, as do those that gravity presses.
+    s = hit.duration * np.linspace(0, 1, 20001 if kind is after_impacts else 4001)
     state = (cell.kappa, cell.r, cell.gamma, hit.side, hit.onset_t, 0.0, hit.side * hit.v_in, s)
     w, rate = long_contact(*state)
     assert np.max(np.abs(w.max(axis=1) / hit.depth[:, 0] - 1)) < grain
