@@ -114,7 +114,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     certain = crest.first & crest.only
     if held is not None:
         last = held.lasting.ends(*single((duration, out)))
-        certain = jnp.where(held.lasting.long, last & crest.first & present(crest.highest) if deep else last, certain)
+        certain = jnp.where(long, last & crest.first & present(crest.highest) if deep else last, certain)
     depth, exact = deepest(wall, entry, crest.s) if deep else (None, jnp.ones_like(certain))
     certain = certain & exact
     sure = wall.usable & converged & (out > 0) & certain
@@ -126,7 +126,6 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     # So far they count from the course's reference, half or a whole free contact after the onset, or much later.
     turned_sine, turned_cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)
     if held is not None:
-        long = held.lasting.long
         turned_sine = jnp.where(long, sine * held.cosine + cosine * held.sine, turned_sine)
         turned_cosine = jnp.where(long, cosine * held.cosine - sine * held.sine, turned_cosine)
     rot = wall.zeta * step

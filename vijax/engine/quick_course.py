@@ -15,8 +15,8 @@ from vijax.runtime.xla import once, shared
 class ContactState(eqx.Module):
     """Penetration w and its derivatives at one time of the contact, with the parts they were made of.
 
-    What gravity adds to w, its steady response, is not in `w` (see `_Entry.penetration`): it changes no derivative,
-    since the membrane's force on it is gravity's, only reversed.
+    What gravity adds to w, its steady response, is not in `w` (see `ContactEntry.penetration`): it changes no
+    derivative, since the membrane's force on it is gravity's, only reversed.
     """
 
     w: Lane

@@ -123,11 +123,12 @@ def lasts(wall: SoftWall, entry: ContactEntry, when: Lane) -> Lasting:
     turned = (entry.free_sin > 0) & (entry.free_cos <= 0)
     outlasts = (pressure > 0) & turned & held & (steady_cos + rest > low) & (when < wall.span + ebb.arc)
     first_low = wall.span + wall.crest
-    late = when - before > first_low + delay
+    soon = when - before
+    late = soon > first_low + delay
     ebbs = share(outlasts & (last + rest > low) & fades & late)
     # An exit is found within 0.53 free contacts of its course's reference. R rises again a period after it rose.
     dips = outlasts & ~ebbs & (2.1 * wall.span < when + 2 - ebb.arc)
-    since = jnp.where(ebbs, when - before, first_low + sine / wall.omega1)
+    since = jnp.where(ebbs, soon, first_low + sine / wall.omega1)
     pull = PI**2 * size + wall.kappa * wall.kappa * jnp.where(ebbs, ring, envelope)
     return Lasting(ebbs, dips, since, (1 + DOUBT) * pull)
 

@@ -36,7 +36,7 @@ class Ebb(eqx.Module):
     phase: Lane  # The phase of the forcing towards the wall.
     arc: Lane  # How long the membrane has been coming from the steady response's other extremum.
     rate: Lane
-    force_cos: Lane  # The forcing then, as in `_Entry`.
+    force_cos: Lane  # The forcing then, as in `ContactEntry`.
     force_sin: Lane
 
 
