@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Array, Bool, Float
 
-from vijax.batch import lane_rounds, lanes
+from vijax.batch import accelerator_lanes, held_lanes, lane_rounds, lanes
 from vijax.runtime import registers, tiles
 
 Lane = Float[Array, "lane"]
@@ -102,6 +102,7 @@ PROGRAM = lane_rounds.Program(
     stopped=lambda toy: toy.left <= 0,
     done=lambda toy: toy.done,
     unload=lambda toy: jnp.stack([toy.name, toy.hash, toy.careful], axis=1),
+    fixed=lambda toy: (toy.name, toy.start, toy.kind),
     service=lane_rounds.Service(
         declined=lambda toy: toy.declined,
         hard=lambda toy: toy.hard,
@@ -168,36 +169,57 @@ def test_an_accelerator_is_given_no_kernels_and_the_same_results(monkeypatch):
     assert np.array_equal(as_there(jnp.asarray(cells)), [plain(row) for row in cells])
 
 
+def in_registers(program, cells, number=256):
+    """Run cells as a GPU does, their kernels interpreted here."""
+    return jax.jit(lambda cells: lanes.run(program, cells, jnp.asarray(len(cells), jnp.int32), OUTPUTS, number))(cells)
+
+
 def test_lanes_that_stay_in_registers_give_the_same_results(monkeypatch):
-    """Its kernels are interpreted here: lanes are stepped, reviewed and given their second tries block by block."""
+    """Lanes are stepped, reviewed and given their second tries block by block."""
     cells = draw(600, [EASY, DECLINES, HARD])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    blocks, stay, each = [], registers.stay, registers.each
+    blocks, stay = [], registers.stay
 
-    def interpreted(work, at):
-        blocks.append(at.cell.size // registers.LANES)
-        return stay(work, at, interpret=True)
+    def interpreted(work, laid, number, tables, real=None):
+        blocks.append(number.size // registers.LANES)
+        return stay(work, laid, number, tables, real, interpret=True)
 
-    def interpreted_each(work, requests, real):
-        blocks.append(requests.left.size // registers.LANES)
-        return each(work, requests, real, interpret=True)
-
-    monkeypatch.setattr(lane_rounds.registers, "stay", interpreted)
-    monkeypatch.setattr(lane_rounds.registers, "each", interpreted_each)
-    found = jax.jit(lambda cells: lanes.run(PROGRAM, cells, jnp.asarray(600, jnp.int32), OUTPUTS, 256))(cells)
-    assert blocks == [8, 1, 1]
+    monkeypatch.setattr(registers, "stay", interpreted)
+    found = in_registers(PROGRAM, cells)
+    assert sorted(blocks) == [1, 1, 8]  # a kernel of both tries for a batch, and one of steps for all
     assert np.array_equal(found, [plain(row) for row in cells])
     # Second tries are what serves the others: a careful one would be seen.
     spoiled = PROGRAM.service._replace(careful=lambda toy: Answer(-toy.hash, jnp.ones_like(toy.done)))
     program, cells = PROGRAM._replace(service=spoiled), draw(600, [EASY, DECLINES])
-    found = jax.jit(lambda cells: lanes.run(program, cells, jnp.asarray(600, jnp.int32), OUTPUTS, 256))(cells)
-    assert np.array_equal(found, [plain(row) for row in cells])
+    assert np.array_equal(in_registers(program, cells), [plain(row) for row in cells])
+    assert np.array_equal(in_registers(PROGRAM._replace(service=None, step=moves_on), cells), list(map(easily, cells)))
+
+
+def moves_on(toy):
+    """Count down, whatever the kind."""
+    return step(toy._replace(kind=jnp.zeros_like(toy.kind)))
+
+
+def easily(row):
+    return plain([*row[:2], EASY, row[3]])
+
+
+@pytest.mark.parametrize("number", [100, 256])
+def test_chains_are_the_same_on_an_accelerator(monkeypatch, number):
+    """With 256 lanes they lie in tables, which a kernel can hold."""
+    links = draw_chains(number, 6)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    follow = jax.jit(partial(lanes.chain, PROGRAM, succeed, outputs=OUTPUTS))
+    found = follow(jnp.asarray(links), count=jnp.int32(number), length=jnp.int32(6))
+    assert np.array_equal(found, [plain_chain(rows) for rows in links])
 
 
 def test_a_lane_that_an_answer_stopped_is_reviewed_although_none_of_its_block_goes_on():
     """Else it would stay where it is for ever: a GPU did not come back from a plane on which gravity holds the ball."""
     toy = load(jnp.asarray(of_kind(EASY, np.full(8, 5.0))))._replace(left=jnp.zeros(8))
-    found = lane_rounds._held_steps(PROGRAM, jnp.arange(8, dtype=jnp.int32), toy)
+    laid = registers.layout(toy, PROGRAM.fixed)
+    at = lane_rounds.AtWork(jnp.arange(8, dtype=jnp.int32), registers.pack(laid, toy))
+    found = registers.unpack(laid, held_lanes._held_steps(PROGRAM, laid, at))
     assert found.done.all()
 
 
@@ -224,13 +246,13 @@ def test_a_cell_ends_alike_wherever_it_stands_in_the_table():
 
 @partial(jax.jit, static_argnames="few")
 def run_most(cells, count, few):
-    return lanes.run_most(PROGRAM, cells, count, OUTPUTS, 128, few)
+    return accelerator_lanes.run_most(PROGRAM, cells, count, OUTPUTS, 128, few)
 
 
 @jax.jit
 def run_rest(rows, count):
     like = jax.ShapeDtypeStruct((1, 4), rows.dtype)
-    return lanes.run(lanes.resumed(PROGRAM, like), rows, count, OUTPUTS, 16)
+    return lanes.run(accelerator_lanes.resumed(PROGRAM, like), rows, count, OUTPUTS, 16)
 
 
 @pytest.mark.parametrize(("count", "few"), [(600, 1), (600, 40), (600, 128), (30, 40), (0, 40)])
@@ -265,15 +287,25 @@ def test_a_cell_that_goes_on_for_long_is_left_to_others():
     assert left.cell[left.cell >= 0].tolist() == [599]
 
 
-def is_served(easy, hard, going, width=64):
-    """Say whether lanes are served now, and if so whether those are easy ones."""
+def at_work(easy, hard, going):
+    """Lanes of which so many ask for an easy answer or a hard one, and so many go on."""
     toy = load(jnp.asarray(of_kind(EASY, np.full(easy + hard + going, 5.0))))
     lane = jnp.arange(easy + hard + going)
     toy = toy._replace(declined=lane < easy + hard, hard=(lane >= easy) & (lane < easy + hard))
-    cell = lane.astype(jnp.int32)
-    service = PROGRAM.service
-    due = lane_rounds._service_due(PROGRAM, service, width, cell, toy)
-    return ("easy" if lane_rounds._ask(PROGRAM, service, width, cell, toy)[0] else "hard") if due else None
+    return lane_rounds.AtWork(lane.astype(jnp.int32), toy)
+
+
+def is_served(at, width):
+    """Say whether lanes are served now, and if so whether those are easy ones."""
+    if not lane_rounds._service_due(PROGRAM, width, *at):
+        return None
+    return "easy" if lane_rounds._ask(PROGRAM, PROGRAM.service, width, *at)[0] else "hard"
+
+
+def is_served_elsewhere(at, width):
+    held = held_lanes.hold(PROGRAM, 4, at.carry.left.dtype, at.cell.size)
+    counted = accelerator_lanes.count(PROGRAM, held, at)
+    return (None, "easy", "hard")[int(accelerator_lanes._turn(counted, width))]
 
 
 @pytest.mark.parametrize(
@@ -290,10 +322,10 @@ def is_served(easy, hard, going, width=64):
         (64, 4, 90, "easy", "hard"),
     ],
 )
-def test_who_is_served_when(monkeypatch, easy, hard, going, on_a_cpu, elsewhere):
-    assert is_served(easy, hard, going) == on_a_cpu
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert is_served(easy, hard, going) == elsewhere
+def test_who_is_served_when(easy, hard, going, on_a_cpu, elsewhere):
+    at = at_work(easy, hard, going)
+    assert is_served(at, width=64) == on_a_cpu
+    assert is_served_elsewhere(at, width=64) == elsewhere
 
 
 def test_a_new_number_of_real_cells_compiles_nothing():

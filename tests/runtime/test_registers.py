@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 
 from vijax.runtime import registers, xla
-from vijax.runtime.registers import LANES, each, stay
+from vijax.runtime.registers import LANES, fit, layout, pack, stay, unpack
 
 BLOCKS = 3
 COUNT = BLOCKS * LANES
@@ -27,6 +27,15 @@ def some_lanes(count=COUNT, wide=2):
     }
 
 
+def laid_out(lanes, *fixed):
+    laid = layout(lanes, lambda lanes: [lanes[name] for name in fixed])
+    return laid, pack(laid, lanes)
+
+
+def numbers(count=COUNT):
+    return jnp.arange(count, dtype=jnp.int32)
+
+
 def falls(factor):
     """Each lane falls to zero; a block goes on until its last one has, and counts its trips."""
 
@@ -35,11 +44,14 @@ def falls(factor):
         left = jnp.maximum(lanes["left"] - 1, 0)
         return lanes | {"left": left, "trips": lanes["trips"] + 1, "sums": sums, "odd": ~lanes["odd"]}
 
-    return lambda lanes: lax.while_loop(lambda lanes: (lanes["left"] > 0).sum() > 0, step, lanes)
+    return lambda number, lanes, each: lax.while_loop(lambda lanes: (lanes["left"] > 0).sum() > 0, step, lanes)
 
 
-def test_a_block_does_not_wait_for_the_others_and_everything_traced_comes_along():
-    found = jax.jit(lambda factor, lanes: stay(falls(factor), lanes, interpret=True))(0.5, some_lanes())
+@pytest.mark.parametrize("fixed", [(), ("row",)])
+def test_a_block_does_not_wait_for_the_others_and_everything_traced_comes_along(fixed):
+    laid, tables = laid_out(some_lanes(), *fixed)
+    found = jax.jit(lambda factor, tables: stay(falls(factor), laid, numbers(), tables, interpret=True))(0.5, tables)
+    found = unpack(laid, found)
     trips = np.repeat([9, 0, 4], LANES)
     row = np.arange(COUNT)
     sign = np.where(row % 2 == 1, 0.5, -0.5)
@@ -52,12 +64,21 @@ def test_a_block_does_not_wait_for_the_others_and_everything_traced_comes_along(
     np.testing.assert_array_equal(found["row"], row)
 
 
-@pytest.mark.parametrize(
-    "lanes", [some_lanes(count=LANES + 1), some_lanes(wide=3)], ids=["a block and one", "by three"]
-)
-def test_what_has_no_blocks_is_done_as_it_stands(lanes):
-    found = stay(falls(0.5), lanes, interpret=True)
-    np.testing.assert_array_equal(found["trips"], 9)
+def test_a_lane_is_told_its_number():
+    laid, tables = laid_out({"x": jnp.zeros(COUNT)})
+    found = stay(
+        lambda number, lanes, each: {"x": lanes["x"] + number.astype(float)},
+        laid,
+        numbers()[::-1],
+        tables,
+        interpret=True,
+    )
+    np.testing.assert_array_equal(unpack(laid, found)["x"], np.arange(COUNT)[::-1])
+
+
+@pytest.mark.parametrize(("count", "wide", "can"), [(COUNT, 2, True), (LANES + 1, 2, False), (COUNT, 3, False)])
+def test_a_kernel_holds_whole_blocks_with_axes_of_a_power_of_two(count, wide, can):
+    assert fit(some_lanes(count, wide), count) == can
 
 
 def calls(work, *given):
@@ -70,25 +91,30 @@ def calls(work, *given):
 def test_a_kernel_reads_and_writes_few_tables():
     """Its compiler takes seconds for each array: of 40 columns that change and 3 that do not three tables are made."""
     lanes = [jnp.full(COUNT, float(i)) for i in range(43)]
+    laid = layout(lanes, lambda lanes: lanes[40:])
+    assert [table.shape for table in jax.tree.leaves(pack(laid, lanes))] == [(COUNT, 32), (COUNT, 8), (COUNT, 4)]
 
-    def work(lanes):
+    def work(number, lanes, each):
         return [x + lanes[-1] for x in lanes[:40]] + lanes[40:]
 
-    assert calls(lambda lanes: stay(work, lanes, interpret=True), lanes) == [(3, 2), (2, 40)]
-    found = stay(work, lanes, interpret=True)
+    def go(tables):
+        return stay(work, laid, numbers(), tables, interpret=True)
+
+    assert calls(go, pack(laid, lanes)) == [(4, 2)]
+    found = unpack(laid, go(pack(laid, lanes)))
     np.testing.assert_array_equal(np.stack(found)[:, -1], [*(np.arange(40) + 42.0), 40, 41, 42])
-    assert calls(lambda lanes: each(work, lanes, jnp.int32(5), interpret=True), lanes) == [(4, 3), (3, 43)]
 
 
 def test_whatever_changes_and_whatever_stays():
     lanes = {"name": jnp.arange(COUNT), "odd": jnp.arange(COUNT) % 2 == 1, "sum": jnp.ones(COUNT)}
     for changed in ("name", "odd", "sum"):
 
-        def work(lanes, changed=changed):
+        def work(number, lanes, each, changed=changed):
             return lanes | {changed: ~lanes[changed] if changed == "odd" else lanes[changed] + 1}
 
-        found = stay(work, lanes, interpret=True)
-        for name, values in work(lanes).items():
+        laid, tables = laid_out(lanes, *(lanes.keys() - {changed}))
+        found = unpack(laid, stay(work, laid, numbers(), tables, interpret=True))
+        for name, values in work(numbers(), lanes, None).items():
             assert found[name].dtype == values.dtype
             np.testing.assert_array_equal(found[name], values)
 
@@ -100,6 +126,17 @@ def test_columns_are_cut_into_tables_of_a_power_of_two_few_of_them_void(columns,
     assert registers._sizes(columns) == sizes
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_record_lies_in_tables_of_its_own_kind_of_number(dtype):
+    lanes = {"x": jnp.linspace(0, 1, COUNT, dtype=dtype), "y": jnp.arange(COUNT), "wide": jnp.ones((COUNT, 4), dtype)}
+    laid, tables = laid_out(lanes, "y")
+    assert {table.dtype for table in jax.tree.leaves(tables)} == {np.dtype(dtype)}
+    found = unpack(laid, tables)
+    for name, values in lanes.items():
+        assert found[name].dtype == values.dtype
+        np.testing.assert_array_equal(found[name], values)
+
+
 @pytest.mark.parametrize(("lanes", "whole"), [(1, 256), (256, 256), (12_500, 12_544), (131_072, 131_072)])
 def test_lanes_are_as_many_as_whole_blocks_have(lanes, whole):
     assert registers.whole_blocks(lanes, 8) == whole
@@ -107,12 +144,12 @@ def test_lanes_are_as_many_as_whole_blocks_have(lanes, whole):
 
 
 def test_a_cuda_gpu_has_one_kernel_and_others_none():
-    work = jax.jit(lambda lanes: stay(falls(0.5), lanes))
-    traced = work.trace(some_lanes())
-    # One that reads tables and writes them, and one that takes these apart.
-    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 2
+    laid, tables = laid_out(some_lanes())
+    work = jax.jit(lambda tables: stay(falls(0.5), laid, numbers(), tables))
+    traced = work.trace(tables)
+    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 1
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
-    np.testing.assert_array_equal(work(some_lanes())["trips"], 9)
+    np.testing.assert_array_equal(unpack(laid, work(tables))["trips"], 9)
 
 
 def most_of(pair):
@@ -122,16 +159,31 @@ def most_of(pair):
     return {"total": total, "many": total > 4.0, "same": jnp.full_like(total, 7.0)}
 
 
+def sums_up(number, lanes, each):
+    """Keep what `most_of` says of each lane: no kernel knows its rows."""
+    return lanes | each(most_of, {"x": lanes["x"], "least": lanes["least"]})
+
+
 def pairs(count):
     row = np.linspace(0.5, 2.0, count)
-    return {"x": jnp.asarray(row), "least": jnp.asarray(row[::-1].copy())}
+    blank = jnp.zeros(count)
+    return {
+        "x": jnp.asarray(row),
+        "least": jnp.asarray(row[::-1].copy()),
+        "total": blank,
+        "many": blank > 1,
+        "same": blank,
+    }
 
 
-@pytest.mark.parametrize("real", [1, LANES, 2 * LANES + 1, 3 * LANES])
+@pytest.mark.parametrize("real", [1, LANES, 2 * LANES + 1, COUNT])
 def test_each_real_lane_gives_its_own(real):
-    given = pairs(3 * LANES)
-    found = jax.jit(lambda given, real: each(most_of, given, real, interpret=True))(given, jnp.int32(real))
-    plain = most_of(given)
+    given = pairs(COUNT)
+    laid, tables = laid_out(given, "x", "least")
+    found = jax.jit(lambda tables, real: stay(sums_up, laid, numbers(), tables, real, interpret=True))(
+        tables, jnp.int32(real)
+    )
+    found, plain = unpack(laid, found), most_of(given)
     for name, values in plain.items():
         assert found[name].dtype == values.dtype
         np.testing.assert_allclose(found[name][:real], values[:real], rtol=1e-15, atol=0)
@@ -139,24 +191,19 @@ def test_each_real_lane_gives_its_own(real):
 
 @pytest.mark.parametrize("real", [LANES + 1, 2 * LANES])
 def test_blocks_without_a_real_lane_are_left_alone(real):
-    given = pairs(3 * LANES)
-    found = registers._of_each(lambda given: 2.0 * given["x"], given, jnp.int32(real), interpret=True)
-    np.testing.assert_array_equal(found[: 2 * LANES], 2.0 * np.asarray(given["x"])[: 2 * LANES])
-    assert not np.array_equal(found[2 * LANES :], 2.0 * np.asarray(given["x"])[2 * LANES :])
+    laid, tables = laid_out(pairs(COUNT), "x", "least")
+    found = unpack(laid, stay(sums_up, laid, numbers(), tables, jnp.int32(real), interpret=True))
+    np.testing.assert_array_equal(found["same"], np.repeat([7.0, 7.0, 0.0], LANES))
 
 
-@pytest.mark.parametrize("count", [LANES - 1, LANES + 1])
-def test_lanes_that_are_no_whole_blocks_are_done_as_they_stand(count):
-    found = each(most_of, pairs(count), jnp.int32(count), interpret=True)
-    np.testing.assert_array_equal(found["total"], most_of(pairs(count))["total"])
-
-
-def test_a_cuda_gpu_has_one_kernel_of_each_and_others_none():
-    work = jax.jit(lambda given: each(most_of, given, jnp.int32(LANES)))
-    traced = work.trace(pairs(LANES))
-    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 2
+def test_elsewhere_each_lane_is_done_as_it_stands():
+    given = pairs(COUNT)
+    laid, tables = laid_out(given, "x", "least")
+    work = jax.jit(lambda tables: stay(sums_up, laid, numbers(), tables, jnp.int32(LANES)))
+    traced = work.trace(tables)
+    assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 1
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
-    np.testing.assert_array_equal(work(pairs(LANES))["many"], most_of(pairs(LANES))["many"])
+    np.testing.assert_array_equal(unpack(laid, work(tables))["many"], most_of(given)["many"])
 
 
 def test_they_stay_where_there_is_a_gpu_and_kernels_are_wanted(monkeypatch):

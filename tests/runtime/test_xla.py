@@ -12,7 +12,7 @@ from jax import export, lax
 
 import vijax
 from vijax.runtime import xla
-from vijax.runtime.xla import first, in_blocks, kernel, put, repeat, search, share, whole_blocks
+from vijax.runtime.xla import first, in_blocks, kernel, put, search, share, whole_blocks
 
 X = jnp.linspace(0.1, 2.0, 192)
 MARK = "xla_cpu_small_call"
@@ -140,12 +140,6 @@ def test_a_search_ends_where_its_loop_does(either):
     halved = jax.vmap(lambda end: search(lambda s: s[0] < end, lambda s: (s[0] + 1, s[1] / 2), (0 * end, 1.0)))(ends)
     np.testing.assert_array_equal(halved[0], ends)
     np.testing.assert_array_equal(halved[1], 0.5 ** np.asarray(ends))
-
-
-def test_work_is_repeated_while_it_moves_anything(either):
-    """On an accelerator as often as it is asked for: what is done then must leave alone what has ended."""
-    trips = repeat(lambda n: n + 1, 8, lambda n: n < 3, jnp.asarray(0))
-    assert trips == (3 if either == "cpu" else 8)
 
 
 @ON_CPU

@@ -76,6 +76,7 @@ def program(plan: Plan, settings: Settings) -> lane_rounds.Program:
         stopped=lambda cell: ~cell.running,
         done=lambda cell: cell.done,
         unload=lambda cell: rows.pack(unload(plan, settings, cell)),
+        fixed=lambda cell: (cell.pair, cell.wall, cell.length, cell.speed, cell.device),
     )
     if method is not None:
         return cells._replace(

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.runtime import registers
-from vijax.runtime.xla import first, in_blocks, kernel, on_cpu, put, repeat, shared, up_to
+from vijax.runtime.xla import first, in_blocks, kernel, put, shared, up_to
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -25,8 +24,6 @@ Carry = Any
 # Quick steps between two rounds of serving, reviewing and refilling: with fewer, the rounds cost more than the steps,
 # with more, lanes that wait stand idle. No result depends on it.
 STEPS = 16
-# Steps of lanes that stay in registers between two reviews, each of which has two fifths of a step's instructions.
-_UNREVIEWED = 4
 
 
 class Service(NamedTuple):
@@ -62,6 +59,7 @@ class Program(NamedTuple):
         arithmetic: Whether all of it may be put in kernels, see `xla.kernel`.
         numbers: Whether step and review are arithmetic of numbers, which may stay in registers, and both tries what
             they can do of each lane; see `registers`.
+        fixed: Carry -> what of it stays as it was loaded.
     """
 
     load: Callable[[Float[Array, "row in"]], Carry]
@@ -74,6 +72,7 @@ class Program(NamedTuple):
     steps: int = STEPS
     arithmetic: bool = True
     numbers: bool = True
+    fixed: Callable[[Carry], Any] = lambda carry: ()
 
     def kernel(self, work: Callable[P, T]) -> Callable[P, T]:
         """Make one kernel of a function, if all of the program may be put in kernels."""
@@ -107,58 +106,39 @@ class AtWork(NamedTuple):
     carry: Carry
 
 
-def _declined(program: Program, at: AtWork) -> Bool[Array, "lane"]:
+def declined(program: Program, at: AtWork) -> Bool[Array, "lane"]:
+    """Find the lanes that wait for an answer."""
     return program.service.declined(at.carry) & (at.cell >= 0) if program.service else jnp.zeros_like(at.cell, bool)
 
 
 def able(program: Program, at: AtWork) -> Int[Array, ""]:
     """Count the lanes that the next step would move."""
-    return ((at.cell >= 0) & ~_declined(program, at) & ~program.stopped(at.carry)).sum()
+    return ((at.cell >= 0) & ~declined(program, at) & ~program.stopped(at.carry)).sum()
 
 
 def run_round(program: Program, width: int, at: AtWork) -> Carry:
-    """Run one round of the lanes that have a cell: steps, service, review.
+    """Run one round of the lanes that have a cell on a CPU: steps, service, review.
 
     Args:
         program: What a cell is.
         width: How many lanes are served together.
         at: The lanes.
     """
-    held = program.numbers and registers.used()
-    carry = _held_steps(program, *at) if held else program.kernel(partial(_steps, program))(*at)
+    carry = program.kernel(partial(_steps, program))(*at)
     if service := program.service:
-        due = program.kernel(partial(_service_due, program, service, width))
-        serve = partial(_serve, program, service, width, held)
+        due = program.kernel(partial(_service_due, program, width))
+        serve = partial(_serve, program, service, width)
         carry = lax.while_loop(partial(due, at.cell), partial(serve, at.cell), carry)
-    return carry if held else program.kernel(program.review)(carry)
+    return program.kernel(program.review)(carry)
 
 
 def _steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Take up to so many steps; fewer once half the lanes that set out wait for something else."""
 
     def some_steps(at: AtWork) -> AtWork:
-        return repeat(partial(_step, program), program.steps, partial(_goes_on, program, able(program, at)), at)
+        return up_to(partial(_step, program), program.steps, partial(_goes_on, program, able(program, at)), at)
 
     return in_blocks(some_steps, AtWork(cell, carry)).carry
-
-
-def _held_steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
-    """Do what `_steps` does, and review, in a GPU's registers: there stopped lanes soon go on."""
-
-    def some_steps(at: AtWork) -> AtWork:
-        at = up_to(partial(_step, program), _UNREVIEWED, partial(_goes_on, program, able(program, at)), at)
-        return at._replace(carry=program.review(at.carry))
-
-    def all_steps(at: AtWork) -> AtWork:
-        first = _moving(program, at)
-        return up_to(some_steps, program.steps // _UNREVIEWED, lambda at: 2 * _moving(program, at) > first, at)
-
-    return registers.stay(all_steps, AtWork(cell, carry)).carry
-
-
-def _moving(program: Program, at: AtWork) -> Int[Array, ""]:
-    """Count the lanes that the next steps or their review would move: one that an answer stopped is to be reviewed."""
-    return ((at.cell >= 0) & ~_declined(program, at) & ~program.done(at.carry)).sum()
 
 
 def _step(program: Program, at: AtWork) -> AtWork:
@@ -169,42 +149,24 @@ def _goes_on(program: Program, at_first: Int[Array, ""], at: AtWork) -> Bool[Arr
     return 2 * able(program, at) > at_first
 
 
-def _service_due(
-    program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
-) -> Bool[Array, ""]:
-    """Say whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one.
-
-    On an accelerator a careful try takes as long however many lanes have one: those who need it wait for many others,
-    or until nobody else goes on.
-    """
+def _service_due(program: Program, width: int, cell: Int[Array, "lane"], carry: Carry) -> Bool[Array, ""]:
+    """Say whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
     at = AtWork(cell, carry)
     easy, hard = (lanes.sum() for lanes in asking(program, at))
-    full, going = (easy >= width) | (hard >= _many(width)), able(program, at)
-    if on_cpu():
-        return full | ((easy + hard > 0) & (easy + hard >= going))
-    return full | jnp.where(easy > 0, easy >= going, (hard > 0) & (going == 0))
-
-
-def _many(width: int) -> int:
-    """Say how many hard lanes are not to wait for others."""
-    return width if on_cpu() else max(width // 16, 1)
+    return (easy >= width) | (hard >= width) | ((easy + hard > 0) & (easy + hard >= able(program, at)))
 
 
 def asking(program: Program, at: AtWork) -> tuple[Bool[Array, "lane"], Bool[Array, "lane"]]:
     """Find the lanes that wait for their second try, and those that wait for the careful one."""
-    declined = _declined(program, at)
-    hard = program.service.hard(at.carry) if program.service else declined
-    return declined & ~hard, declined & hard
+    waits = declined(program, at)
+    hard = program.service.hard(at.carry) if program.service else waits
+    return waits & ~hard, waits & hard
 
 
-def _serve(program: Program, service: Service, width: int, held: bool, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+def _serve(program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Give a batch of easy lanes their second try, or a batch of hard ones the careful try."""
     easy, batch, requests = program.kernel(partial(_ask, program, service, width))(cell, carry)
-    second, careful = (
-        partial(registers.each, work, real=batch.real) if held else program.kernel(work)
-        for work in (service.second, service.careful)
-    )
-    answers = lax.cond(easy, second, careful, requests)
+    answers = lax.cond(easy, program.kernel(service.second), program.kernel(service.careful), requests)
     return program.kernel(partial(_settle, service))(carry, answers, batch)
 
 
@@ -213,10 +175,7 @@ def _ask(
 ) -> tuple[Bool[Array, ""], LaneBatch, Any]:
     """Say whose turn it is, easy lanes or hard ones, and what they request."""
     easy, hard = asking(program, AtWork(cell, carry))
-    some, others = easy.sum(), hard.sum()
-    turn = some >= jnp.minimum(others, width)
-    if not on_cpu():
-        turn = (some > 0) & (others < _many(width))
+    turn = easy.sum() >= jnp.minimum(hard.sum(), width)
     batch = batch_of(jnp.where(turn, easy, hard), width)
     return turn, batch, take(service.request(carry), batch.members)
 

@@ -6,37 +6,31 @@ nothing is left.
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.batch import rows
+from vijax.batch import accelerator_lanes, held_lanes
 from vijax.batch.lane_rounds import AtWork, Carry, Program, able, batch_of, run_round, take
-from vijax.runtime import registers
 from vijax.runtime.arrays import choose
 from vijax.runtime.xla import on_cpu, put, whole_blocks
 
-# One lane in so many is served or refilled together, on an accelerator and on a CPU. A larger batch keeps slow cells
-# waiting; but to serve 16,384 lanes takes an accelerator no longer than to serve 4,096.
-_SHARE_ELSEWHERE, _SHARE, _FEWEST = 8, 32, 4
+# One lane in so many is served or refilled together, and so many at least. A larger batch keeps slow cells waiting.
+_SHARE, _FEWEST = 32, 4
 # Rows of a CPU's table, and its lanes, however many cells there are: one program, which takes as long to compile as to
 # run half a million cells, serves every plane. With 512 lanes planes of 10^5 cells would run a thirtieth sooner.
 TABLE, _LANES = 32_768, 64
-# An accelerator goes on with as few cells as `run_most` may leave while such a share of them ends in a round, on the
-# average of so many: others, who fly side by side, take as long for these as it does for a round.
-_SHARE_OF_A_ROUND, _ROUNDS = 1 / 256, 16
 
 
 class _Queue(NamedTuple):
-    """The loop's state: the lanes, the next cell to start, the results so far, how many cells end in a round."""
+    """The loop's state: the lanes, the next cell to start, the results so far."""
 
     at: AtWork
     waiting: Int[Array, ""]
     results: Float[Array, "cell out"]
-    pace: Float[Array, ""]
 
 
 class _Table(NamedTuple):
@@ -49,13 +43,9 @@ class _Table(NamedTuple):
 def width_of(cells: int) -> int:
     """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
 
-    At the end of a tile they stand idle: 4,096 cells take half again as long with 512 lanes as with 64. An accelerator
-    takes nearly as long for a step of 8,192 lanes as for one of 32,768, and beyond in proportion; at the end of a tile
-    few lanes are left, and the steps of all are waited for.
+    At the end of a tile they stand idle: 4,096 cells take half again as long with 512 lanes as with 64.
     """
-    if on_cpu():
-        return _LANES
-    return registers.whole_blocks(max(min(cells // 8, 131_072), min(cells, 8_192)), _SHARE_ELSEWHERE)
+    return _LANES if on_cpu() else accelerator_lanes.width_of(cells)
 
 
 def table_rows(cells: int, variants: int) -> int:
@@ -65,14 +55,7 @@ def table_rows(cells: int, variants: int) -> int:
 
 def _served(lanes: int) -> int:
     """Choose how many lanes are served or refilled together."""
-    return min(max(lanes // (_SHARE if on_cpu() else _SHARE_ELSEWHERE), _FEWEST), lanes)
-
-
-class Left(NamedTuple):
-    """Cells that were not flown to their end: which (-1: none), and all that their lanes know of them, as rows."""
-
-    cell: Int[Array, "few"]
-    lanes: Float[Array, "few column"]
+    return min(max(lanes // _SHARE, _FEWEST), lanes)
 
 
 def run(
@@ -92,57 +75,24 @@ def run(
     LLVM makes several loops of one, of whole vectors and of what is left, and fuses multiplications and additions in
     each as it sees fit.
     """
-    return _run(program, _Table(cells, count), outputs, lanes, 0).results
+    if not on_cpu():
+        return accelerator_lanes.run(program, cells, count, outputs, lanes)
+    return _run(program, _Table(cells, count), outputs, lanes).results
 
 
-def run_most(
-    program: Program, cells: Float[Array, "cell in"], count: Int[Array, ""], outputs: int, lanes: int, few: int
-) -> tuple[Float[Array, "cell out"], Left]:
-    """Do what `run` does until few cells are left, whose rows of results are zeros; `resumed` goes on with them.
-
-    At most `few`, and fewer where those end quickly: what is left in the end asks again and again to be served, a step
-    a round, and takes the accelerator longer than it takes others.
-    """
-    queue = _run(program, _Table(cells, count), outputs, lanes, few)
-    batch = batch_of(queue.at.cell >= 0, few)
-    real = jnp.arange(few, dtype=jnp.int32) < batch.real
-    cell = jnp.where(real, queue.at.cell[batch.members], -1)
-    return queue.results, Left(cell, rows.pack(take(queue.at.carry, batch.members)))
-
-
-def resumed(program: Program, like: Float[Array, "row in"]) -> Program:
-    """Make the program whose cells are rows of `Left`; `like` has the shape of rows of the one that left them."""
-    lane = jax.eval_shape(program.load, like)
-    return program._replace(load=partial(rows.unpack, like=lane))
-
-
-def _run(program: Program, table: _Table, outputs: int, lanes: int, few: int) -> _Queue:
-    """Run cells until none waits and no more than `few` are on their way."""
+def _run(program: Program, table: _Table, outputs: int, lanes: int) -> _Queue:
+    """Run cells until none waits and none is on its way."""
     lanes = whole_blocks(lanes)
     width = _served(lanes)
 
     def refill_and_round(queue: _Queue) -> _Queue:
-        # Where the last cells are left to others nobody waits for a lane either, once no cell does.
-        queue = _refill(program, table, width, queue, width if few else 1)
-        new = queue._replace(at=queue.at._replace(carry=run_round(program, width, queue.at)))
-        if not few:
-            return new
-        ended = (_flying(program, queue.at) - _flying(program, new.at)).astype(new.pace.dtype)
-        return new._replace(pace=new.pace + (ended - new.pace) / _ROUNDS)
+        queue = _refill(program, table, width, queue)
+        return queue._replace(at=queue.at._replace(carry=run_round(program, width, queue.at)))
 
     def goes_on(queue: _Queue) -> Bool[Array, ""]:
-        if not few:
-            return (queue.at.cell >= 0).any() | (queue.waiting < table.real)
-        many = (_flying(program, queue.at) > few) | (queue.pace > max(few * _SHARE_OF_A_ROUND, 1.0))
-        return many | (queue.waiting < table.real)
+        return (queue.at.cell >= 0).any() | (queue.waiting < table.real)
 
-    queue = lax.while_loop(goes_on, refill_and_round, _all_waiting(program, table, outputs, lanes))
-    return _refill(program, table, width, queue, 1) if few else queue
-
-
-def _flying(program: Program, at: AtWork) -> Int[Array, ""]:
-    """Count the cells that are on their way."""
-    return ((at.cell >= 0) & ~program.done(at.carry)).sum()
+    return lax.while_loop(goes_on, refill_and_round, _all_waiting(program, table, outputs, lanes))
 
 
 def _all_waiting(program: Program, table: _Table, outputs: int, lanes: int) -> _Queue:
@@ -152,17 +102,12 @@ def _all_waiting(program: Program, table: _Table, outputs: int, lanes: int) -> _
         AtWork(jnp.full(lanes, -1, jnp.int32), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh)),
         waiting=jnp.asarray(0, jnp.int32),
         results=jnp.zeros((table.cells.shape[0], outputs), table.cells.dtype),
-        pace=jnp.asarray(0.0, table.cells.dtype),
     )
 
 
-def _refill(program: Program, table: _Table, width: int, queue: _Queue, last: int) -> _Queue:
-    """Write down the cells that are done and load waiting ones, a batch at a time, while that is worth its price.
-
-    Args:
-        last: For how many lanes it is, once no cell waits.
-    """
-    due = program.kernel(partial(_refill_due, program, table, width, last))
+def _refill(program: Program, table: _Table, width: int, queue: _Queue) -> _Queue:
+    """Write down the cells that are done and load waiting ones, a batch at a time, while that is worth its price."""
+    due = program.kernel(partial(_refill_due, program, table, width))
     exchange = program.kernel(partial(_exchange, program, table, width))
 
     def one_batch(queue: _Queue) -> _Queue:
@@ -177,11 +122,9 @@ def _free(program: Program, table: _Table, at: AtWork, waiting: Int[Array, ""]) 
     return jnp.where(at.cell >= 0, program.done(at.carry), waiting < table.real)
 
 
-def _refill_due(
-    program: Program, table: _Table, width: int, last: int, at: AtWork, waiting: Int[Array, ""]
-) -> Bool[Array, ""]:
+def _refill_due(program: Program, table: _Table, width: int, at: AtWork, waiting: Int[Array, ""]) -> Bool[Array, ""]:
     # With cells waiting a refill is worth its price only for several lanes.
-    enough = jnp.where(waiting < table.real, width, last)
+    enough = jnp.where(waiting < table.real, width, 1)
     return _free(program, table, at, waiting).sum() >= enough
 
 
@@ -195,6 +138,18 @@ def _exchange(program: Program, table: _Table, width: int, at: AtWork, waiting: 
     start = waiting + jnp.arange(width, dtype=jnp.int32)
     fresh = AtWork(jnp.where(start < count, start, -1), program.load(cells[jnp.minimum(start, cells.shape[0] - 1)]))
     return put(at, fresh, batch.members, batch.real), waiting + batch.real, rows, found
+
+
+def _held(program: Program, columns: int, kind: Any, lanes: int) -> tuple[Callable[..., Any], ...]:
+    """Say how lanes are loaded, how a program knows them, and what a round is."""
+    if on_cpu():
+        return program.load, lambda carry: carry, partial(run_round, program)
+    held = held_lanes.hold(program, columns, kind, lanes)
+
+    def advance(width: int, at: AtWork) -> Any:
+        return accelerator_lanes.run_round(program, held, width, at, accelerator_lanes.count(program, held, at))
+
+    return held.load, held.record, advance
 
 
 class _Chains(NamedTuple):
@@ -225,17 +180,18 @@ def chain(
     A lane whose link has ended waits for a few others at most, which are passed on with it: to load a cell costs as
     much as many steps.
     """
-    lanes, most, _ = links.shape
+    lanes, most, columns = links.shape
     width = _served(lanes)
+    load, record, moved = _held(program, columns, links.dtype, lanes)
     enough = max(lanes // _SHARE, 1)
     lane = jnp.arange(lanes, dtype=jnp.int32)
 
     def ended(carry: Carry, link: Int[Array, "lane"]) -> Bool[Array, "lane"]:
-        return (link >= 0) & program.done(carry)
+        return (link >= 0) & program.done(record(carry))
 
     def due(carry: Carry, link: Int[Array, "lane"]) -> Bool[Array, ""]:
         number = ended(carry, link).sum()
-        return (number >= enough) | ((number > 0) & (number >= able(program, AtWork(link, carry))))
+        return (number >= enough) | ((number > 0) & (number >= able(program, AtWork(link, record(carry)))))
 
     def exchange(carry: Carry, link: Int[Array, "lane"]):
         """Pass a batch on; give rows of the result table, and where they belong: no link, past the last one."""
@@ -243,10 +199,10 @@ def chain(
         rows, some = batch.members, take(carry, batch.members)
         before = link[rows]
         goes_on = before + 1 < length
-        fresh = program.load(succeed(some, links[rows, jnp.minimum(before + 1, most - 1)]))
+        fresh = load(succeed(record(some), links[rows, jnp.minimum(before + 1, most - 1)]))
         new = choose(goes_on, fresh, some), jnp.where(goes_on, before + 1, -1)
         place = jnp.where(jnp.arange(width, dtype=jnp.int32) < batch.real, before, most)
-        return *put((carry, link), new, rows, batch.real), rows, place, program.unload(some)
+        return *put((carry, link), new, rows, batch.real), rows, place, program.unload(record(some))
 
     def pass_on(state: _Chains) -> _Chains:
         carry, link, rows, place, found = program.kernel(exchange)(state.carry, state.link)
@@ -255,10 +211,10 @@ def chain(
     def advance(state: _Chains) -> _Chains:
         is_due = program.kernel(due)
         state = lax.while_loop(lambda state: is_due(state.carry, state.link), pass_on, state)
-        return state._replace(carry=run_round(program, width, AtWork(state.link, state.carry)))
+        return state._replace(carry=moved(width, AtWork(state.link, state.carry)))
 
     start = _Chains(
-        carry=program.load(links[:, 0]),
+        carry=load(links[:, 0]),
         link=jnp.where(lane < count, 0, -1).astype(jnp.int32),
         results=jnp.zeros((lanes, most, outputs), links.dtype),
     )

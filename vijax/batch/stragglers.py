@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vijax.batch import cell_program, lanes, rows
+from vijax.batch import accelerator_lanes, cell_program, lanes, rows
 from vijax.batch.cell import Plan, Settings
 from vijax.batch.summary import shapes
 from vijax.model.device import Harvester, electrical
@@ -51,7 +51,7 @@ def _compiled(plan: Plan) -> export_cache.TracedProgram:
 
     def finish(table, count, settings):
         kind = table.dtype
-        cells = lanes.resumed(cell_program.program(plan, settings), _entry(plan, kind))
+        cells = accelerator_lanes.resumed(cell_program.program(plan, settings), _entry(plan, kind))
         return lanes.run(cells, table, count, rows.width(shapes(plan, kind)), _LANES)
 
     return export_cache.TracedProgram(finish, f"{finish.__qualname__} {plan}")
@@ -78,7 +78,7 @@ def finish(plan: Plan, settings: Settings, left: np.ndarray) -> np.ndarray:
 
     Args:
         plan, settings: Those of the tile.
-        left: What is known of each [cell, column], as `lanes.run_most` gives it; no more than `most`.
+        left: What is known of each [cell, column], as `accelerator_lanes.run_most` gives it; no more than `most`.
 
     Returns:
         Their rows of results [cell, column].

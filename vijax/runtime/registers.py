@@ -4,19 +4,20 @@ XLA makes a loop of kernels, and each stores all that the next one reads of a la
 GPU longer than to compute them. Here a thread has a lane, reads it once and writes it once, and a block of lanes does
 not wait for the others.
 
-By Pallas' way to Triton, as the way to Mosaic GPU knows no float64. A kernel reads and writes a few tables, not the
-eighty arrays that lanes are: Triton's compiler looks at all of a kernel for each of its loads and stores, and was done
-in 32 seconds where it now is in 4.
+By Pallas' way to Triton, as the way to Mosaic GPU knows no float64. Between kernels lanes lie in a few tables [lane,
+column], not in the eighty arrays that a record has: Triton's compiler looks at all of a kernel for each of its loads
+and stores, and XLA would need a kernel for each array that a few lanes are taken from, or put into.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from vijax.runtime import xla
 from vijax.runtime.unrolled import unrolled
@@ -26,45 +27,38 @@ T = TypeVar("T")
 # Lanes of a block, a thread each: those that a GPU runs in step anyway.
 LANES = 32
 
+Each = Callable[[Callable[[Any], Any], Any], Any]
+"""Does some work on lanes as on single ones; see `stay`."""
+
+
+class Layout(NamedTuple):
+    """Where the leaves of a record of lanes lie in tables.
+
+    Attributes:
+        like: The record, as shapes.
+        fixed: Of each leaf, in their order, whether it stays as it was laid out.
+    """
+
+    like: Any
+    fixed: tuple[bool, ...]
+
+
+class Tables(NamedTuple):
+    """A record of lanes as few tables of floating numbers, those that kernels write apart from those that they read."""
+
+    changing: tuple[Float[Array, "lane column"], ...]
+    fixed: tuple[Float[Array, "lane column"], ...]
+
 
 def used() -> bool:
     """Say whether programs are made for a GPU and kernels are wanted there."""
     return xla.KERNELS and xla.platform() == "gpu"
 
 
-def stay(work: Callable[[T], T], lanes: T, *, interpret: bool = False) -> T:
-    """Do `work` on all lanes, block by block: on a CUDA GPU in one kernel, elsewhere as it stands.
-
-    Args:
-        work: On lanes, arrays of one leading axis; elementwise arithmetic, sums over lanes and loops, nothing else.
-            Where further axes are not of a power of two, or lanes are not whole blocks, it is not in one kernel.
-            Whole numbers pass as floating ones, and must be so small that these hold them.
-        lanes: What it is done on.
-        interpret: Whether to run the kernel here whatever this machine is, operation by operation: for tests.
-    """
-    if not all(map(_fits, jax.tree.leaves(lanes))):
-        return work(lanes)
-    if interpret:
-        return _in_one_kernel(work, lanes, interpret=True)
-    return lax.platform_dependent(lanes, cuda=partial(_in_one_kernel, work), default=work)
-
-
-def each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], *, interpret: bool = False) -> T:
-    """Make of the first `real` lanes what `work` makes of each: on a CUDA GPU in one kernel, elsewhere as it stands.
-
-    Args:
-        work: On lanes, arrays of one axis; what `unrolled` can follow, whose results are such arrays.
-            Where lanes are not whole blocks, it is not in one kernel.
-        lanes: What it is done on.
-        real: How many count; what becomes of the others may be anything.
-        interpret: As in `stay`.
-    """
-    leaves = jax.tree.leaves(lanes)
-    if any(leaf.ndim != 1 or leaf.size % LANES for leaf in leaves):
-        return work(lanes)
-    if interpret:
-        return _of_each(work, lanes, real, interpret=True)
-    return lax.platform_dependent(lanes, real, cuda=partial(_of_each, work), default=lambda lanes, _: work(lanes))
+def fit(like: Any, lanes: int) -> bool:
+    """Say whether a kernel can hold lanes: whole blocks of them, with no axis but that which is not a power of two."""
+    sizes = (size for leaf in jax.tree.leaves(like) for size in leaf.shape[1:])
+    return lanes % LANES == 0 and all(size & (size - 1) == 0 for size in sizes)
 
 
 def whole_blocks(lanes: int, parts: int) -> int:
@@ -72,94 +66,158 @@ def whole_blocks(lanes: int, parts: int) -> int:
     return -(-lanes // (parts * LANES)) * parts * LANES
 
 
-def _fits(leaf: Any) -> bool:
-    count, *more = leaf.shape
-    return count % LANES == 0 and all(size & (size - 1) == 0 for size in more)
+def layout(like: Any, fixed: Callable[[Any], Any]) -> Layout:
+    """Lay out a record.
+
+    Args:
+        like: The record, as shapes; whole numbers in it must be so small that floating ones hold them.
+        fixed: A record -> what of it stays as it was laid out.
+    """
+    leaves, tree = jax.tree.flatten(like)
+    stays = set(jax.tree.leaves(fixed(jax.tree.unflatten(tree, range(len(leaves))))))
+    return Layout(like, tuple(place in stays for place in range(len(leaves))))
 
 
-def _in_one_kernel(work: Callable[[T], T], lanes: T, interpret: bool = False) -> T:
-    leaves, tree = jax.tree.flatten(lanes)
-    block = [jax.ShapeDtypeStruct((LANES, *leaf.shape[1:]), leaf.dtype) for leaf in leaves]
-    traced = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(work(jax.tree.unflatten(tree, leaves))))(*block)
-    # What comes out as it went in is not written.
-    pairs = zip(traced.jaxpr.invars, traced.jaxpr.outvars, strict=True)
-    moved = [i for i, (old, new) in enumerate(pairs) if old is not new]
-    like = [leaves[i] for i in moved]
-
-    def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
-        found = jax.core.eval_jaxpr(traced.jaxpr, [ref[...] for ref in read], *_columns(given, block))
-        _write([found[i] for i in moved], written)
-
-    kind = _kind(leaves)
-    found = _by_blocks(body, (_tables(leaves, kind), traced.consts, _shapes(like, kind)), interpret)
-    for i, value in zip(moved, _apart(found, like, interpret), strict=True):
-        leaves[i] = value
-    return jax.tree.unflatten(tree, leaves)
+def pack(laid: Layout, record: Any) -> Tables:
+    """Lay lanes out as tables."""
+    return Tables(*(_laid_out(laid, record, fixed, partial(jnp.stack, axis=1)) for fixed in (False, True)))
 
 
-def _of_each(work: Callable[[Any], T], lanes: Any, real: Int[Array, ""], interpret: bool = False) -> T:
+def unpack(laid: Layout, tables: Tables) -> Any:
+    """Take the record out of its tables again."""
+    columns = [_cut(tables.changing), _cut(tables.fixed)]
+    leaves = [_read(columns[fixed], leaf) for leaf, fixed in _leaves(laid)]
+    return jax.tree.unflatten(jax.tree.structure(laid.like), leaves)
+
+
+def stay(
+    work: Callable[[Int[Array, "lane"], T, Each], T],
+    laid: Layout,
+    number: Int[Array, "lane"],
+    tables: Tables,
+    real: Int[Array, ""] | None = None,
+    *,
+    interpret: bool = False,
+) -> Tables:
+    """Do `work` on lanes, block by block: on a CUDA GPU in one kernel, elsewhere as it stands.
+
+    Args:
+        work: A number of each lane, and their record -> the record; elementwise arithmetic, sums over lanes and loops,
+            nothing else. What does more goes through its third argument, which does some work on a record of arrays of
+            one axis as on single lanes (`unrolled`).
+        laid: How the record lies in the tables; `fit` must hold.
+        number: Whatever a lane is told besides.
+        tables: What it is done on.
+        real: How many lanes count, the first ones, if not all; what becomes of the others may be anything.
+        interpret: Whether to run the kernel here whatever this machine is, operation by operation: for tests.
+    """
+    kernel = partial(_in_one_kernel, work, laid, interpret=interpret)
+
+    def as_it_stands(number: Any, tables: Tables, real: Any) -> Tables:
+        record = work(number, unpack(laid, tables), lambda some, given: some(given))
+        return tables._replace(changing=pack(laid, record).changing)
+
+    if interpret:
+        return kernel(number, tables, real)
+    return lax.platform_dependent(number, tables, real, cuda=kernel, default=as_it_stands)
+
+
+def _on_single_lanes(some: Callable[[Any], Any], given: Any) -> Any:
+    leaves, tree = jax.tree.flatten(given)
+    results = jax.tree.structure(jax.eval_shape(some, given))
+    return jax.tree.unflatten(results, unrolled(lambda leaves: some(jax.tree.unflatten(tree, leaves)), leaves))
+
+
+def _in_one_kernel(
+    work: Callable[[Any, T, Each], T], laid: Layout, number: Any, tables: Tables, real: Any, *, interpret: bool
+) -> Tables:
     from jax.experimental import pallas
 
-    leaves, tree = jax.tree.flatten(lanes)
-    block = [jax.ShapeDtypeStruct((LANES,), leaf.dtype) for leaf in leaves]
-    like, results = jax.tree.flatten(jax.eval_shape(work, lanes))
+    first = jax.ShapeDtypeStruct((LANES,), number.dtype)
+    block = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((LANES, *leaf.shape[1:]), leaf.dtype), laid.like)
+    traced = jax.make_jaxpr(lambda number, record: jax.tree.leaves(work(number, record, _on_single_lanes)))(
+        first, block
+    )
+    # What all blocks read: how many lanes count, and every number that the work knows from elsewhere.
+    read = [*([] if real is None else [real.reshape(1)]), *traced.consts]
+    given = [number, *tables.changing, *tables.fixed]
+    ends = [len(given), len(given) + len(read)]
 
-    def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
-        @pallas.when(pallas.program_id(0) * LANES < read[0][0])
-        def _():
-            _write(unrolled(lambda some: work(jax.tree.unflatten(tree, some)), _columns(given, block)), written)
+    def on_refs(*refs: Any) -> None:
+        number, *held = refs[: ends[0]]
+        consts, written = refs[ends[0] + (real is not None) : ends[1]], refs[ends[1] :]
 
-    kind = _kind(leaves)
-    found = _by_blocks(body, (_tables(leaves, kind), [real.reshape(1)], _shapes(like, kind)), interpret)
-    return jax.tree.unflatten(results, _apart(found, like, interpret))
+        def on_a_block() -> None:
+            some = Tables(*_parted([ref[...] for ref in held], len(tables.changing)))
+            leaves = jax.tree.leaves(unpack(laid, some))
+            found = jax.core.eval_jaxpr(traced.jaxpr, [ref[...] for ref in consts], number[...], *leaves)
+            record = jax.tree.unflatten(jax.tree.structure(laid.like), found)
+            for ref, table in zip(written, _laid_out(laid, record, False, _joined), strict=True):
+                ref[...] = table
+
+        if real is None:
+            on_a_block()
+        else:
+            pallas.when(pallas.program_id(0) * LANES < refs[ends[0]][0])(on_a_block)
+
+    return tables._replace(changing=_by_blocks(on_refs, given, read, tables.changing, interpret))
 
 
 def _by_blocks(
-    body: Callable[[list[Any], list[Any], list[Any]], None],
-    arrays: tuple[list[Any], list[Any], list[Any]],
-    interpret: bool,
-) -> list[Any]:
+    on_refs: Callable[..., None], given: list[Any], read: list[Any], written: tuple[Any, ...], interpret: bool
+) -> tuple[Any, ...]:
     """Call a kernel on all blocks of lanes.
 
     Args:
-        body: On references to what a block is given, to what all blocks read, and to what a block writes.
-        arrays: Those that blocks have parts of, by their last axis; what all blocks read; and the shapes of what is
-            written.
+        on_refs: On references to what a block is given, to what all blocks read, and to what a block writes.
+        given: Arrays that blocks have parts of: the numbers of the lanes, what is written, what is not.
+        read: What all blocks read.
+        written: Those of `given` that are written, in place.
         interpret: As in `stay`.
     """
     # Here, as importing vijax on a CPU must not load it.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
-    given, read, written = arrays
-
     def part(array: Any) -> Any:
-        return pallas.BlockSpec((*array.shape[:-1], LANES), lambda i: (*[0] * (array.ndim - 1), i))
+        return pallas.BlockSpec((LANES, *array.shape[1:]), lambda i: (i, *[0] * (array.ndim - 1)))
 
     def whole(array: Any) -> Any:
         return pallas.BlockSpec(array.shape, lambda _: (0,) * array.ndim)
 
-    def on_refs(*refs: Any) -> None:
-        first, second = len(given), len(given) + len(read)
-        body(list(refs[:first]), list(refs[first:second]), list(refs[second:]))
-
-    return pallas.pallas_call(
+    found = pallas.pallas_call(
         on_refs,
-        grid=(given[0].shape[-1] // LANES,),
+        grid=(given[0].size // LANES,),
         in_specs=[*map(part, given), *map(whole, read)],
         out_specs=list(map(part, written)),
-        out_shape=[jax.ShapeDtypeStruct(array.shape, array.dtype) for array in written],
+        out_shape=[jax.ShapeDtypeStruct(table.shape, table.dtype) for table in written],
+        input_output_aliases={1 + i: i for i in range(len(written))},
         compiler_params=triton.CompilerParams(num_warps=1),
         interpret=interpret,
     )(*given, *read)
+    return tuple(found)
 
 
-# --- tables [column, lane] -------------------------------------------------------------------------------------------
+def _parted(values: list[Any], first: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    return tuple(values[:first]), tuple(values[first:])
 
 
-def _kind(leaves: list[Any]) -> Any:
-    """Find which floating numbers lanes hold."""
-    return next(leaf.dtype for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating))
+# --- columns ---------------------------------------------------------------------------------------------------------
+
+
+def _leaves(laid: Layout) -> Iterator[tuple[Any, bool]]:
+    return zip(jax.tree.leaves(laid.like), laid.fixed, strict=True)
+
+
+def _laid_out(laid: Layout, record: Any, fixed: bool, join: Callable[[list[Any]], Any]) -> tuple[Any, ...]:
+    """Make the tables of what is fixed in a record, or of what is not, joining columns in some way."""
+    columns: list[Any] = []
+    kind = next(leaf.dtype for leaf, _ in _leaves(laid) if jnp.issubdtype(leaf.dtype, jnp.floating))
+    for value, stays in zip(jax.tree.leaves(record), laid.fixed, strict=True):
+        if stays == fixed:
+            rows = value.reshape(value.shape[0], -1).astype(kind)
+            columns += [part.reshape(-1) for part in lax.split(rows, (1,) * rows.shape[1], axis=1)]
+    return tuple(map(join, _by_table(columns)))
 
 
 def _sizes(columns: int) -> list[int]:
@@ -170,19 +228,6 @@ def _sizes(columns: int) -> list[int]:
     return [size] if 4 * columns >= 3 * size else [size // 2, *_sizes(columns - size // 2)]
 
 
-def _shapes(leaves: list[Any], kind: Any) -> list[Any]:
-    """Give the shapes of the tables of lanes."""
-    lanes = leaves[0].shape[0]
-    columns = sum(leaf.size for leaf in leaves) // lanes
-    return [jax.ShapeDtypeStruct((size, lanes), kind) for size in _sizes(columns)]
-
-
-def _tables(leaves: list[Any], kind: Any) -> list[Any]:
-    """Lay lanes out as few tables of floating numbers of a kind."""
-    rows = [leaf.reshape(leaf.shape[0], -1).astype(kind) for leaf in leaves]
-    return list(map(jnp.stack, _by_table([some[:, i] for some in rows for i in range(some.shape[1])])))
-
-
 def _by_table(columns: list[Any]) -> Iterator[list[Any]]:
     """Give the columns of each table, void ones too."""
     for size in _sizes(len(columns)):
@@ -190,52 +235,25 @@ def _by_table(columns: list[Any]) -> Iterator[list[Any]]:
         yield some + some[:1] * (size - len(some))
 
 
-def _by_leaf(columns: list[Any], like: list[Any]) -> Iterator[tuple[list[Any], Any]]:
-    """Give the columns of each leaf, with the leaf."""
-    for leaf in like:
-        width = leaf.size // leaf.shape[0]
-        some, columns = columns[:width], columns[width:]
-        yield some, leaf
+def _cut(tables: tuple[Any, ...]) -> Iterator[Any]:
+    """Give one column of tables after another."""
+    for table in tables:
+        for part in lax.split(table, (1,) * table.shape[1], axis=1):
+            yield part.reshape(-1)
 
 
-def _columns(refs: list[Any], like: list[Any]) -> list[Any]:
-    """Read the leaves of a block."""
-    columns: list[Any] = []
-    for ref in refs:
-        table = ref[...]
-        parts = lax.split(table, (1,) * len(table)) if len(table) > 1 else [table]
-        columns += [part.reshape(LANES) for part in parts]
-    return [_joined(some).reshape(leaf.shape).astype(leaf.dtype) for some, leaf in _by_leaf(columns, like)]
-
-
-def _write(values: list[Any], refs: list[Any]) -> None:
-    """Write the leaves of a block."""
-    columns: list[Any] = []
-    for value in values:
-        rows = value.reshape(LANES, -1).astype(refs[0].dtype)
-        parts = lax.split(rows, (1,) * rows.shape[1], axis=1) if rows.shape[1] > 1 else [rows]
-        columns += [part.reshape(LANES) for part in parts]
-    for ref, some in zip(refs, _by_table(columns), strict=True):
-        ref[...] = lax.transpose(_joined(some).reshape(LANES, len(some)), (1, 0))
+def _read(columns: Iterator[Any], leaf: Any) -> Any:
+    """Read a leaf from the columns that come next."""
+    lanes = [next(columns) for _ in range(math.prod(leaf.shape[1:]))]
+    return _joined(lanes).reshape(-1, *leaf.shape[1:]).astype(leaf.dtype)
 
 
 def _joined(columns: list[Any]) -> Any:
-    """Join columns to an array [lane, 2, ..., 2]: Triton joins two at a time, along a new last axis."""
-    if len(columns) == 1:
-        return columns[0]
-    return jnp.concatenate([_joined(columns[half::2])[..., None] for half in (0, 1)], axis=-1)
+    """Join columns to a table: Triton joins two at a time, along a new last axis."""
 
+    def joined(columns: list[Any]) -> Any:
+        if len(columns) == 1:
+            return columns[0]
+        return jnp.concatenate([joined(columns[half::2])[..., None] for half in (0, 1)], axis=-1)
 
-def _apart(tables: list[Any], like: list[Any], interpret: bool) -> list[Any]:
-    """Make arrays of the columns of tables, in one kernel: XLA would copy them one by one."""
-    flat = [
-        jax.ShapeDtypeStruct(leaf.shape[:1], leaf.dtype) for leaf in like for _ in range(leaf.size // leaf.shape[0])
-    ]
-
-    def body(given: list[Any], read: list[Any], written: list[Any]) -> None:
-        rows = [(ref, i) for ref in given for i in range(ref.shape[0])]
-        for (ref, i), out in zip(rows, written, strict=False):
-            out[...] = ref[i, :].astype(out.dtype)
-
-    columns = _by_blocks(body, (tables, [], flat), interpret)
-    return [jnp.stack(some, axis=-1).reshape(leaf.shape) for some, leaf in _by_leaf(columns, like)]
+    return joined(columns).reshape(-1, len(columns))

@@ -63,9 +63,6 @@ _BRIEF = {"xla_backend_optimization_level": 0}
 _STAYS = {"inlineable": "false"}  # a call that XLA does not see through
 _ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
 _TRIPS = 4  # of a short loop, between two looks whether it goes on, on an accelerator
-# Trips of a long loop that an accelerator's kernels make at once: less of what the second reads of the first is stored,
-# and a step of all lanes takes a sixth less time. Four would take twice as long to compile, for a twentieth more.
-_UNROLLED = 2
 _BLOCK = 64  # lanes: what a step stores of them stays in the first cache; with 32 LLVM runs out of registers
 
 once = jax.jit
@@ -169,16 +166,6 @@ def kernel(work: Callable[P, T]) -> Callable[P, T]:
         return jax.tree.unflatten(jax.tree.structure(shape), set_xla_metadata(results, **_ONE_KERNEL))
 
     return call
-
-
-def repeat(work: Callable[[T], T], most: int, goes_on: Callable[[T], Bool[Array, ""]], state: T) -> T:
-    """Do `work` up to so many times: on the CPU while `goes_on`, elsewhere always.
-
-    An accelerator runs what the host sends: it would stop to be asked after every trip, for longer than one takes.
-    """
-    if not on_cpu():
-        return lax.fori_loop(0, most, lambda _, state: work(state), state, unroll=_UNROLLED)
-    return up_to(work, most, goes_on, state)
 
 
 def up_to(work: Callable[[T], T], most: int, goes_on: Callable[[T], Bool[Array, ""]], state: T) -> T:
