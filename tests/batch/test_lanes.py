@@ -174,25 +174,48 @@ def in_registers(program, cells, number=256):
     return jax.jit(lambda cells: lanes.run(program, cells, jnp.asarray(len(cells), jnp.int32), OUTPUTS, number))(cells)
 
 
-def test_lanes_that_stay_in_registers_give_the_same_results(monkeypatch):
-    """Lanes are stepped, reviewed and given their second tries block by block."""
-    cells = draw(600, [EASY, DECLINES, HARD])
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+@pytest.fixture
+def interpreted(monkeypatch):
+    """A GPU whose kernels are interpreted here; how many blocks of lanes each has."""
     blocks, stay = [], registers.stay
 
-    def interpreted(work, laid, number, tables, real=None):
+    def here(work, laid, number, tables, real=None):
         blocks.append(number.size // registers.LANES)
         return stay(work, laid, number, tables, real, interpret=True)
 
-    monkeypatch.setattr(registers, "stay", interpreted)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(registers, "stay", here)
+    return blocks
+
+
+def test_lanes_that_stay_in_registers_give_the_same_results(interpreted):
+    """Lanes are stepped, reviewed and given their second tries block by block."""
+    cells = draw(600, [EASY, DECLINES, HARD])
     found = in_registers(PROGRAM, cells)
-    assert sorted(blocks) == [1, 1, 8]  # a kernel of both tries for a batch, and one of steps for all
+    assert sorted(interpreted) == [1, 1, 8]  # a kernel of both tries for a batch, and one of steps for all
     assert np.array_equal(found, [plain(row) for row in cells])
     # Second tries are what serves the others: a careful one would be seen.
     spoiled = PROGRAM.service._replace(careful=lambda toy: Answer(-toy.hash, jnp.ones_like(toy.done)))
     program, cells = PROGRAM._replace(service=spoiled), draw(600, [EASY, DECLINES])
     assert np.array_equal(in_registers(program, cells), [plain(row) for row in cells])
     assert np.array_equal(in_registers(PROGRAM._replace(service=None, step=moves_on), cells), list(map(easily, cells)))
+
+
+@pytest.mark.parametrize("number", [32, 128, 160, 100])
+def test_a_batch_of_lanes_in_registers_is_of_whole_blocks(interpreted, number):
+    """Else a kernel would leave some out, who would ask for ever; 100 lanes are held by no kernel."""
+    cells = draw(200, [EASY, DECLINES, HARD])
+    assert np.array_equal(in_registers(PROGRAM, cells, number), [plain(row) for row in cells])
+    assert sorted(interpreted) == ([] if number == 100 else [1, 1, number // 32])
+
+
+def test_chains_stay_in_registers_too(interpreted):
+    links = draw_chains(64, 4)
+    found = jax.jit(partial(lanes.chain, PROGRAM, succeed, outputs=OUTPUTS))(
+        jnp.asarray(links), count=jnp.int32(64), length=jnp.int32(4)
+    )
+    assert sorted(interpreted) == [1, 1, 2]
+    assert np.array_equal(found, [plain_chain(rows) for rows in links])
 
 
 def moves_on(toy):
@@ -216,9 +239,10 @@ def test_chains_are_the_same_on_an_accelerator(monkeypatch, number):
 
 def test_a_lane_that_an_answer_stopped_is_reviewed_although_none_of_its_block_goes_on():
     """Else it would stay where it is for ever: a GPU did not come back from a plane on which gravity holds the ball."""
-    toy = load(jnp.asarray(of_kind(EASY, np.full(8, 5.0))))._replace(left=jnp.zeros(8))
+    count = registers.LANES
+    toy = load(jnp.asarray(of_kind(EASY, np.full(count, 5.0))))._replace(left=jnp.zeros(count))
     laid = registers.layout(toy, PROGRAM.fixed)
-    at = lane_rounds.AtWork(jnp.arange(8, dtype=jnp.int32), registers.pack(laid, toy))
+    at = lane_rounds.AtWork(jnp.arange(count, dtype=jnp.int32), registers.pack(laid, toy))
     found = registers.unpack(laid, held_lanes._held_steps(PROGRAM, laid, at))
     assert found.done.all()
 

@@ -196,6 +196,12 @@ def test_blocks_without_a_real_lane_are_left_alone(real):
     np.testing.assert_array_equal(found["same"], np.repeat([7.0, 7.0, 0.0], LANES))
 
 
+def test_lanes_that_are_no_whole_blocks_are_refused():
+    laid, tables = laid_out(pairs(LANES + 1), "x", "least")
+    with pytest.raises(ValueError, match=r"whole blocks of 32 lanes; got 33"):
+        stay(sums_up, laid, numbers(LANES + 1), tables)
+
+
 def test_elsewhere_each_lane_is_done_as_it_stands():
     given = pairs(COUNT)
     laid, tables = laid_out(given, "x", "least")

@@ -43,6 +43,11 @@ def width_of(cells: int) -> int:
     return registers.whole_blocks(max(min(cells // 8, 131_072), min(cells, 8_192)), _SHARE)
 
 
+def served(lanes: int) -> int:
+    """Choose how many lanes are served together, and are enough for a refill: whole blocks, where there are so many."""
+    return min(registers.whole_blocks(-(-lanes // _SHARE), 1), lanes)
+
+
 class Left(NamedTuple):
     """Cells that were not flown to their end: which (-1: none), and all that their lanes know of them, as rows."""
 
@@ -178,7 +183,7 @@ def run_most(
 
 def _asked(program: Program, cells: Float[Array, "cell in"], real: Int[Array, ""], lanes: int, few: int) -> _Mission:
     held = hold(program, cells.shape[1], cells.dtype, lanes)
-    return _Mission(program, held, cells, real, max(lanes // _SHARE, 1), few)
+    return _Mission(program, held, cells, real, served(lanes), few)
 
 
 def _run(asked: _Mission, outputs: int, lanes: int) -> _UnderWay:

@@ -55,6 +55,8 @@ def table_rows(cells: int, variants: int) -> int:
 
 def _served(lanes: int) -> int:
     """Choose how many lanes are served or refilled together."""
+    if not on_cpu():
+        return accelerator_lanes.served(lanes)
     return min(max(lanes // _SHARE, _FEWEST), lanes)
 
 

@@ -110,7 +110,12 @@ def stay(
         tables: What it is done on.
         real: How many lanes count, the first ones, if not all; what becomes of the others may be anything.
         interpret: Whether to run the kernel here whatever this machine is, operation by operation: for tests.
+
+    Raises:
+        ValueError: Lanes are no whole blocks: a kernel would leave out what is left of them.
     """
+    if number.size % LANES:
+        raise ValueError(f"number must be of whole blocks of {LANES} lanes; got {number.size}; whole_blocks rounds up")
     kernel = partial(_in_one_kernel, work, laid, interpret=interpret)
 
     def as_it_stands(number: Any, tables: Tables, real: Any) -> Tables:
