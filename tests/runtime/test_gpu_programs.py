@@ -8,7 +8,7 @@ from jax import export
 import vijax
 from tests.helpers import cases
 from tests.runtime.test_programs import CALLS, known  # noqa: F401  a fixture
-from vijax.batch import lanes, simulate, stragglers
+from vijax.batch import lanes, stragglers
 from vijax.batch.cell import Plan
 from vijax.planes import tile_size
 from vijax.runtime import export_cache, xla
@@ -81,7 +81,7 @@ def test_the_program_that_leaves_its_last_cells_is_lowered_for_a_gpu(known, call
     CALLS["sweep"](0, known)
     on_gpu()
     (shapes,) = (shapes for (name, _), (_, shapes) in called.items() if "tile" in name)
-    text = check_lowered(simulate._compiled_most(Plan(deep=True, energies=True), 256, 16), shapes)
+    text = check_lowered(stragglers._compiled_most(Plan(deep=True, energies=True), 256, 16), shapes)
     assert "__gpu$xla.gpu.triton" in text  # lanes stay in registers
 
 
@@ -118,7 +118,7 @@ def test_a_plane_as_a_gpu_has_it_comes_out_the_same(name, on_gpu, monkeypatch):
     monkeypatch.setattr(stragglers, "_EACH", 4)
     found = vijax.sweep(**asked)
     stragglers._compiled.cache_clear()
-    simulate._compiled_most.cache_clear()
+    stragglers._compiled_most.cache_clear()
     settled = plain.period.values > 0
     assert settled.mean() > 0.3
     np.testing.assert_array_equal(found.period.values[settled], plain.period.values[settled])

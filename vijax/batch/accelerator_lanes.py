@@ -188,11 +188,9 @@ def _asked(program: Program, cells: Float[Array, "cell in"], real: Int[Array, ""
 
 def _run(asked: _Mission, outputs: int, lanes: int) -> _UnderWay:
     """Run cells until none waits and no more than few are on their way."""
-    some = jax.ShapeDtypeStruct((lanes, asked.cells.shape[1]), asked.cells.dtype)
-    fresh = jax.eval_shape(asked.held.load, some)
     zero, kind = jnp.asarray(0, jnp.int32), asked.cells.dtype
     start = _UnderWay(
-        AtWork(jnp.full(lanes, -1, jnp.int32), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), fresh)),
+        AtWork(jnp.full(lanes, -1, jnp.int32), asked.held.blank()),
         Counted(*[zero] * len(Counted._fields)),
         waiting=zero,
         results=jnp.zeros((asked.cells.shape[0], outputs), kind),
@@ -201,43 +199,43 @@ def _run(asked: _Mission, outputs: int, lanes: int) -> _UnderWay:
     return lax.while_loop(partial(_goes_on, asked), partial(_refilled_and_moved, asked), start)
 
 
-def _refilled_and_moved(asked: _Mission, queue: _UnderWay) -> _UnderWay:
-    before = queue.counted.flying - jnp.minimum(queue.waiting, asked.real)
-    queue = _if(_refill_due(asked, queue), partial(_refilled, asked), queue)
-    at = queue.at._replace(carry=run_round(asked.program, asked.held, asked.width, queue.at, queue.counted))
+def _refilled_and_moved(asked: _Mission, state: _UnderWay) -> _UnderWay:
+    before = state.counted.flying - jnp.minimum(state.waiting, asked.real)
+    state = _if(_refill_due(asked, state), partial(_refilled, asked), state)
+    at = state.at._replace(carry=run_round(asked.program, asked.held, asked.width, state.at, state.counted))
     counted = count(asked.program, asked.held, at)
-    ended = before + jnp.minimum(queue.waiting, asked.real) - counted.flying
-    pace = queue.pace + (ended.astype(queue.pace.dtype) - queue.pace) / _ROUNDS
-    return queue._replace(at=at, counted=counted, pace=pace)
+    ended = before + jnp.minimum(state.waiting, asked.real) - counted.flying
+    pace = state.pace + (ended.astype(state.pace.dtype) - state.pace) / _ROUNDS
+    return state._replace(at=at, counted=counted, pace=pace)
 
 
-def _many(asked: _Mission, queue: _UnderWay) -> Bool[Array, ""]:
+def _many(asked: _Mission, state: _UnderWay) -> Bool[Array, ""]:
     """Say whether too many cells fly to be left, or end too quickly for that."""
-    flying = queue.counted.flying
+    flying = state.counted.flying
     if not asked.few:
         return flying > 0
-    return (flying > asked.few) | (queue.pace > max(asked.few * _SHARE_OF_A_ROUND, 1.0))
+    return (flying > asked.few) | (state.pace > max(asked.few * _SHARE_OF_A_ROUND, 1.0))
 
 
-def _goes_on(asked: _Mission, queue: _UnderWay) -> Bool[Array, ""]:
+def _goes_on(asked: _Mission, state: _UnderWay) -> Bool[Array, ""]:
     # Of those that are left hardly one is done: to write it down would take a round.
-    flying, done = queue.counted.flying, queue.counted.done
+    flying, done = state.counted.flying, state.counted.done
     crowded = (flying + done > asked.few) | (done > asked.few // 16)
-    return (queue.waiting < asked.real) | _many(asked, queue) | crowded
+    return (state.waiting < asked.real) | _many(asked, state) | crowded
 
 
-def _refill_due(asked: _Mission, queue: _UnderWay) -> Bool[Array, ""]:
+def _refill_due(asked: _Mission, state: _UnderWay) -> Bool[Array, ""]:
     """Say whether a refill is worth its price: for several lanes, or in the end."""
-    flying, done = queue.counted.flying, queue.counted.done
-    free = queue.at.cell.size - flying
+    flying, done = state.counted.flying, state.counted.done
+    free = state.at.cell.size - flying
     return jnp.where(
-        queue.waiting < asked.real, free >= asked.width, (done >= asked.width) | ((done > 0) & ~_many(asked, queue))
+        state.waiting < asked.real, free >= asked.width, (done >= asked.width) | ((done > 0) & ~_many(asked, state))
     )
 
 
-def _refilled(asked: _Mission, queue: _UnderWay) -> _UnderWay:
+def _refilled(asked: _Mission, state: _UnderWay) -> _UnderWay:
     """Write down cells that are done, and load waiting ones: a batch of lanes."""
-    at, waiting, size = queue.at, queue.waiting, asked.cells.shape[0]
+    at, waiting, size = state.at, state.waiting, asked.cells.shape[0]
     free = jnp.where(at.cell >= 0, asked.program.done(asked.held.record(at.carry)), waiting < asked.real)
     most = min(_REFILLED * asked.width, at.cell.size)
     batch, order = batch_of(free, most), jnp.arange(most, dtype=jnp.int32)
@@ -246,8 +244,8 @@ def _refilled(asked: _Mission, queue: _UnderWay) -> _UnderWay:
     found = asked.program.unload(asked.held.record(take(at.carry, batch.members)))
     new = waiting + order
     fresh = AtWork(jnp.where(new < asked.real, new, -1), asked.held.load(asked.cells[jnp.minimum(new, size - 1)]))
-    return queue._replace(
+    return state._replace(
         at=asked.held.put(at, fresh, batch),
         waiting=waiting + batch.real,
-        results=queue.results.at[ended].set(found, mode="drop"),
+        results=state.results.at[ended].set(found, mode="drop"),
     )

@@ -27,6 +27,7 @@ class Hold(NamedTuple):
     """How lanes are held, and what is done to them as they are.
 
     Attributes:
+        blank: Lanes that hold zeros.
         load: Rows of the cell table -> lanes.
         record: Lanes -> the record that a program knows them by.
         steps: Lanes at work -> lanes after up to so many steps, reviewed.
@@ -34,6 +35,7 @@ class Hold(NamedTuple):
         put: Lanes, others, a batch of the former -> lanes, the batch replaced by the others.
     """
 
+    blank: Callable[[], Any]
     load: Callable[[Float[Array, "row in"]], Any]
     record: Callable[[Any], Carry]
     steps: Callable[[AtWork], Any]
@@ -51,8 +53,13 @@ def hold(program: Program, columns: int, kind: Any, lanes: int) -> Hold:
         lanes: How many there are.
     """
     like = jax.eval_shape(program.load, jax.ShapeDtypeStruct((lanes, columns), kind))
+
+    def zeros() -> Carry:
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+
     if not (program.numbers and registers.used() and registers.fit(like, lanes)):
         return Hold(
+            blank=zeros,
             load=program.load,
             record=lambda lanes: lanes,
             steps=partial(_steps, program),
@@ -61,6 +68,7 @@ def hold(program: Program, columns: int, kind: Any, lanes: int) -> Hold:
         )
     laid = registers.layout(like, program.fixed)
     return Hold(
+        blank=lambda: registers.pack(laid, zeros()),
         load=lambda rows: registers.pack(laid, program.load(rows)),
         record=partial(registers.unpack, laid),
         steps=partial(_held_steps, program, laid),

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from vijax.batch import accelerator_lanes, chain, lanes, rows, stragglers
+from vijax.batch import chain, lanes, rows, stragglers
 from vijax.batch.cell import TRANSIENT_SHARE, Cell, Entry, Lane, Plan, Settings, walls_of
 from vijax.batch.cell_program import entry_shapes, program
 from vijax.batch.recurrence import MAX_PERIOD, recurrence, settled
@@ -21,7 +21,7 @@ from vijax.engine.method import Method
 from vijax.model.device import Harvester, check_device, electrical
 from vijax.model.membrane import one_of
 from vijax.model.pair import ImpactPair, check_pair
-from vijax.runtime import checks, context, export_cache
+from vijax.runtime import checks, export_cache
 from vijax.runtime.arrays import AnyArray, present
 from vijax.runtime.context import door
 
@@ -52,18 +52,6 @@ def compiled(plan: Plan, width: int) -> export_cache.TracedProgram:
         return lanes.run(program(plan, settings), cells, count, outputs, width)
 
     return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width}")
-
-
-@lru_cache(maxsize=32)
-def _compiled_most(plan: Plan, width: int, few: int) -> export_cache.TracedProgram:
-    """Compile the program of a plan that ends when so few cells are left (see `stragglers`), with columns as rows."""
-
-    def tile(cells, count, settings):
-        outputs = rows.width(shapes(plan, cells.dtype))
-        results, left = accelerator_lanes.run_most(program(plan, settings), cells, count, outputs, width, few)
-        return results.T, left
-
-    return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width} {few}")
 
 
 def tolerances(dtype: str) -> dict[str, float]:
@@ -181,37 +169,7 @@ def _run(plan: Plan, entry: Entry, settings: Settings, real: int, size: int, on:
     if not few:
         table = np.asarray(compiled(plan, width)(cells, count, settings))
         return rows.unpack(table[:real], like)
-    return _run_with_stragglers(plan, (cells, count, settings), real, few)
-
-
-def _run_with_stragglers(plan: Plan, given: Any, real: int, few: int) -> Summary:
-    """Do what `_run` does on an accelerator, whose last cells the cores beside it fly."""
-    cells, count, settings = given
-    like = shapes(plan, cells.dtype)
-    with context.pool(2) as beside:
-        ready = beside.submit(stragglers.prepare, plan, settings)  # compiled while the other program is
-        memory = beside.submit(_written_to, (rows.width(like), cells.shape[0] if real else 0), cells.dtype)
-        columns, left = _compiled_most(plan, lanes.width_of(cells.shape[0]), few)(cells, count, settings)
-        ready.result()
-        table = memory.result()
-        if not real:
-            return rows.unpack(table.T, like)
-        cell, lane = np.asarray(left.cell), np.asarray(left.lanes)
-        there = cell >= 0
-        last = beside.submit(stragglers.finish, plan, settings, lane[there])
-        table[...] = columns  # copied from the accelerator while the cores fly
-        found = rows.unpack(table.T[:real], like)
-        rest = rows.unpack(last.result(), like)
-    for field, values in zip(jax.tree.leaves(found), jax.tree.leaves(rest), strict=True):
-        field[cell[there]] = values
-    return found
-
-
-def _written_to(shape: tuple[int, ...], kind: Any) -> np.ndarray:
-    """Give an array that the system has given memory: when it is first written to, while an accelerator works."""
-    table = np.empty(shape, kind)
-    table.fill(0)
-    return table
+    return stragglers.run(plan, (cells, count, settings), real, few)
 
 
 def blank(count: int, variants: int, dtype: str) -> Summary:

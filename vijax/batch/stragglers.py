@@ -3,6 +3,7 @@
 A step of one lane takes an accelerator nearly as long as that of eight thousand, and some cells of every map have
 thousands of impacts to go, or ask again and again for a step with loops in it: it would work on them for many times as
 long as on all others together. Cores are quick with few cells, and nothing that is known of one gets lost on the way.
+Begin with `run`.
 """
 
 from functools import lru_cache, partial
@@ -13,7 +14,7 @@ import numpy as np
 
 from vijax.batch import accelerator_lanes, cell_program, lanes, rows
 from vijax.batch.cell import Plan, Settings
-from vijax.batch.summary import shapes
+from vijax.batch.summary import Summary, shapes
 from vijax.model.device import Harvester, electrical
 from vijax.runtime import context, export_cache, tiles, xla
 
@@ -30,6 +31,57 @@ def most() -> int:
         return 0
     with jax.default_device(core):
         return _EACH * tiles.workers()
+
+
+@lru_cache(maxsize=32)
+def _compiled_most(plan: Plan, width: int, few: int) -> export_cache.TracedProgram:
+    """Compile the program of a plan that ends when so few cells are left for the cores, with columns as rows."""
+
+    def tile(cells, count, settings):
+        outputs = rows.width(shapes(plan, cells.dtype))
+        results, left = accelerator_lanes.run_most(
+            cell_program.program(plan, settings), cells, count, outputs, width, few
+        )
+        return results.T, left
+
+    return export_cache.TracedProgram(tile, f"{tile.__qualname__} {plan} {width} {few}")
+
+
+def run(plan: Plan, given: Any, real: int, few: int) -> Summary:
+    """Run a tile on an accelerator, whose last cells the cores beside it fly.
+
+    Args:
+        plan: What is asked for.
+        given: Rows of the cell table, how many are real, and the settings, as compiled calls are given them.
+        real: How many are real; with 0 all that is needed is compiled.
+        few: How many cells the cores take over at most: `most`.
+    """
+    cells, count, settings = given
+    like = shapes(plan, cells.dtype)
+    with context.pool(2) as beside:
+        ready = beside.submit(prepare, plan, settings)  # compiled while the other program is
+        memory = beside.submit(_written_to, (rows.width(like), cells.shape[0] if real else 0), cells.dtype)
+        columns, left = _compiled_most(plan, lanes.width_of(cells.shape[0]), few)(cells, count, settings)
+        ready.result()
+        table = memory.result()
+        if not real:
+            return rows.unpack(table.T, like)
+        cell, lane = np.asarray(left.cell), np.asarray(left.lanes)
+        there = cell >= 0
+        last = beside.submit(finish, plan, settings, lane[there])
+        table[...] = columns  # copied from the accelerator while the cores fly
+        found = rows.unpack(table.T[:real], like)
+        rest = rows.unpack(last.result(), like)
+    for field, values in zip(jax.tree.leaves(found), jax.tree.leaves(rest), strict=True):
+        field[cell[there]] = values
+    return found
+
+
+def _written_to(shape: tuple[int, ...], kind: Any) -> np.ndarray:
+    """Give an array that the system has given memory: when it is first written to, while an accelerator works."""
+    table = np.empty(shape, kind)
+    table.fill(0)
+    return table
 
 
 def _core() -> jax.Device | None:

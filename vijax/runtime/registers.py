@@ -153,7 +153,7 @@ def _in_one_kernel(
         consts, written = refs[ends[0] + (real is not None) : ends[1]], refs[ends[1] :]
 
         def on_a_block() -> None:
-            some = Tables(*_parted([ref[...] for ref in held], len(tables.changing)))
+            some = jax.tree.unflatten(jax.tree.structure(tables), [ref[...] for ref in held])
             leaves = jax.tree.leaves(unpack(laid, some))
             found = jax.core.eval_jaxpr(traced.jaxpr, [ref[...] for ref in consts], number[...], *leaves)
             record = jax.tree.unflatten(jax.tree.structure(laid.like), found)
@@ -201,10 +201,6 @@ def _by_blocks(
         interpret=interpret,
     )(*given, *read)
     return tuple(found)
-
-
-def _parted(values: list[Any], first: int) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    return tuple(values[:first]), tuple(values[first:])
 
 
 # --- columns ---------------------------------------------------------------------------------------------------------
