@@ -1,17 +1,21 @@
-"""Chunks of a store are, byte for byte, those that zarr would have written."""
+"""Chunks and metadata of a store are, byte for byte, those that zarr would have written."""
 
 import tempfile
+import warnings
 from pathlib import Path
 
+import numpy as np
+import xarray as xr
 import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from vijax.planes.store import compressors, encoded
+from vijax.planes.store import array, compressors, encoded, write_blank
+from vijax.planes.store_metadata import void
 
 KINDS = st.sampled_from(["<f8", "<f4", "<i4", "|i1", "|b1"])
-SHAPES = arrays.array_shapes(max_dims=3, max_side=9)
+SHAPES = arrays.array_shapes(min_dims=0, max_dims=3, max_side=9)
 
 
 @given(chunk=arrays.arrays(KINDS, SHAPES), turned=st.booleans())
@@ -20,5 +24,35 @@ def test_an_encoded_chunk_is_zarrs_own(chunk, turned):
     with tempfile.TemporaryDirectory() as folder:
         array = zarr.create_array(folder, data=chunk, chunks=chunk.shape, compressors=compressors(), fill_value=None)
         array.with_config({"write_empty_chunks": True})[...] = chunk
-        (written,) = (path for path in Path(folder, "c").rglob("*") if path.is_file())
+        (written,) = (path for path in Path(folder).rglob("*") if path.is_file() and path.name != "zarr.json")
         assert encoded(chunk) == written.read_bytes()
+
+
+@given(kinds=st.lists(KINDS, max_size=3), shape=SHAPES, parts=st.integers(1, 3))
+def test_metadata_are_zarrs_own(kinds, shape, parts):
+    dims, chunks = [f"x{at}" for at in range(len(shape))], tuple(-(-side // parts) for side in shape)
+    told = {"title": "a map", "harvester_r": 0.5}
+    variables = {f"v{at}": xr.Variable(dims, np.zeros(shape, kind), {"units": "1"}) for at, kind in enumerate(kinds)}
+    voids = {name: void(name, variable.dtype) for name, variable in variables.items()}
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # consolidated metadata are no part of the format yet
+        ours, theirs = Path(folder, "ours"), Path(folder, "theirs")
+        write_blank(ours, told, {name: array(each, shape, chunks, voids[name]) for name, each in variables.items()})
+        group = zarr.create_group(theirs, attributes=told)
+        for name, each in variables.items():
+            group.create_array(
+                name,
+                shape=shape,
+                chunks=chunks,
+                dtype=each.dtype,
+                fill_value=voids[name],
+                compressors=compressors(),
+                dimension_names=dims,
+                attributes=each.attrs,
+            )
+        zarr.consolidate_metadata(theirs)
+        assert written(ours) == written(theirs)
+
+
+def written(store: Path) -> dict[str, bytes]:
+    return {path.relative_to(store).as_posix(): path.read_bytes() for path in store.rglob("*") if path.is_file()}

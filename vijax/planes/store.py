@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
     import xarray as xr
+    from zarr.core.metadata import ArrayV3Metadata
 
 # Level of zstd. Level 3 takes twice as long and saves a thousandth more.
 _LEVEL = 1
@@ -84,27 +85,66 @@ def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) ->
     target = check_store("path", path, checks.flag("overwrite", overwrite))
     with replacing_folder(target) as part:
         write(dataset, part)
-        seal(part)
+        inventory.write(part)
 
 
 def write(dataset: "xr.Dataset", path: Path) -> None:
-    """Write a new store, which others may add to before it is sealed."""
+    """Write a new store, all its metadata in its first file, too, so that it opens at once anywhere."""
     encoding = {name: {"compressors": compressors()} for name in dataset.variables}
-    dataset.to_zarr(path, mode="w-", zarr_format=3, consolidated=False, encoding=encoding)
-
-
-def seal(path: Path, **facts: Any) -> None:
-    """Consolidate the metadata of a new store, so that it opens at once anywhere, and list its files; see `inventory`.
-
-    The metadata of a study do not change with its tiles: they are consolidated before there is any.
-    """
-    import zarr
-
     with warnings.catch_warnings():
         # A reader that does not know of them finds the same in every array.
         warnings.filterwarnings("ignore", "Consolidated metadata", UserWarning)
-        zarr.consolidate_metadata(path)
-    inventory.write(path, **facts)
+        dataset.to_zarr(path, mode="w-", zarr_format=3, consolidated=True, encoding=encoding)
+
+
+def write_blank(path: Path, attributes: Mapping[str, Any], arrays: "Mapping[str, ArrayV3Metadata]") -> None:
+    """Write a new store without a chunk, as `write` does.
+
+    The metadata are zarr's own; only that they are written at once is not: an array after another takes it two
+    milliseconds each, in all as long as a thousand cells.
+    """
+    from zarr.buffer import default_buffer_prototype
+    from zarr.core.group import ConsolidatedMetadata, GroupMetadata
+
+    group = GroupMetadata(attributes=dict(attributes), consolidated_metadata=ConsolidatedMetadata(dict(arrays)))
+    metadata: dict[str, GroupMetadata | ArrayV3Metadata] = {"": group, **arrays}
+    for folder, described in metadata.items():
+        (path / folder).mkdir()
+        for name, content in described.to_buffer_dict(default_buffer_prototype()).items():
+            (path / folder / name).write_bytes(content.to_bytes())
+
+
+def array(variable: "xr.Variable", shape: tuple[int, ...], chunks: tuple[int, ...], void: Any) -> "ArrayV3Metadata":
+    """Describe an array of a store, with dimensions, numbers and attributes of a variable.
+
+    Args:
+        variable: What it is like.
+        shape: Of the array.
+        chunks: Lengths of its chunks.
+        void: What it holds where there is no chunk.
+    """
+    from zarr.core.metadata import ArrayV3Metadata
+
+    codecs = [{"name": "bytes", "configuration": {"endian": "little"}}, *(codec.to_dict() for codec in compressors())]
+    return ArrayV3Metadata.from_dict(
+        {
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": shape,
+            "data_type": variable.dtype.name,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunks}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "fill_value": "NaN" if void != void else void,
+            "codecs": codecs,
+            "attributes": variable.attrs,
+            "dimension_names": [str(dim) for dim in variable.dims] or None,
+        }
+    )
+
+
+def chunk(path: Path, name: str, place: Iterable[int]) -> Path:
+    """Name the file of a chunk of an array, by its number along every dimension."""
+    return path.joinpath(name, "c", *map(str, place))
 
 
 def compressors() -> tuple[Any, ...]:

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vijax.model.records import Status
-from vijax.planes import inventory
+from vijax.planes import inventory, store
 from vijax.planes.dataset import SweepPlan, asked, coordinates, provenance, specimen
-from vijax.planes.store import compressors, seal, view
-from vijax.planes.store import write as write_store
 from vijax.runtime.files import replacing
 from vijax.runtime.pages import see
 
@@ -26,7 +24,7 @@ _SHOWN = 3  # Settings that differ which an error names; of others it says how m
 
 
 def write(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path) -> None:
-    """Write the store of a plan, every variable void.
+    """Write the store of a plan, every variable void: its metadata do not change with its tiles.
 
     Args:
         planned: What it will hold.
@@ -34,24 +32,20 @@ def write(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path) -
         birth: Of the store: no other has the same.
         path: Folder to make.
     """
-    import xarray as xr
-    import zarr
-
-    of = planned.cells
-    write_store(xr.Dataset(coords=coordinates(of), attrs=provenance(planned)), path)
-    group = zarr.open_group(path, mode="r+")
+    sizes, axes = planned.cells.sizes, coordinates(planned.cells)
+    arrays = {name: store.array(axis, axis.shape, axis.shape, np.nan) for name, axis in axes.items()}
     for name, variable in specimen(planned).data_vars.items():
-        group.create_array(
-            str(name),
-            shape=tuple(of.sizes[str(dim)] for dim in variable.dims),
-            chunks=tuple(tile.get(str(dim), of.sizes[str(dim)]) for dim in variable.dims),
-            dtype=variable.dtype,
-            fill_value=void(str(name), variable.dtype),
-            compressors=compressors(),
-            dimension_names=[str(dim) for dim in variable.dims],
-            attributes=variable.attrs,
-        )
-    seal(path, birth=birth, tile=dict(tile))
+        shape = tuple(sizes[str(dim)] for dim in variable.dims)
+        chunks = tuple({**sizes, **tile}[str(dim)] for dim in variable.dims)
+        arrays[str(name)] = store.array(variable.variable, shape, chunks, void(str(name), variable.dtype))
+    # Arrays named as their only dimension pass for coordinates; by this xarray knows the others, as CF has it.
+    others = " ".join(sorted(name for name, axis in axes.items() if axis.dims != (name,)))
+    store.write_blank(path, provenance(planned) | {"coordinates": others}, arrays)
+    for name, axis in axes.items():
+        file = store.chunk(path, name, [0] * axis.ndim)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(store.encoded(axis.values))
+    inventory.write(path, birth=birth, tile=dict(tile))
 
 
 def void(name: str, dtype: np.dtype) -> Any:
@@ -140,8 +134,8 @@ def _put(name: str, reason: str, content: bytes, path: Path, say: Callable[[str]
 
 def check_same(planned: SweepPlan, path: Path) -> None:
     """Raise FileExistsError unless a store holds the plane of a plan, or part of it."""
-    with view(path) as store:
-        found = list(_differences(planned, store))
+    with store.view(path) as written:
+        found = list(_differences(planned, written))
     if found:
         more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         raise FileExistsError(
@@ -153,19 +147,19 @@ def check_same(planned: SweepPlan, path: Path) -> None:
         )
 
 
-def _differences(planned: SweepPlan, store: "xr.Dataset") -> Iterator[str]:
+def _differences(planned: SweepPlan, written: "xr.Dataset") -> Iterator[str]:
     """Find what was asked otherwise than the store has it, a phrase each."""
     told = json.loads(json.dumps(asked(planned)))
     for name in dict.fromkeys([*told, *_OFTEN_LEFT_OUT]):
-        here, there = told.get(name, "left out"), store.attrs.get(name, "left out")
+        here, there = told.get(name, "left out"), written.attrs.get(name, "left out")
         if here != there:
             yield f"{name} is {there}, and not {here}"
     axes = coordinates(planned.cells)
-    for name in dict.fromkeys([*axes, *map(str, store.coords)]):
-        here, there = axes.get(name), store.coords.get(name)
+    for name in dict.fromkeys([*axes, *map(str, written.coords)]):
+        here, there = axes.get(name), written.coords.get(name)
         if here is None or there is None or here.dims != there.dims or not _equal(here.values, there.values):
             yield f"{name} is {_words(there)}, and not {_words(here)}"
-    yield from (f"{name} is left out" for name in planned.outputs if name not in store)
+    yield from (f"{name} is left out" for name in planned.outputs if name not in written)
 
 
 def _equal(one: np.ndarray, other: np.ndarray) -> bool:

@@ -22,7 +22,7 @@ import numpy as np
 from vijax.planes import inventory, store_metadata, tile_size
 from vijax.planes.cells import Cells
 from vijax.planes.dataset import SweepPlan, made_by
-from vijax.planes.store import check_place, check_store, encoded, view
+from vijax.planes.store import check_place, check_store, chunk, encoded
 from vijax.runtime.files import beside, replacing, replacing_folder, write_json
 from vijax.runtime.pages import see
 from vijax.runtime.tiles import places
@@ -228,9 +228,9 @@ def _most(of: Cells) -> int:
 
 def _found(planned: SweepPlan, path: Path) -> Study:
     """Describe the study that a store is, its tiles as long as they were when it was made."""
-    with view(path) as store:
-        dims = {name: tuple(map(str, store[name].dims)) for name in planned.outputs}
-        chunks = store["status"].encoding["chunks"]
+    arrays = {name: inventory.content(path / name / "zarr.json") or {} for name in planned.outputs}
+    dims = {name: tuple(array.get("dimension_names", ())) for name, array in arrays.items()}
+    chunks = arrays["status"]["chunk_grid"]["configuration"]["chunk_shape"]
     return Study(path, planned, dims, dict(zip(planned.cells.dynamic, chunks, strict=True)), _birth(path))
 
 
@@ -315,7 +315,7 @@ def _damage(study: Study, tile: int) -> str:
 def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, int]) -> Iterator[tuple[str, Path]]:
     """Name the chunk of every variable of a tile."""
     for name, along in dims.items():
-        yield name, path.joinpath(name, "c", *(str(place.get(dim, 0)) for dim in along))
+        yield name, chunk(path, name, (place.get(dim, 0) for dim in along))
 
 
 def write(tile: StudyTile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
