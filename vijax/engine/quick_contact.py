@@ -1,6 +1,5 @@
 """The quick contact: one membrane contact in straight-line arithmetic, certified or declined."""
 
-import math
 from dataclasses import replace
 
 import equinox as eqx
@@ -11,9 +10,11 @@ from vijax.engine.impact import Lane
 from vijax.engine.quick_course import (
     ContactCourse,
     ContactEntry,
+    Reference,
     at_reference,
     course_at,
     entry_of,
+    further,
     in_reach,
     motion,
 )
@@ -21,19 +22,10 @@ from vijax.engine.quick_crest import deepest, rough_crest
 from vijax.engine.quick_flight import Flight
 from vijax.engine.quick_hold import prolonged
 from vijax.engine.quick_wall import SoftWall
-from vijax.engine.roots import converged_step, householder, single
-from vijax.model.flow import PI, horner
+from vijax.engine.roots import converged_step, converges, correction, householder, single, taylor
+from vijax.model.flow import PI
 from vijax.runtime.arrays import choose, present
 from vijax.runtime.xla import share, shared
-
-# Rounds in single precision towards the exit, after the first step from the reference. With fewer, the step in double
-# precision that follows is too long more often, and the lane is declined: it costs time and no digits.
-_ROUNDS = 2
-
-
-def _taylor(derivatives: tuple[Lane, ...], order: int, s: Lane) -> Lane:
-    """Sum derivatives[k] s^k/(k + order)!."""
-    return horner(tuple(d * (1 / math.factorial(k + order)) for k, d in enumerate(derivatives)), s)
 
 
 class Exit(eqx.Module):
@@ -56,23 +48,24 @@ class _Guess(eqx.Module):
 
 @shared
 def _guess(wall: SoftWall, entry: ContactEntry) -> _Guess:
-    """Guess from the cubic Taylor polynomial at the onset, and a Newton step on that of degree six."""
+    """Guess from the cubic Taylor polynomial at the onset; with gravity a Newton step on that of degree six follows."""
     speed, square = entry.speed, wall.kappa * wall.kappa
     push = entry.force - 2 * wall.zeta * speed
     jerk = -PI * entry.force_sin - 2 * wall.zeta * push - square * speed
     bend = 0.25 * push * push - (2 / 3) * jerk * speed
     hop = 2 * speed / (jnp.sqrt(jnp.maximum(bend, 0.0)) - 0.5 * push)
     short = (bend > 0) & (hop > 0) & (hop < wall.hop)
+    rise = 2 * speed / (jnp.sqrt(jnp.maximum(push * push - 2 * jerk * speed, 0.0)) - push)
+    if entry.pressure is None:
+        return _Guess(short, hop, rise)
     snap = -(PI**2) * entry.force_cos - 2 * wall.zeta * jerk - square * push
     fifth = PI**3 * entry.force_sin - 2 * wall.zeta * snap - square * jerk
     sixth = PI**4 * entry.force_cos - 2 * wall.zeta * fifth - square * snap
     derivatives = (speed, push, jerk, snap, fifth, sixth)
-    value = _taylor(derivatives, 1, hop) * hop
-    slope = _taylor(derivatives, 0, hop)
+    value = taylor(derivatives, 1, hop) * hop
+    slope = taylor(derivatives, 0, hop)
     hop = jnp.where(slope < 0, hop - value / slope, hop)
-    rise = 2 * speed / (jnp.sqrt(jnp.maximum(push * push - 2 * jerk * speed, 0.0)) - push)
-    rise = rise - _taylor(derivatives, 0, rise) / _taylor(derivatives[1:], 0, rise)
-    return _Guess(short, hop, rise)
+    return _Guess(short, hop, rise + correction(rise, derivatives))
 
 
 @shared
@@ -91,30 +84,30 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     entry = entry_of(wall, flight)
     rough, begun = single((replace(wall, incline=None), entry))
     guess = _guess(rough, begun)
-    middle = course_at(entry, wall.cos_middle, wall.sin_middle, (entry.free_sin, -entry.free_cos), wall.root_r)
-    far = course_at(entry, wall.cos_span, wall.sin_span, (-entry.free_cos, -entry.free_sin), wall.r)
-    course = share(choose(guess.short, middle, far))
-    reference = jnp.where(guess.short, 0.5 * wall.span, wall.span)
-    held = None if wall.ebb is None else prolonged(wall, entry, (rough, begun), begins)
-    if held is not None:
-        long = held.lasting.long
-        course = share(choose(long, held.course, course))
-        reference = jnp.where(long, held.reference, reference)
-        guess = replace(guess, short=guess.short & ~long)
+    none = jnp.zeros_like(wall.span)
+    middle = Reference(0.5 * wall.span, wall.cos_middle, wall.sin_middle, none, none + 1, wall.root_r)
+    far = Reference(wall.span, wall.cos_span, wall.sin_span, none - 1, none, wall.r)
+    reference = choose(guess.short, middle, far)
+    lasting = None
+    if wall.ebb is not None:
+        lasting, late = prolonged(wall, entry, (rough, begun), begins)
+        reference = share(choose(lasting.long, late, reference))
+        guess = replace(guess, short=guess.short & ~lasting.long)
+    course = share(course_at(entry, reference))
     s, reached = _rough_exit(rough, begun, guess, single(course))
-    s = share(s.astype(reference.dtype))
+    s = share(s.astype(entry.speed.dtype))
     at = share(motion(wall, course, s))
     step = share(householder(entry.penetration(at), at.rate, at.push, at.jerk))
     out = -(at.rate + step * (at.push + step * (0.5 * at.jerk)))
-    duration = reference + s + step
-    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.push / at.rate))
+    duration = reference.s + s + step
     # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
-    converged = reached & (stiffness * jnp.abs(step) < converged_step(eps)) & (wall.omega1 * duration > 0.25)
-    crest = rough_crest(rough, begun, (guess.short, guess.rise), single((duration, at.drive, at.force)))
+    converged = reached & converges(step, wall.omega1, at.rate, at.push, converged_step(eps))
+    converged = converged & (wall.omega1 * duration > 0.25)
+    crest = rough_crest(rough, begun, (guess.short, guess.rise), single((duration, at.drive, at.force)), deep)
     certain = crest.first & crest.only
-    if held is not None:
-        last = held.lasting.ends(*single((duration, out)))
-        certain = jnp.where(long, last & crest.first & present(crest.highest) if deep else last, certain)
+    if lasting is not None:
+        last = lasting.ends(*single((duration, out)))
+        certain = jnp.where(lasting.long, last & crest.first & present(crest.highest) if deep else last, certain)
     depth, exact = deepest(wall, entry, crest.s) if deep else (None, jnp.ones_like(certain))
     certain = certain & exact
     sure = wall.usable & converged & (out > 0) & certain
@@ -122,12 +115,9 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     twist = turn * turn
     turn_sine, turn_cosine = turn * (1 - twist * (1 / 6)), 1 - twist * (0.5 - twist * (1 / 24))
     sine, cosine = at.sine * turn_cosine + at.cosine * turn_sine, at.cosine * turn_cosine - at.sine * turn_sine
-    short = guess.short
-    # So far they count from the course's reference, half or a whole free contact after the onset, or much later.
-    turned_sine, turned_cosine = jnp.where(short, cosine, -sine), jnp.where(short, -sine, -cosine)
-    if held is not None:
-        turned_sine = jnp.where(long, sine * held.cosine + cosine * held.sine, turned_sine)
-        turned_cosine = jnp.where(long, cosine * held.cosine - sine * held.sine, turned_cosine)
+    # So far they count from the course's reference.
+    turned_sine = sine * reference.cosine + cosine * reference.sine
+    turned_cosine = cosine * reference.cosine - sine * reference.sine
     rot = wall.zeta * step
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
     return Exit(duration, out, turned_sine, turned_cosine, decay), depth, sure
@@ -137,13 +127,20 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
 def _rough_exit(
     wall: SoftWall, entry: ContactEntry, guess: _Guess, course: ContactCourse
 ) -> tuple[Lane, Bool[Array, "lane"]]:
-    """Find the exit from the course's reference in single precision, and whether the polynomials held on the way."""
+    """Find the exit from the course's reference in single precision, and whether the polynomials held on the way.
+
+    One step from the reference, one from there. What that misses its Taylor polynomial tells, without another sine. On
+    steep ground it tells twice: of contacts that end slowly the first answer is not close enough.
+    """
     free = at_reference(wall, course)
     near = guess.hop - 0.5 * wall.span
     s = share(jnp.where(guess.short, near, householder(entry.penetration(free), free.rate, free.push, free.jerk)))
     reached = in_reach(wall, s)
-    for _ in range(_ROUNDS):
-        at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
-        s = share(s + householder(entry.penetration(at), at.rate, at.push, at.jerk))
-        reached = reached & in_reach(wall, s)
+    at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
+    derivatives = entry.penetration(at), at.rate, at.push, at.jerk, *further(wall, at)
+    step = share(householder(*derivatives[:4]))
+    for _ in range(1 if wall.ebb is None else 2):
+        step = step + correction(step, derivatives)
+    s = share(s + step)
+    reached = reached & in_reach(wall, s)
     return jnp.where(reached, s, 0.0), reached

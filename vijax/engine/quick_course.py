@@ -65,6 +65,13 @@ def _derivatives(wall: SoftWall, w, rate, force, drive, sine, cosine, decay) -> 
     return ContactState(w, rate, force, push, jerk, drive, sine, cosine, decay)
 
 
+def further(wall: SoftWall, at: ContactState) -> tuple[Lane, Lane]:
+    """Compute the fourth and the fifth derivative of w."""
+    square = wall.kappa * wall.kappa
+    snap = -(PI**2) * at.force - 2 * wall.zeta * at.jerk - square * at.push
+    return snap, -(PI**2) * at.drive - 2 * wall.zeta * snap - square * at.jerk
+
+
 def at_reference(wall: SoftWall, course: ContactCourse) -> ContactState:
     """Give the contact at the course's reference: no sine and no exponential is needed there."""
     one, zero = jnp.ones_like(course.decay), jnp.zeros_like(course.decay)
@@ -100,11 +107,6 @@ class ContactEntry(eqx.Module):
         """All of the forcing at the onset."""
         return self.force_cos if self.pressure is None else self.force_cos + self.pressure
 
-    @property
-    def parts(self) -> tuple[Lane, ...]:
-        """Give what `course_at` rotates."""
-        return self.steady_cos, self.steady_sin, self.force_cos, self.force_sin
-
 
 @shared
 def entry_of(wall: SoftWall, flight: Flight) -> ContactEntry:
@@ -124,14 +126,25 @@ def entry_of(wall: SoftWall, flight: Flight) -> ContactEntry:
     return ContactEntry(flight.speed, force_cos, force_sin, steady_cos, steady_sin, -steady, free_sin, pressure, rest)
 
 
-def course_at(entry: ContactEntry, cosine: Lane, sine: Lane, free: tuple[Lane, Lane], decay: Lane) -> ContactCourse:
-    """Rotate the contact to a reference time of given cos and sin of pi s; `free` is its free part there."""
-    steady_cos, steady_sin, force_cos, force_sin = entry.parts
+class Reference(eqx.Module):
+    """A time after the onset that a contact is seen from: cos and sin of pi s and of omega1 s, exp(-zeta s)."""
+
+    s: Lane
+    drive_cosine: Lane
+    drive_sine: Lane
+    cosine: Lane
+    sine: Lane
+    decay: Lane
+
+
+def course_at(entry: ContactEntry, at: Reference) -> ContactCourse:
+    """Rotate the contact to a reference time."""
     return ContactCourse(
-        steady_cos * cosine + steady_sin * sine,
-        steady_sin * cosine - steady_cos * sine,
-        force_cos * cosine - force_sin * sine,
-        force_cos * sine + force_sin * cosine,
-        *free,
-        decay,
+        entry.steady_cos * at.drive_cosine + entry.steady_sin * at.drive_sine,
+        entry.steady_sin * at.drive_cosine - entry.steady_cos * at.drive_sine,
+        entry.force_cos * at.drive_cosine - entry.force_sin * at.drive_sine,
+        entry.force_cos * at.drive_sine + entry.force_sin * at.drive_cosine,
+        entry.free_cos * at.cosine + entry.free_sin * at.sine,
+        entry.free_sin * at.cosine - entry.free_cos * at.sine,
+        at.decay,
     )

@@ -9,17 +9,20 @@ from vijax.engine.quick_course import (
     ContactCourse,
     ContactEntry,
     ContactState,
+    Reference,
     at_reference,
     course_at,
+    further,
     in_reach,
     motion,
 )
 from vijax.engine.quick_wall import DEEP_REACH, DOUBT, LONG_REACH, SoftWall
-from vijax.engine.roots import converged_step, householder
+from vijax.engine.roots import converged_step, converges, correction, householder
 from vijax.model.flow import PI
 from vijax.runtime.xla import share, shared
 
-_ROUNDS = 2  # towards the crest, in single precision; see `quick_contact`
+# The step to the crest in single precision is this long at most, in parts of 1/omega1: its Taylor polynomials hold.
+_STEP = 0.15
 # The last step to the crest may be such a part of the last one to the exit: the depth is then off by three roundings at
 # most. After a longer one its digits go, and with less more lanes are declined.
 _CREST_STEP = 1 / 8
@@ -29,13 +32,7 @@ _CREST_STEP = 1 / 8
 def _crest_course(wall: SoftWall, entry: ContactEntry) -> ContactCourse:
     """Rotate the contact to the free time of greatest depth: cos and sin of omega1 s are zeta/kappa, omega1/kappa."""
     cosine, sine = share((wall.zeta / wall.kappa, wall.omega1 / wall.kappa))
-    free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
-    return course_at(entry, wall.cos_crest, wall.sin_crest, free, wall.crest_decay)
-
-
-def _snap(wall: SoftWall, at: ContactState) -> Lane:
-    """Compute the fourth derivative of w."""
-    return -(PI**2) * at.force - 2 * wall.zeta * at.jerk - wall.kappa * wall.kappa * at.push
+    return course_at(entry, Reference(wall.crest, wall.cos_crest, wall.sin_crest, cosine, sine, wall.crest_decay))
 
 
 class FirstCrest(eqx.Module):
@@ -44,10 +41,21 @@ class FirstCrest(eqx.Module):
     s: Lane  # The time, counted from that of the free contact's crest.
     first: Bool[Array, "lane"]  # It is found, and w rises until then.
     only: Bool[Array, "lane"]  # w has no other extremum before the exit.
-    highest: Bool[Array, "lane"] | None  # None where gravity prolongs no contact: w does not come back to this height.
+    highest: Bool[Array, "lane"] | None  # w does not come back to this height; None where that is not needed.
 
 
-def _stays_below(wall: SoftWall, at: ContactState) -> Bool[Array, "lane"]:
+class _Place(eqx.Module):
+    """A zero of w' in single precision: its time from the free contact's crest, and the contact there."""
+
+    s: Lane
+    w: Lane  # of `ContactState`, as what follows
+    force: Lane
+    push: Lane
+    drive: Lane
+    converged: Bool[Array, "lane"]
+
+
+def _stays_below(wall: SoftWall, at: _Place) -> Bool[Array, "lane"]:
     """Say whether w stays below its first crest as long as its steady response S ebbs, however often it swings.
 
     Call w - S the swing, of the envelope a at the crest, where its rate is -S'. A time y later S has gained S' y at
@@ -83,38 +91,52 @@ def _stays_below(wall: SoftWall, at: ContactState) -> Bool[Array, "lane"]:
     return falls & (swing > (1 + DOUBT) * higher)
 
 
-class _Place(eqx.Module):
-    """A zero of w' in single precision: its time from the free contact's crest, and the contact in the last round."""
+def _rough_place(wall: SoftWall, course: ContactCourse, hop: tuple[Bool[Array, "lane"], Lane], rounds: int) -> _Place:
+    """Find where w' is zero, from the free contact's crest or that of a hop; 0 where the polynomials do not hold.
 
-    s: Lane
-    at: ContactState
-    converged: Bool[Array, "lane"]
-
-
-def _rough_place(wall: SoftWall, course: ContactCourse, hop: tuple[Bool[Array, "lane"], Lane]) -> _Place:
-    """Find where w' is zero, from the free contact's crest or that of a hop; 0 where the polynomials do not hold."""
+    As `quick_contact` finds the exit, in so many rounds; the contact at the crest is that of Taylor polynomials, too.
+    """
     free = at_reference(wall, course)
     short, rise = hop
-    s = share(jnp.where(short, rise - wall.crest, householder(free.rate, free.push, free.jerk, _snap(wall, free))))
+    s = share(jnp.where(short, rise - wall.crest, _toward(wall, free)))
     reached = in_reach(wall, s)
-    for _ in range(_ROUNDS):
-        at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
-        step = share(householder(at.rate, at.push, at.jerk, _snap(wall, at)))
-        s = share(s + step)
+    for _ in range(rounds - 1):
+        s = share(s + _toward(wall, share(motion(wall, course, jnp.where(reached, s, 0.0)))))
         reached = reached & in_reach(wall, s)
-    stiffness = jnp.maximum(wall.omega1, jnp.abs(at.jerk / at.push))
-    converged = reached & (stiffness * jnp.abs(step) < DOUBT) & (at.push < 0)
-    return _Place(jnp.where(reached, s, 0.0), at, converged)
+    at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
+    snap, fifth = share(further(wall, at))
+    step = share(_toward(wall, at))
+    missed = share(correction(step, (at.rate, at.push, at.jerk, snap, fifth)))
+    step, s = share((step + missed, s + step + missed))
+    converged = converges(step, wall.omega1, at.push, at.jerk, _STEP) & (at.push < 0)
+    converged = converged & converges(missed, wall.omega1, at.push, at.jerk, DOUBT)
+    reached = reached & in_reach(wall, s)
+    turn = PI * step
+    sine, cosine = turn * (1 - turn * turn * (1 / 6)), 1 - 0.5 * turn * turn
+    return _Place(
+        jnp.where(reached, s, 0.0),
+        at.w + step * (at.rate + step * (0.5 * at.push + step * (1 / 6) * at.jerk)),
+        at.force * cosine + at.drive * sine * (1 / PI),
+        at.push + step * (at.jerk + step * (0.5 * snap + step * (1 / 6) * fifth)),
+        at.drive * cosine - PI * at.force * sine,
+        reached & converged,
+    )
+
+
+def _toward(wall: SoftWall, at: ContactState) -> Lane:
+    """Compute the step towards a zero of w'."""
+    return householder(at.rate, at.push, at.jerk, further(wall, at)[0])
 
 
 @shared
 def rough_crest(
-    wall: SoftWall, entry: ContactEntry, hop: tuple[Bool[Array, "lane"], Lane], end: tuple[Lane, Lane, Lane]
+    wall: SoftWall, entry: ContactEntry, hop: tuple[Bool[Array, "lane"], Lane], end: tuple[Lane, Lane, Lane], deep: bool
 ) -> FirstCrest:
     """Find when w is largest, from the free contact's time, and whether it has no other extremum before the exit.
 
     In single precision, with what is close called uncertain. `hop` says whether the contact ends long before a free
-    one, and when it is deepest then; `end` holds the duration and f' and f at the exit.
+    one, and when it is deepest then; `end` holds the duration and f' and f at the exit. Where the depth is asked for
+    (`deep`) on steep ground crests far from the free one matter, too: they take another round.
 
     w' is an oscillator too, driven by the derivative f' of the forcing. Write e^(zeta s) w' = phi q with phi the free
     solution: q rises while f' > 0 and falls while f' < 0. Up to the crest, an f' that ends negative allows one zero.
@@ -124,8 +146,8 @@ def rough_crest(
     """
     duration, exit_drive, exit_force = end
     course = _crest_course(wall, entry)
-    place = _rough_place(wall, course, hop)
-    at, when = place.at, wall.crest + place.s
+    at = share(_rough_place(wall, course, hop, 2 if deep and wall.ebb is not None else 1))
+    when = wall.crest + at.s
     way = duration - when
     falls, pulled, one_change = at.drive <= -DOUBT, at.force <= -DOUBT, duration < 1 - DOUBT
     first = falls & ((entry.force_sin >= 0) | ((entry.force > 0) & (course.force_sin >= DOUBT)))
@@ -159,9 +181,9 @@ def rough_crest(
         outwards = entry.pressure < -1
         first, only = first | outwards, only | outwards
     inside = (wall.omega1 * way > DOUBT) & (way < (1 - DOUBT) * wall.span)
-    highest = None if wall.ebb is None else _stays_below(wall, at)
-    first = place.converged & first & (wall.omega1 * when > DOUBT)
-    return FirstCrest(place.s, first, only & inside, highest)
+    highest = _stays_below(wall, at) if deep and wall.ebb is not None else None
+    first = at.converged & first & (wall.omega1 * when > DOUBT)
+    return FirstCrest(at.s, first, only & inside, highest)
 
 
 def deepest(wall: SoftWall, entry: ContactEntry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:

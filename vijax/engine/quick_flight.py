@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool
 
 from vijax.engine.impact import Ball, Lane
 from vijax.engine.polynomial import arcsine, phase, sine_cosine
-from vijax.engine.roots import converged_step, householder, single
+from vijax.engine.roots import converged_step, converges, householder, single
 from vijax.model.flow import PI
 from vijax.runtime.xla import share, shared
 
@@ -120,12 +120,11 @@ def fly(half: Lane, lane: Ball) -> Flight:
     y, step, sine, cosine = _kepler(slope, goal)
     square = step * step
     turn_sine, turn_cosine = step * (1 - square * (1 / 6)), 1 - square * (0.5 - square * (1 / 24))
-    stiffness = jnp.maximum(1.0, jnp.abs(sine / (slope + cosine)))
+    # The iteration is of fourth order: what is left after the last step is (stiffness step)^3 step.
+    converged = converges(step, 1.0, slope + cosine, sine, converged_step(eps))
     sine, cosine = sine * turn_cosine + cosine * turn_sine, cosine * turn_cosine - sine * turn_sine
     speed = (slope + cosine) * (1 / PI)
     elapsed = away + y * (1 / PI)
-    # The iteration is of fourth order: what is left after the last step is (stiffness step)^3 step.
-    converged = stiffness * jnp.abs(step) < converged_step(eps)
     # A short hop loses its leading digits in the phases.
     moves = lane.v != 0
     # One at rest that meets no wall may stay where it is for ever.

@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool
 
 from vijax.engine.impact import Lane
 from vijax.engine.polynomial import long_decay, phase
-from vijax.engine.quick_course import ContactCourse, ContactEntry, course_at
+from vijax.engine.quick_course import ContactEntry, Reference
 from vijax.engine.quick_wall import DOUBT, SoftWall
 from vijax.model.flow import PI
 from vijax.runtime.arrays import choose, present
@@ -44,25 +44,10 @@ class Lasting(eqx.Module):
         return (self.dips | (way > 0)) & (2 * out > self.pull * way)
 
 
-class Prolonged(eqx.Module):
-    """Where the exit of a contact that gravity prolongs is sought.
-
-    Attributes:
-        lasting: What is certain of the contact; it is prolonged where that is `long`.
-        course: The contact as seen from a reference time.
-        reference: That time.
-        sine, cosine: Of omega1 s then.
-    """
-
-    lasting: Lasting
-    course: ContactCourse
-    reference: Lane
-    sine: Lane
-    cosine: Lane
-
-
-def prolonged(wall: SoftWall, entry: ContactEntry, rough: tuple[SoftWall, ContactEntry], begins: Lane) -> Prolonged:
-    """Find what is certain of contacts that outlast the free one, and where their ends are sought.
+def prolonged(
+    wall: SoftWall, entry: ContactEntry, rough: tuple[SoftWall, ContactEntry], begins: Lane
+) -> tuple[Lasting, Reference]:
+    """Find what is certain of contacts that outlast the free one, and from where the ends of those are sought.
 
     Args:
         wall, entry: Of the contact.
@@ -73,14 +58,8 @@ def prolonged(wall: SoftWall, entry: ContactEntry, rough: tuple[SoftWall, Contac
     when = share(when - 2 * jnp.floor(0.5 * when))
     lasting = lasts(*rough, when.astype(jnp.float32))
     turns = wall.omega1 * when * (1 / PI)
-    sine, cosine = share(phase(turns - 2 * jnp.floor(0.5 * turns)))
-    return Prolonged(
-        lasting,
-        choose(lasting.ebbs, _ebb_course(wall, entry, when, cosine, sine), _dip_course(wall, entry)),
-        reference=jnp.where(lasting.ebbs, when, 1.5 * wall.span),
-        sine=jnp.where(lasting.ebbs, sine, -1.0),
-        cosine=jnp.where(lasting.ebbs, cosine, 0.0),
-    )
+    sine, cosine = phase(turns - 2 * jnp.floor(0.5 * turns))
+    return lasting, choose(lasting.ebbs, _ebb(wall, entry, when, cosine, sine), _dip(wall))
 
 
 @shared
@@ -133,20 +112,17 @@ def lasts(wall: SoftWall, entry: ContactEntry, when: Lane) -> Lasting:
     return Lasting(ebbs, dips, since, (1 + DOUBT) * pull)
 
 
-@shared
-def _ebb_course(wall: SoftWall, entry: ContactEntry, when: Lane, cosine: Lane, sine: Lane) -> ContactCourse:
-    """Rotate the contact to where its steady response ends, with cos and sin of omega1 s there."""
+def _ebb(wall: SoftWall, entry: ContactEntry, when: Lane, cosine: Lane, sine: Lane) -> Reference:
+    """Describe the time when the steady response ends, with cos and sin of omega1 s then."""
     ebb = present(wall.ebb)
-    free = (entry.free_cos * cosine + entry.free_sin * sine, entry.free_sin * cosine - entry.free_cos * sine)
-    return ContactCourse(
-        -present(entry.rest), ebb.rate * (-1 / PI), ebb.force_cos, ebb.force_sin, *free, long_decay(wall.zeta * when)
-    )
+    drive_cosine = ebb.force_cos * entry.force_cos + ebb.force_sin * entry.force_sin
+    drive_sine = ebb.force_sin * entry.force_cos - ebb.force_cos * entry.force_sin
+    return Reference(when, drive_cosine, drive_sine, cosine, sine, long_decay(wall.zeta * when))
 
 
-@shared
-def _dip_course(wall: SoftWall, entry: ContactEntry) -> ContactCourse:
-    """Rotate the contact to one and a half free contacts after its onset, where the swing is about at its low."""
-    cosine = wall.cos_span * wall.cos_middle - wall.sin_span * wall.sin_middle
-    sine = wall.sin_span * wall.cos_middle + wall.cos_span * wall.sin_middle
-    cosine, sine = share((cosine, sine))
-    return course_at(entry, cosine, sine, (-entry.free_sin, entry.free_cos), wall.r * wall.root_r)
+def _dip(wall: SoftWall) -> Reference:
+    """Describe the time of one and a half free contacts, where the swing is about at its low."""
+    drive_cosine = wall.cos_span * wall.cos_middle - wall.sin_span * wall.sin_middle
+    drive_sine = wall.sin_span * wall.cos_middle + wall.cos_span * wall.sin_middle
+    none = jnp.zeros_like(wall.span)
+    return Reference(1.5 * wall.span, drive_cosine, drive_sine, none, none - 1, wall.r * wall.root_r)

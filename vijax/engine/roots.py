@@ -1,5 +1,6 @@
 """Roots: inside a bracket, their derivatives by the equation they solve, and the step that all quick searches share."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from vijax.model.flow import horner
 from vijax.runtime.arrays import Flag, Scalar, Values
 from vijax.runtime.xla import search, share, shared
 
@@ -68,10 +70,26 @@ def converged_step(eps: Any) -> float:
     return float(eps) ** 0.25
 
 
+def converges(step: Values, rate: Any, f1: Values, f2: Values, most: float) -> Values:
+    """Say whether a step times the stiffness is below a bound: that of the rate, or |f2/f1|, without its division."""
+    size = jnp.abs(step)
+    return (rate * size < most) & (jnp.abs(f2) * size < most * jnp.abs(f1))
+
+
 def householder(f: Values, f1: Values, f2: Values, f3: Values) -> Values:
     """Compute the step of the fourth-order root iteration from f and its first three derivatives; one division."""
     slope, bent = f1 * f1, f * f2
     return -f * (6 * slope - 3 * bent) / (6 * f1 * (slope - bent) + f * f * f3)
+
+
+def taylor(derivatives: tuple[Values, ...], order: int, s: Values) -> Values:
+    """Sum derivatives[k] s^k/(k + order)!."""
+    return horner(tuple(d * (1 / math.factorial(k + order)) for k, d in enumerate(derivatives)), s)
+
+
+def correction(step: Values, derivatives: tuple[Values, ...]) -> Values:
+    """Compute what a step to a root misses: Newton's on the Taylor polynomial, from where the step leads."""
+    return -taylor(derivatives, 0, step) / taylor(derivatives[1:], 0, step)
 
 
 @shared
