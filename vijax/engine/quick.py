@@ -17,7 +17,7 @@ from vijax.engine.quick_inclined_flight import fly as fly_inclined
 from vijax.engine.quick_wall import RigidWall, SoftWall, TwoWalls, Wall
 from vijax.model import energy
 from vijax.model.sides import apart, at
-from vijax.runtime.arrays import choose
+from vijax.runtime.arrays import choose, present
 
 
 def through(contact: tuple[Lane, ...], elapsed: Lane) -> tuple[Lane, Lane, Lane, Lane]:
@@ -82,7 +82,8 @@ def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: L
         # `touch` is sure of no short contact, and the flight knows the forcing at its end.
         c, q = -flight.sine, flight.cosine
         force = c, q, c if wall.incline is None else c - onset.side * gamma
-        work = energy.long_contact_work(wall.kappa, 2 * wall.zeta, force, duration, (flight.speed, -out))
+        turn = duration, *present(left.drive)
+        work = energy.long_contact_work(wall.kappa, 2 * wall.zeta, force, turn, (flight.speed, -out))
     h = left.decay * left.sine / wall.omega1
     slope = left.decay * left.cosine - wall.zeta * h
     contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)

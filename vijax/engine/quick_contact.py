@@ -10,6 +10,7 @@ from vijax.engine.impact import Lane
 from vijax.engine.quick_course import (
     ContactCourse,
     ContactEntry,
+    ContactState,
     Reference,
     at_reference,
     course_at,
@@ -36,6 +37,7 @@ class Exit(eqx.Module):
     sine: Lane
     cosine: Lane
     decay: Lane
+    drive: tuple[Lane, Lane] | None  # Sin, cos of pi s, where the work is asked for.
 
 
 class _Guess(eqx.Module):
@@ -98,7 +100,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     s = share(s.astype(entry.speed.dtype))
     at = share(motion(wall, course, s))
     step = share(householder(entry.penetration(at), at.rate, at.push, at.jerk))
-    out = -(at.rate + step * (at.push + step * (0.5 * at.jerk)))
+    out = -(at.rate + step * (at.push + step * (0.5 * at.jerk + step * (1 / 6) * further(wall, at)[0])))
     duration = reference.s + s + step
     # The iteration is of fourth order; and in a shorter contact the closed form has lost two digits.
     converged = reached & converges(step, wall.omega1, at.rate, at.push, converged_step(eps))
@@ -120,7 +122,20 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     turned_cosine = cosine * reference.cosine - sine * reference.sine
     rot = wall.zeta * step
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
-    return Exit(duration, out, turned_sine, turned_cosine, decay), depth, sure
+    drive = _turned(entry, at, PI * step) if deep else None
+    return Exit(duration, out, turned_sine, turned_cosine, decay, drive), depth, sure
+
+
+def _turned(entry: ContactEntry, at: ContactState, turn: Lane) -> tuple[Lane, Lane]:
+    """Compute sin and cos of what the forcing has turned since the onset, a small turn further than at `at`."""
+    square = turn * turn
+    sine, cosine = turn * (1 - square * (1 / 6)), 1 - 0.5 * square
+    ahead = at.drive * (-1 / PI)
+    force_cos, force_sin = at.force * cosine - ahead * sine, ahead * cosine + at.force * sine
+    return (
+        force_sin * entry.force_cos - force_cos * entry.force_sin,
+        force_cos * entry.force_cos + force_sin * entry.force_sin,
+    )
 
 
 @shared

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from vijax.model.flow import horner
-from vijax.runtime.arrays import Flag, Scalar, Values
+from vijax.runtime.arrays import Flag, Flags, Scalar, Values
 from vijax.runtime.xla import search, share, shared
 
 _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
@@ -70,7 +70,7 @@ def converged_step(eps: Any) -> float:
     return float(eps) ** 0.25
 
 
-def converges(step: Values, rate: Any, f1: Values, f2: Values, most: float) -> Values:
+def converges(step: Values, rate: Any, f1: Values, f2: Values, most: float) -> Flags:
     """Say whether a step times the stiffness is below a bound: that of the rate, or |f2/f1|, without its division."""
     size = jnp.abs(step)
     return (rate * size < most) & (jnp.abs(f2) * size < most * jnp.abs(f1))

@@ -194,17 +194,20 @@ def _long_work(
 
 
 def long_contact_work(
-    kappa: Values, mu: Values, force: tuple[Values, ...], duration: Values, z: tuple[Values, Values]
+    kappa: Values, mu: Values, force: tuple[Values, ...], turn: tuple[Values, ...], z: tuple[Values, Values]
 ) -> Values:
     """Compute what `membrane_work` does of contacts that are not short and whose forcing is known: half the arithmetic.
 
     Args:
         kappa, mu: The pair's.
         force: The forcing c cos(pi s) - q sin(pi s) - g as c, q and its value at the onset, c - g.
-        duration: Time from onset to exit; max(kappa, pi) duration is at least `SHORT_REACH`.
+        turn: The time s from onset to exit, of which max(kappa, pi) s is at least `SHORT_REACH`; sin and cos of pi s.
         z: Velocity w' at onset and at exit.
     """
-    return jnp.where(mu > 0, _long_work(kappa, mu, force, half_turn(duration), z), 0.0)
+    s, sine, cosine = turn
+    # Versine and lag are as exact as the forcing here: what they add to a short contact's work is little.
+    turned = sine, cosine, 1 - cosine, PI * s - sine
+    return jnp.where(mu > 0, _long_work(kappa, mu, force, turned, z), 0.0)
 
 
 @door
