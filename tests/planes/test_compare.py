@@ -217,11 +217,15 @@ def test_from_arguments_to_store_and_picture(found, tmp_path, monkeypatch, capsy
     assert sorted(path.name for path in tmp_path.iterdir()) == ["comparison.png", "comparison.zarr"]
     xr.testing.assert_equal(load(tmp_path / "comparison.zarr"), found)
     said = capsys.readouterr().out
+    # At (0.3, 4) motions are chaotic and at times yield next to nothing: by chance a run is soft or undecided.
+    rigid, soft, undecided = ((found.cheapest_model == model).sum().item() for model in range(3))
+    assert (rigid, soft + undecided) == (8, 12)
+    assert 3 <= undecided <= 4
     for part in (
         "24 cells in",
         "soft cells by status: ok 20",
         "label: ",
-        "cheapest model within 1 %: rigid 8, soft 9, undecided 3",
+        f"cheapest model within 1 %: rigid {rigid}, soft {soft}, undecided {undecided}",
         "least kappa from which on it is rigid: 1000 to 1e+04, median 1000 (3 of 4 found)",
         "wrote comparison.zarr, comparison.png",
     ):
