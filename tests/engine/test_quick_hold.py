@@ -93,6 +93,25 @@ def test_none_is_deeper_than_its_first_crest(prolonged):
         assert np.min(share[free_contacts(pair, hit) < 5]) > 0.99
 
 
+def test_crests_far_from_the_free_one_are_found():
+    """With one round of sines to the crest 0.61 of the steps are sure."""
+    rng, shares = np.random.default_rng(11), []
+    for _ in range(ROUNDS):
+        pair, v, t = hops(rng)
+        shares.append(leave(pair, -np.sign(pair.gamma), v, t, True)[1].mean())
+    assert np.mean(shares) > 0.63
+
+
+def test_a_contact_that_ends_slowly_is_sure():
+    """With one correction of the step to its exit it is declined."""
+    d, kappa, r, gamma = 0.06441284123535639, 42.86727297639803, 0.639641708545424, 0.9102778815739276
+    v, t = np.full(COUNT, 0.005376395230627496), np.full(COUNT, 0.018888211608415917)
+    hit, sure, w = leave(pairs(np.full(COUNT, d), kappa, r, gamma), -np.ones(COUNT), v, t, False)
+    assert sure.all()
+    assert w.min() > 0
+    assert np.max(hit.v_out / hit.v_in) < 0  # It leaves the wall that it meets.
+
+
 def test_a_contact_that_just_ends_at_the_first_low_has_no_later_end():
     """One of three million: its w is below zero for a moment, and would be said to end where it is so again."""
     d, kappa, r, gamma = 0.20003687089776961, 17.661471184654324, 0.08972374016170381, 0.48703763561527846

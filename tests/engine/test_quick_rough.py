@@ -10,8 +10,8 @@ import pytest
 
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Ball
-from vijax.engine.quick_contact import _guess, _rough_exit
-from vijax.engine.quick_course import ContactCourse, ContactEntry, Reference, course_at, entry_of, in_reach, motion
+from vijax.engine.quick_contact import _guess, _rough_exit, free_reference
+from vijax.engine.quick_course import ContactEntry, course_at, entry_of, in_reach, motion
 from vijax.engine.quick_crest import _crest_course, _rough_place
 from vijax.engine.quick_flight import fly
 from vijax.engine.quick_inclined_flight import fly as fly_inclined
@@ -19,7 +19,6 @@ from vijax.engine.quick_wall import SoftWall, prepare
 from vijax.engine.roots import converged_step, householder, single
 from vijax.model.flow import PI
 from vijax.model.pair import ImpactPair
-from vijax.runtime.arrays import choose
 
 COUNT = 1 << 15
 
@@ -56,10 +55,7 @@ def exits(wall: SoftWall, entry: ContactEntry):
     """Find exits roughly and in double precision: errors in radians of the swing, and which of them are near."""
     rough, begun = single((replace(wall, incline=None), entry))
     guess = _guess(rough, begun)
-    none = jnp.zeros_like(wall.span)
-    middle = Reference(0.5 * wall.span, wall.cos_middle, wall.sin_middle, none, none + 1, wall.root_r)
-    far = Reference(wall.span, wall.cos_span, wall.sin_span, none - 1, none, wall.r)
-    course: ContactCourse = course_at(entry, choose(guess.short, middle, far))
+    course = course_at(entry, free_reference(wall, guess.short))
     s, reached = _rough_exit(rough, begun, guess, single(course))
     begin = root = s.astype(float)
     for _ in range(6):

@@ -86,10 +86,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     entry = entry_of(wall, flight)
     rough, begun = single((replace(wall, incline=None), entry))
     guess = _guess(rough, begun)
-    none = jnp.zeros_like(wall.span)
-    middle = Reference(0.5 * wall.span, wall.cos_middle, wall.sin_middle, none, none + 1, wall.root_r)
-    far = Reference(wall.span, wall.cos_span, wall.sin_span, none - 1, none, wall.r)
-    reference = choose(guess.short, middle, far)
+    reference = free_reference(wall, guess.short)
     lasting = None
     if wall.ebb is not None:
         lasting, late = prolonged(wall, entry, (rough, begun), begins)
@@ -124,6 +121,14 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
     drive = _turned(entry, at, PI * step) if deep else None
     return Exit(duration, out, turned_sine, turned_cosine, decay, drive), depth, sure
+
+
+def free_reference(wall: SoftWall, short: Bool[Array, "lane"]) -> Reference:
+    """Describe where the free contact ends, or its half where the contact is short: no sine is needed there."""
+    none = jnp.zeros_like(wall.span)
+    middle = Reference(0.5 * wall.span, wall.cos_middle, wall.sin_middle, none, none + 1, wall.root_r)
+    far = Reference(wall.span, wall.cos_span, wall.sin_span, none - 1, none, wall.r)
+    return choose(short, middle, far)
 
 
 def _turned(entry: ContactEntry, at: ContactState, turn: Lane) -> tuple[Lane, Lane]:

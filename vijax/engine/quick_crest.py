@@ -48,10 +48,10 @@ class _Place(eqx.Module):
     """A zero of w' in single precision: its time from the free contact's crest, and the contact there."""
 
     s: Lane
-    w: Lane  # of `ContactState`, as what follows
-    force: Lane
-    push: Lane
-    drive: Lane
+    w: Lane  # The penetration there, but for what gravity adds,
+    force: Lane  # the periodic part of the forcing,
+    push: Lane  # w'',
+    drive: Lane  # and the derivative of the forcing.
     converged: Bool[Array, "lane"]
 
 
