@@ -44,7 +44,9 @@ Pictures: `plots`, which is loaded, and matplotlib with it, when it is first ask
 
 import os
 import sys
-from importlib import import_module, metadata
+from functools import cache
+from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vijax.runtime import forks  # noqa: F401, which watches them from now on
@@ -55,24 +57,29 @@ if TYPE_CHECKING:
     __version__: str
 else:
     # The command `vijax` has to import this package before it can answer --help, or a shell that completes. With JAX
-    # that would take ten times as long, so what is offered is loaded when a name of it is first asked for.
+    # that would take ten times as long, so of what is offered each name is loaded when it is first asked for.
     def __getattr__(name):
         if name == "__version__":
             return metadata.version("vijax")
-        if name == "plots":
-            return import_module("vijax.plots")
-        public = _public()
-        if name == "__all__" or name in public.__all__:
-            return getattr(public, name)
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name == "__all__":
+            return __dir__()
+        if name.startswith("__") or name not in _homes():
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from vijax.runtime.offered import load
+
+        found = load(_homes()[name])
+        if "jax" in sys.modules:
+            _said_of_bits()
+        return found
 
     def __dir__():
-        return _public().__all__
+        return sorted(_homes())
 
-    def _public():
-        public = import_module("vijax.public")
-        _said_of_bits()
-        return public
+    @cache
+    def _homes():
+        from vijax.runtime.offered import homes
+
+        return homes(__name__, Path(__file__).with_name("public.py"))
 
 
 _X64 = "JAX_ENABLE_X64"

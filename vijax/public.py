@@ -1,4 +1,4 @@
-"""What `import vijax` offers. It is loaded when the first of its names is asked for; see `vijax.__init__`."""
+"""What `import vijax` offers, and where: `vijax.__init__` reads these lines, and loads a name as it is asked for."""
 
 from typing import TYPE_CHECKING
 
@@ -55,7 +55,7 @@ from vijax.planes.store import load, save
 from vijax.planes.sweep import sweep
 
 if TYPE_CHECKING:
-    from vijax import plots  # loaded, and matplotlib with it, by `vijax.__getattr__`
+    import vijax.plots as plots
 
 __all__ = [
     "AperiodicOptimum",

@@ -3,8 +3,10 @@
 `style` knows before a run what can be drawn, and loads none of it. Begin with `number_maps`.
 """
 
-from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from vijax.runtime.offered import homes, load
 
 if TYPE_CHECKING:
     from vijax.plots.branch_diagrams import branches
@@ -18,24 +20,12 @@ if TYPE_CHECKING:
     from vijax.plots.orbit_diagrams import orbit_diagram
     from vijax.plots.responses import response
 else:
-    # What stands where; a room is loaded, and matplotlib with it, when something of it is first asked for.
-    _ROOMS = {
-        "branches": "branch_diagrams",
-        "curves": "curve_maps",
-        **dict.fromkeys(("design", "design_map"), "designs"),
-        "save": "figure",
-        "fit": "fits",
-        **dict.fromkeys(("basins", "label_map"), "kind_maps"),
-        **dict.fromkeys(("difference_map", "power_map", "variable_map"), "number_maps"),
-        **dict.fromkeys(("energies", "trajectory"), "motions"),
-        "orbit_diagram": "orbit_diagrams",
-        "response": "responses",
-    }
+    _HOMES = homes(__name__, Path(__file__))
 
     def __getattr__(name: str) -> Any:
-        if name not in _ROOMS:
+        if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_ROOMS[name]}"), name)
+        return load(_HOMES[name])
 
 
 __all__ = [
