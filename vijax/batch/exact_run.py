@@ -9,14 +9,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from vijax.batch.run_records import Asked, Room, Trajectory, begin
+from vijax.batch.run_records import Asked, Room, Trajectory, start_of
 from vijax.engine import exact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
-from vijax.model.records import State, Status
+from vijax.model.records import Impact, State, Status
 from vijax.runtime import tiles
-from vijax.runtime.arrays import AnyArray
-from vijax.runtime.programs import jitted
+from vijax.runtime.arrays import AnyArray, choose
+from vijax.runtime.programs import begin, jitted
 from vijax.runtime.xla import once
 
 # The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
@@ -72,9 +72,8 @@ class _Reached(NamedTuple):
     over: Bool[AnyArray, "row"]
 
 
-@jitted
 def _set_out(pair: ImpactPair, u0, v0, t0) -> _Reached:
-    return _Reached(jax.vmap(begin)(pair, u0, v0, t0), jnp.zeros(u0.shape, bool))
+    return _Reached(jax.vmap(start_of)(pair, u0, v0, t0), jnp.zeros(u0.shape, bool))
 
 
 def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArray, ""], count: int):
@@ -103,22 +102,32 @@ def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArr
     return reached, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), flown)
 
 
+def _nowhere(count: int, dtype: Any) -> _Reached:
+    """Make what a run is that has not begun."""
+    number: Any = np.zeros(count, dtype)
+    whole: Any = np.zeros(count, np.int32)
+    return _Reached(State(number, number, number, whole, whole), whole > 0)
+
+
 @jitted
-def _stretch(asked: Asked, pair: ImpactPair, reached: _Reached, first: Any):
+def _stretch(asked: Asked, pair: ImpactPair, starts: tuple, reached: _Reached, first: Any):
+    """Take balls a stretch on; the first begins where they start. One program compiles sooner than two."""
+    reached = choose(first == 0, _set_out(pair, *starts), reached)
     return _onward(asked, pair, reached, first, _STRETCH)
 
 
 def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Reached, _Flown]:
     """Take all steps of rows of starts: as many as there is room for where traced, else until all runs are over."""
-    reached = _set_out(pair, *starts)
     # One step more than impacts: the flight or contact in which the last period ends.
     steps = room.impacts + 1
     if tiles.library((pair, starts)) is jnp:
-        return _onward(asked, pair, reached, jnp.int32(0), steps)
+        return _onward(asked, pair, _set_out(pair, *starts), jnp.int32(0), steps)
     # Stretches of one length need one program, where every number of periods would need its own: 4 s and 800 mappings.
+    _begin_strobes(pair, starts[0].size * room.periods)
     parts = []
+    reached = _nowhere(starts[0].size, starts[0].dtype)
     for first in range(0, steps, _STRETCH):
-        reached, flown = _stretch(asked, pair, reached, np.int32(first))
+        reached, flown = _stretch(asked, pair, starts, reached, np.int32(first))
         parts.append(jax.tree.map(np.asarray, flown))
         if np.asarray(reached.over).all():
             break
@@ -179,6 +188,15 @@ def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:
 def balls_at(rows: tuple) -> tuple:
     """Do what `ball_at` does, for many balls: of each what that takes."""
     return jax.vmap(ball_at)(*rows)
+
+
+def _begin_strobes(pair: ImpactPair, count: int) -> None:
+    """Begin to compile what finds so many balls at phase 0."""
+    size = tiles.tiles(count, _STROBES)[0].rows.size
+    rows: Any = jax.tree.map(lambda leaf: np.broadcast_to(leaf[:1], size), pair)
+    number, (start, no) = rows.d, _nowhere(size, rows.d.dtype)
+    impact = Impact(start.n, number, start.n, number, number, number, number, number)
+    begin(balls_at, (rows, start, exact.Outcome(start, impact, number, number, no, no, no), number))
 
 
 def _before(clock: Float[AnyArray, "row step"], now: Float[AnyArray, "row period"]) -> Int[AnyArray, "row period"]:

@@ -52,7 +52,7 @@ class Room(NamedTuple):
     chunks: int
 
 
-def begin(pair: ImpactPair, u0, v0, t0) -> State:
+def start_of(pair: ImpactPair, u0, v0, t0) -> State:
     """Make the start a state, in contact or in flight."""
     t, n = flow.wrap_phase(t0)
     return State(u0, v0, t, n.astype(jnp.int32), exact.start_mode(pair, u0, v0, t).astype(jnp.int32))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory, begin
+from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory, start_of
 from vijax.engine.method import HELD, Method, repeated
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, Status
@@ -56,7 +56,7 @@ def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) ->
 def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Trajectory:
     """Step all lanes together, each until its last period is over and its last contact has ended."""
     periods, max_impacts, chunks = asked
-    begun = jax.vmap(begin)(pair, u0, v0, t0)
+    begun = jax.vmap(start_of)(pair, u0, v0, t0)
     wall = jax.vmap(method.walls)(pair)
     carry = jax.vmap(partial(method.start, deep=True, tangent=False))(pair, begun)
     start = _recording(room, carry, u0)
