@@ -168,7 +168,7 @@ def kernels() -> Iterator[Figure]:
     from vijax.model.device import Harvester, electrical
     from vijax.runtime import xla
 
-    plan, cells = Plan(deep=True, energies=True), 1 << 20
+    plan, cells = Plan(deep=True, work=True, energies=True), 1 << 20
     kind = np.dtype("float64")
     one: Any = jax.ShapeDtypeStruct((), kind)
     device = jax.tree.map(lambda x: one, electrical(Harvester()))

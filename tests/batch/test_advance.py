@@ -16,7 +16,7 @@ from vijax.runtime import xla
 from vijax.runtime.unrolled import unrolled
 
 CELLS, STEPS = 2048, 60
-PLAN = Plan(until="window", deep=True, tangent=False)
+PLAN = Plan(until="window", deep=True, work=True, tangent=False)
 SETTINGS = Settings(
     periods=jnp.asarray(1000.0),
     transient=jnp.asarray(0.0),
@@ -57,7 +57,7 @@ def declined():
 )
 def test_an_accelerator_finds_the_careful_answer_lane_by_lane(on_gpu, wall):
     """There it is a kernel, which knows single lanes alone, and goes round until the last of these is done."""
-    plan = Plan(rigid=wall.rigid, ground=ground_of(wall.gamma), deep=True)
+    plan = Plan(rigid=wall.rigid, ground=ground_of(wall.gamma), deep=True, work=True)
     rng, one = np.random.default_rng(4), jnp.ones(64)
     pair = jax.tree.map(lambda x: x * one, wall)
     u, v, t = (jnp.asarray(rng.uniform(-x, x, 64)) for x in (0.1, 0.5, 1.0))

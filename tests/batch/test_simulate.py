@@ -245,6 +245,13 @@ def test_window_counts_the_impacts_with_their_onset_in_it(recorded):
     assert np.all(found.period == -1)
 
 
+def test_power_is_the_same_where_nothing_is_set_against_it(plane):
+    alone = summarise(PLANE, outputs={"P"}, variants=ALONE)
+    assert alone.energy_ratio is None
+    assert plane.energy_ratio.max() > 0
+    np.testing.assert_allclose(alone.P[PERIODIC, 0], plane.P[PERIODIC, 0], rtol=1e-11)
+
+
 def test_a_mirrored_start_half_a_period_later_ends_on_the_mirrored_attractor(plane, recorded):
     calm = [i for i, known in enumerate(FEW) if known["p"] and known["converged_after"] < 50]
     state = recorded.states

@@ -38,7 +38,7 @@ def test_every_core_has_its_share_and_rows_come_back_in_order(shares, cells, exp
 
 
 def test_what_is_needed_is_compiled_by_a_share_without_a_cell(shares):
-    stragglers.prepare(Plan(deep=True, energies=True), SETTINGS)
+    stragglers.prepare(Plan(deep=True, work=True, energies=True), SETTINGS)
     assert shares == [0]
 
 

@@ -30,7 +30,9 @@ def both(request):
     lane = Ball(*(jnp.asarray(getattr(flat.before, name), float) for name in ("u", "v", "t", "n")))
 
     def program(pair, lane):
-        return quick.quick_step(quick_wall.prepare(pair), jnp.zeros_like(lane.u), lane, deep=True, tangent=True)
+        return quick.quick_step(
+            quick_wall.prepare(pair), jnp.zeros_like(lane.u), lane, deep=True, work=True, tangent=True
+        )
 
     hit, _, sure, never = jax.tree.map(np.asarray, jax.jit(program)(pair, lane))
     return request.param, flat, hit, sure, never

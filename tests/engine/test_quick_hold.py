@@ -35,7 +35,7 @@ def penetrations(pair, hit):
 @partial(jax.jit, static_argnames="deep")
 def step(pair, ball, deep):
     wall = quick_wall.prepare(pair, ground=Ground.STEEP)
-    found = quick.quick_step(wall, pair.gamma, ball, deep=deep, tangent=True)
+    found = quick.quick_step(wall, pair.gamma, ball, deep=deep, work=deep, tangent=True)
     return found.impact, found.sure, penetrations(pair, found.impact)
 
 

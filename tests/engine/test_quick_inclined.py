@@ -42,7 +42,7 @@ def step_on_level_ground(pair, ball):
 @jax.jit
 def deep_step(pair, ball):
     wall = quick_wall.prepare(pair, ground=Ground.STEEP)
-    found = quick.quick_step(wall, pair.gamma, ball, deep=True)
+    found = quick.quick_step(wall, pair.gamma, ball, deep=True, work=True)
     return found.impact, found.arrival, found.sure
 
 

@@ -32,7 +32,7 @@ def both(request):
     ran = march(pair, start(rng.uniform(-0.45, 0.45, TILE) * d, rng.uniform(-0.7, 0.7, TILE), rng.uniform(0, 2, TILE)))
     many = ran.out.flight.shape[1]
     flat = jax.tree.map(lambda x: x.reshape(TILE * many, *x.shape[2:]), ran)
-    program = jax.jit(lambda pair, lane: sampled.sampled_step(pair, lane, deep=True, tangent=True))
+    program = jax.jit(lambda pair, lane: sampled.sampled_step(pair, lane, deep=True, work=True, tangent=True))
     parts = []
     # In batches as small as the lanes serve: a sampled step holds some dozens of samples a lane.
     for k in range(many):
@@ -66,7 +66,7 @@ def test_it_is_sure_of_most_steps(both):
 
 @jax.jit
 def deep_step(pair, lane):
-    return sampled.sampled_step(pair, lane, deep=True)
+    return sampled.sampled_step(pair, lane, deep=True, work=True)
 
 
 def lanes(u, v, t):
@@ -131,7 +131,7 @@ def off_the_left_wall(kappas, speeds, count=512):
     at = [jnp.asarray(np.resize(x, count), float) for x in (-0.03, v, t)]
     still = jnp.zeros(count, jnp.int32)
     step = jax.jit(jax.vmap(lambda pair, state: exact.step(pair, state, jnp.asarray(100.0))))
-    sample = jax.jit(lambda pair, lane: sampled.sampled_step(pair, lane, deep=True))
+    sample = jax.jit(lambda pair, lane: sampled.sampled_step(pair, lane, deep=True, work=True))
     return sample(pair, Ball(*at, jnp.zeros(count))), step(pair, State(*at, still, still)).impact
 
 
@@ -162,7 +162,9 @@ def test_an_accelerator_finds_the_same_lane_by_lane(monkeypatch):
 
     @jax.jit
     def lane_by_lane(*leaves):
-        return unrolled(lambda some: sampled.sampled_step(*jax.tree.unflatten(tree, some), deep=True), list(leaves))
+        return unrolled(
+            lambda some: sampled.sampled_step(*jax.tree.unflatten(tree, some), deep=True, work=True), list(leaves)
+        )
 
     hit, sure = jax.tree.unflatten(jax.tree.structure(plain), lane_by_lane(*leaves))
     assert np.mean(plain[1]) > 0.5
@@ -186,7 +188,7 @@ def test_flights_that_are_not_sure_are_sampled_where_asked_for():
         jnp.asarray(known),
     )
     for unsure in (False, True):
-        hit, sure = sampled.sampled_step(pair, lane, told, unsure=unsure, deep=True)
+        hit, sure = sampled.sampled_step(pair, lane, told, unsure=unsure, deep=True, work=True)
         assert np.array_equal(np.asarray(hit.flight)[known], found.flight[known] + 0.125)
         if not unsure:
             assert not np.any(np.asarray(sure)[~known])

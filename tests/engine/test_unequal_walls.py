@@ -110,14 +110,14 @@ def careful(pair, ball):
 
 
 def by_samples(pair, ball):
-    hit, sure = sampled.sampled_step(pair, ball, deep=True, tangent=True)
+    hit, sure = sampled.sampled_step(pair, ball, deep=True, work=True, tangent=True)
     told = (2 * hit.onset_n + hit.onset_t, hit.v_in, hit.v_out, hit.duration, hit.depth, hit.work, *hit.tangent)
     return hit.side, told, sure
 
 
 def quickly(pair, ball):
     walls = quick_wall.prepare(pair, ground=ground_of(0.3))
-    hit, _, sure, _ = quick.quick_step(walls, pair.gamma, ball, deep=True, tangent=True)
+    hit, _, sure, _ = quick.quick_step(walls, pair.gamma, ball, deep=True, work=True, tangent=True)
     told = (2 * hit.onset_n + hit.onset_t, hit.v_in, hit.v_out, hit.duration, hit.depth, hit.work, *hit.tangent)
     return hit.side, told, sure
 

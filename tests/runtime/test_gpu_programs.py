@@ -81,7 +81,7 @@ def test_the_program_that_leaves_its_last_cells_is_lowered_for_a_gpu(known, call
     CALLS["sweep"](0, known)
     on_gpu()
     (shapes,) = (shapes for (name, _), (_, shapes) in called.items() if "tile" in name)
-    text = check_lowered(stragglers._compiled_most(Plan(deep=True, energies=True), 256, 16), shapes)
+    text = check_lowered(stragglers._compiled_most(Plan(deep=True, work=True, energies=True), 256, 16), shapes)
     assert "__gpu$xla.gpu.triton" in text  # lanes stay in registers
 
 

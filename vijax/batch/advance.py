@@ -31,7 +31,9 @@ def step(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     """Take every lane one impact on: by the quick step."""
     pair, ball = cell.pair, cell.ball
     wall: Any = present(cell.wall)
-    impact, arrival, sure, never = quick.quick_step(wall, pair.gamma, ball, deep=plan.deep, tangent=plan.tangent)
+    impact, arrival, sure, never = quick.quick_step(
+        wall, pair.gamma, ball, deep=plan.deep, work=plan.work, tangent=plan.tangent
+    )
     active = cell.running & ~cell.declined
     free = active & (cell.held == 0)
     no = jnp.zeros_like(active)
@@ -80,7 +82,13 @@ def sampled_answer(plan: Plan, request: Request) -> Answer:
     """
     unsure = plan.ground is not Ground.LEVEL or not xla.on_cpu()
     impact, sure = sampled.sampled_step(
-        request.pair, request.ball, request.arrival, unsure=unsure, deep=plan.deep, tangent=plan.tangent
+        request.pair,
+        request.ball,
+        request.arrival,
+        unsure=unsure,
+        deep=plan.deep,
+        work=plan.work,
+        tangent=plan.tangent,
     )
     no = jnp.zeros_like(sure)
     sure = sure & (request.held == 0)
@@ -110,7 +118,7 @@ def careful_answer(plan: Plan, request: Request) -> Answer:
         duration=out.stay,
         after=Ball(after.u, after.v, after.t, ball.n + after.n.astype(ball.n.dtype)),
         depth=out.impact.depth if plan.deep else None,
-        work=out.impact.work if plan.deep else None,
+        work=out.impact.work if plan.work else None,
         tangent=matrix,
     )
     event = Event(impact, (out.impact.side != 0) | late, out.quiet & ~late, out.permanent, out.stuck)

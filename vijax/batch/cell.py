@@ -43,8 +43,9 @@ class Plan(eqx.Module):
         unequal: Whether the two walls may differ.
         hard_wall: Which wall is rigid beside a soft one; 0 where both are of one kind.
         ground: What gamma is over all cells.
-        deep: Whether greatest depths and works are wanted.
+        deep: Whether greatest depths are wanted.
         energies: Whether what is harvested is wanted; needs `deep`.
+        work: Whether what impacts give to the membrane is wanted, and what is harvested is set against it.
         asymmetry: Whether the mean of v_in is wanted.
         tangent: Whether the tangent map is wanted; the search for an attractor needs it.
         variants: How many devices share the motion of a cell.
@@ -59,6 +60,7 @@ class Plan(eqx.Module):
     ground: Ground = eqx.field(static=True, default=Ground.LEVEL)
     deep: bool = eqx.field(static=True, default=False)
     energies: bool = eqx.field(static=True, default=False)
+    work: bool = eqx.field(static=True, default=False)
     asymmetry: bool = eqx.field(static=True, default=False)
     tangent: bool = eqx.field(static=True, default=True)
     variants: int = eqx.field(static=True, default=1)
@@ -117,7 +119,7 @@ class Harvest(eqx.Module):
     batch: Float[AnyArray, "lane variant"]  # what the running batch has given so far
     past: Float[AnyArray, "lane variant"]  # what all full batches have given
     square: Float[AnyArray, "lane variant"]  # the squares of what each full batch has given, added up
-    ratio: Float[AnyArray, "lane variant"]  # largest of harvested energy over what an impact gave
+    ratio: Float[AnyArray, "lane variant"] | None  # largest of harvested energy over what an impact gave
 
 
 class Tally(eqx.Module):
@@ -222,7 +224,7 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
     """Make sums of nothing yet."""
     zero = jnp.zeros_like(like)
     wide = jnp.zeros((*like.shape, plan.variants), like.dtype)
-    harvest = Harvest(wide, wide, wide, wide) if plan.energies else None
+    harvest = Harvest(wide, wide, wide, wide if plan.work else None) if plan.energies else None
     stuck = jnp.zeros(like.shape, bool) if plan.rigid or plan.hard_wall else None
     deepest = zero if plan.deep else None
     sides = Sides(zero, zero) if plan.deep and plan.unequal else None

@@ -154,7 +154,7 @@ def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int
 def _quick_outcome(walls: quick_wall.TwoWalls, pair: ImpactPair, state: State) -> tuple[exact.Outcome, Any]:
     """Take balls one impact on by the quick step; say of which it is sure."""
     ball = Ball(state.u, state.v, state.t, state.n.astype(state.t.dtype))
-    impact, _, sure, _ = quick.quick_step(walls, pair.gamma, ball, deep=True)
+    impact, _, sure, _ = quick.quick_step(walls, pair.gamma, ball, deep=True, work=True)
     after, whole, no = impact.after, state.n.dtype, jnp.zeros_like(sure)
     told = Impact(
         n=impact.onset_n.astype(whole),

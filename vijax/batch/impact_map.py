@@ -43,7 +43,7 @@ class Next(eqx.Module):
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     """Answer by the quick step."""
     wall = quick_wall.prepare(request.pair, ground=plan.ground)
-    impact, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True)
+    impact, _, sure, never = quick.quick_step(wall, request.pair.gamma, request.ball, deep=True, work=True)
     no = jnp.zeros_like(sure)
     return advance.Answer(Event(impact, sure, never, no, no), no, sure | never)
 
@@ -95,7 +95,7 @@ def next_impacts(
         t: Phase, in [0, 2).
         ground: That of all cells with which one program is shared.
     """
-    plan = Plan(until="window", **walls_of(pair), ground=ground, deep=True, tangent=False)
+    plan = Plan(until="window", **walls_of(pair), ground=ground, deep=True, work=True, tangent=False)
     pair, side, speed, t = jax.tree.map(np.asarray, (pair, side, speed, t))
     zero: Any = np.zeros_like(t)
     ball = Ball(0.5 * side * pair.d, -side * speed, t, zero)

@@ -93,4 +93,4 @@ def _traced(plan: Plan, given: Any) -> Float[Array, "ball out"]:
 
 
 def _plan(pair: ImpactPair, ground: Ground, variants: int) -> Plan:
-    return Plan(**walls_of(pair), ground=ground, deep=True, energies=True, variants=variants)
+    return Plan(**walls_of(pair), ground=ground, deep=True, work=True, energies=True, variants=variants)

@@ -135,6 +135,7 @@ def summarise(
         **walls_of(pair),
         ground=ground_of(pair.gamma),
         deep=bool(outputs & DEEP),
+        work="energy_ratio" in outputs,
         energies=bool(outputs & ENERGY),
         asymmetry="asymmetry" in outputs,
         tangent=until == "attractor" or "lyapunov" in outputs,
@@ -174,7 +175,7 @@ def _run(plan: Plan, entry: Entry, settings: Settings, real: int, size: int, on:
 
 def blank(count: int, variants: int, dtype: str) -> Summary:
     """Make an empty summary of so many cells: which shape and kind of number each field has."""
-    plan = Plan(deep=True, energies=True, asymmetry=True, unequal=True, variants=variants)
+    plan = Plan(deep=True, work=True, energies=True, asymmetry=True, unequal=True, variants=variants)
     like = shapes(plan, np.dtype(dtype))
     return rows.unpack(np.zeros((count, rows.width(like)), dtype), like)
 
@@ -213,7 +214,8 @@ def attractors(
 
 def _chained(pair: ImpactPair) -> Plan:
     """Make the plan of cells whose ends are wanted."""
-    return Plan(**walls_of(pair), ground=ground_of(pair.gamma), deep=True, energies=True, chained=True)
+    ground = ground_of(pair.gamma)
+    return Plan(**walls_of(pair), ground=ground, deep=True, work=True, energies=True, chained=True)
 
 
 def _chained_settings(

@@ -74,7 +74,7 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
         duration=impact.duration,
         after=Ball(after.u, after.v, after.t, after.n.astype(after.t.dtype)),
         depth=jnp.where(permanent, carry.depth, impact.depth) if plan.deep else None,
-        work=impact.work if plan.deep else None,
+        work=impact.work if plan.work else None,
         tangent=outcome.tangent,
     )
     # A rigid wall that has a contact of some length has held the ball.

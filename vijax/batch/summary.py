@@ -51,7 +51,8 @@ def shapes(plan: Plan, dtype: Any) -> Any:
     kinds |= dict.fromkeys(("period", "impacts_left", "impacts_right", "status"), whole)
     kinds |= {"handover": Handover(number, number, number, Ball(*[number] * 4), number)}
     asked = dict.fromkeys(energies, plan.energies)
-    asked |= {"deepest": plan.deep} | dict.fromkeys(("deepest_left", "deepest_right"), plan.deep and plan.unequal)
+    asked |= {"energy_ratio": plan.energies and plan.work, "deepest": plan.deep}
+    asked |= dict.fromkeys(("deepest_left", "deepest_right"), plan.deep and plan.unequal)
     asked |= {"asymmetry": plan.asymmetry, "lyapunov": plan.tangent, "handover": plan.chained}
     names = Summary.__dataclass_fields__
     fields: dict[str, Any] = {name: kinds.get(name, number) if asked.get(name, True) else None for name in names}
@@ -122,11 +123,7 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
     def depth(greatest):
         return jnp.where(failed, jnp.nan, jnp.where(e.silent, 0.0, greatest))
 
-    power = error = ratio = None
-    if t.harvest is not None:
-        power, error = _power(plan, settings, cell, t.harvest, e)
-        power, error = jnp.where(failed[:, None], jnp.nan, power), jnp.where(failed[:, None], jnp.nan, error)
-        ratio = jnp.where(failed[:, None], jnp.nan, jnp.where(still[:, None], 0.0, t.harvest.ratio))
+    power, error, ratio = _harvested(plan, settings, cell, e)
     depths = {"deepest": t.deepest} | named("deepest", t.deepest_sides or Sides(None, None))
     ran = cell.ball.n + 0.5 * cell.ball.t
     return Summary(
@@ -170,6 +167,18 @@ def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, "lane"], Lane | None
     if cell.tally.stuck is not None:
         status = jnp.where(cell.tally.stuck & (status == Status.OK), Status.STICKING, status)
     return period, status, lyapunov
+
+
+def _harvested(
+    plan: Plan, settings: Settings, cell: Cell, e: _End
+) -> tuple[Values | None, Values | None, Values | None]:
+    """Tell power, its standard error and the largest energy ratio, as far as they are asked for."""
+    harvest = cell.tally.harvest
+    if harvest is None:
+        return None, None, None
+    power, error = _power(plan, settings, cell, harvest, e)
+    ratio = None if harvest.ratio is None else jnp.where(e.still[:, None], 0.0, harvest.ratio)
+    return jax.tree.map(lambda x: jnp.where(e.failed[:, None], jnp.nan, x), (power, error, ratio))
 
 
 def _power(plan: Plan, settings: Settings, cell: Cell, harvest: Harvest, e: _End) -> tuple[Values, Values]:

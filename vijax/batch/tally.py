@@ -132,15 +132,18 @@ def _harvested(
 ) -> Harvest:
     """Add what one impact harvests."""
     metres = (present(impact.depth) * cell.length)[:, None] * settings.length_variant
-    speeds = cell.speed[:, None] * settings.speed_variant
     device = settings.device if cell.device is None else jax.tree.map(lambda x: x[:, None], cell.device)
     device = device.at(impact.side[:, None])
     got = share(energy.harvested_energy(device, metres))
-    given = device.m_b * speeds * speeds * present(impact.work)[:, None]
     wide, ended = counted[:, None], turned[:, None]
+    ratio = old.ratio
+    if ratio is not None:
+        speeds = cell.speed[:, None] * settings.speed_variant
+        given = device.m_b * speeds * speeds * present(impact.work)[:, None]
+        ratio = jnp.where(wide, jnp.maximum(ratio, energy.energy_ratio(got, given)), ratio)
     return Harvest(
         batch=jnp.where(ended, 0.0, old.batch) + jnp.where(wide, got, 0.0),
         past=jnp.where(ended, old.past + old.batch, old.past),
         square=jnp.where(ended, old.square + old.batch * old.batch, old.square),
-        ratio=jnp.where(wide, jnp.maximum(old.ratio, energy.energy_ratio(got, given)), old.ratio),
+        ratio=ratio,
     )

@@ -57,7 +57,7 @@ class _Exit(NamedTuple):
     sure: Bool[Array, "lane"]
 
 
-def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool) -> _Exit:
+def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool, work: bool) -> _Exit:
     """Leave a rigid wall, at once."""
     out = wall.r * flight.speed
     # In the frame of the wall the acceleration there is -sine.
@@ -66,36 +66,39 @@ def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool) -> _Exi
         push = push + onset.side * wall.incline.gamma
     contact = (-wall.r, jnp.zeros_like(out), -(1 + wall.r) * push / flight.speed, -wall.r)
     depth = wall.chi * flight.speed if deep else None
-    work = energy.membrane_work_rigid(onset.v_in, wall.r) if deep else None
+    given = energy.membrane_work_rigid(onset.v_in, wall.r) if work else None
     sure = out > 10 * stick_speed(out.dtype)
-    return _Exit(jnp.zeros_like(out), out, onset.t, onset.n, depth, work, contact, sure)
+    return _Exit(jnp.zeros_like(out), out, onset.t, onset.n, depth, given, contact, sure)
 
 
-def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, gamma: Lane) -> _Exit:
+def _release(wall: SoftWall, flight: Flight, onset: _Onset, deep: bool, work: bool, gamma: Lane) -> _Exit:
     """Leave a membrane, after a contact."""
-    left, depth, sure = touch(wall, flight, deep, onset.t + jnp.where(onset.side < 0, 1.0, 0.0))
+    left, depth, sure = touch(wall, flight, deep, work, onset.t + jnp.where(onset.side < 0, 1.0, 0.0))
     duration, out = left.duration, left.speed
     leave = onset.t + duration
     passed = jnp.floor(0.5 * leave)
-    work = None
-    if deep:
+    given = None
+    if work:
         # `touch` is sure of no short contact, and the flight knows the forcing at its end.
         c, q = -flight.sine, flight.cosine
         force = c, q, c if wall.incline is None else c - onset.side * gamma
         turn = duration, *present(left.drive)
-        work = energy.long_contact_work(wall.kappa, 2 * wall.zeta, force, turn, (flight.speed, -out))
+        given = energy.long_contact_work(wall.kappa, 2 * wall.zeta, force, turn, (flight.speed, -out))
     h = left.decay * left.sine / wall.omega1
     slope = left.decay * left.cosine - wall.zeta * h
     contact = (slope, h, -wall.kappa * wall.kappa * h, slope + 2 * wall.zeta * h)
-    return _Exit(duration, out, leave - 2 * passed, onset.n + passed, depth, work, contact, sure)
+    return _Exit(duration, out, leave - 2 * passed, onset.n + passed, depth, given, contact, sure)
 
 
-def quick_step(walls: TwoWalls, gamma: Lane, lane: Ball, *, deep: bool = False, tangent: bool = False) -> Quick:
+def quick_step(
+    walls: TwoWalls, gamma: Lane, lane: Ball, *, deep: bool = False, work: bool = False, tangent: bool = False
+) -> Quick:
     """Take every lane one impact on by the regular path.
 
     Args:
         walls: Made for ground that gamma fits.
-        deep: Also find the greatest depth and the work given to the membrane.
+        deep: Also find the greatest depth.
+        work: Also find the work given to the membrane.
         tangent: Also give the tangent map of the step, flight and saltations included.
     """
     both = apart(walls)
@@ -109,8 +112,8 @@ def quick_step(walls: TwoWalls, gamma: Lane, lane: Ball, *, deep: bool = False, 
 
     def leave(wall: Wall) -> _Exit:
         if isinstance(wall, RigidWall):
-            return _rebound(wall, flight, onset, deep)
-        return _release(wall, flight, onset, deep, gamma)
+            return _rebound(wall, flight, onset, deep, work)
+        return _release(wall, flight, onset, deep, work, gamma)
 
     if type(both.left) is type(both.right):
         leaves = leave(at(walls, side))

@@ -71,7 +71,9 @@ def _guess(wall: SoftWall, entry: ContactEntry) -> _Guess:
 
 
 @shared
-def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
+def touch(
+    wall: SoftWall, flight: Flight, deep: bool, work: bool, begins: Lane
+) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
     """Find the exit, the greatest depth if asked for, and whether w rises once and falls once until then for certain.
 
     The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
@@ -80,6 +82,9 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     when the membrane without its swing would come back.
 
     Args:
+        wall, flight: Those that meet.
+        deep: Whether the depth is asked for.
+        work: Whether what the work needs is, `Exit.drive`.
         begins: Phase of the forcing towards the wall at the onset.
     """
     eps = jnp.finfo(wall.half.dtype).eps
@@ -107,7 +112,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     if lasting is not None:
         last = lasting.ends(*single((duration, out)))
         certain = jnp.where(lasting.long, last & crest.first & present(crest.highest) if deep else last, certain)
-    depth, exact = deepest(wall, entry, crest.s) if deep else (None, jnp.ones_like(certain))
+    depth, exact = deepest(wall, entry, crest) if deep else (None, jnp.ones_like(certain))
     certain = certain & exact
     sure = wall.usable & converged & (out > 0) & certain
     turn = wall.omega1 * step
@@ -119,7 +124,7 @@ def touch(wall: SoftWall, flight: Flight, deep: bool, begins: Lane) -> tuple[Exi
     turned_cosine = cosine * reference.cosine - sine * reference.sine
     rot = wall.zeta * step
     decay = at.decay * (1 - rot * (1 - rot * (0.5 - rot * (1 / 6))))
-    drive = _turned(entry, at, PI * step) if deep else None
+    drive = _turned(entry, at, PI * step) if work else None
     return Exit(duration, out, turned_sine, turned_cosine, decay, drive), depth, sure
 
 

@@ -9,7 +9,7 @@ from vijax.engine.polynomial import EXP_REACH, REACH, exp, sine_cosine
 from vijax.engine.quick_flight import Flight
 from vijax.engine.quick_wall import SoftWall
 from vijax.model.flow import PI
-from vijax.runtime.xla import once, shared
+from vijax.runtime.xla import once, share, shared
 
 
 class ContactState(eqx.Module):
@@ -47,7 +47,7 @@ def motion(wall: SoftWall, course: ContactCourse, s: Lane) -> ContactState:
     """Compute the contact at time s from the course's reference."""
     sine, cosine = sine_cosine(wall.omega1 * s)
     drive_sine, drive_cosine = sine_cosine(PI * s)
-    decay = course.decay * exp(-wall.zeta * s)
+    decay = share(course.decay * exp(-wall.zeta * s))
     along = course.free_cos * cosine + course.free_sin * sine
     across = course.free_sin * cosine - course.free_cos * sine
     steady = course.steady_cos * drive_cosine + course.steady_sin * drive_sine

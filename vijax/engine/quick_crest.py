@@ -39,6 +39,8 @@ class FirstCrest(eqx.Module):
     """Where w' is zero for the first time, and what is certain of it."""
 
     s: Lane  # The time, counted from that of the free contact's crest.
+    push: Lane  # w'' there,
+    jerk: Lane  # and w'''.
     first: Bool[Array, "lane"]  # It is found, and w rises until then.
     only: Bool[Array, "lane"]  # w has no other extremum before the exit.
     highest: Bool[Array, "lane"] | None  # w does not come back to this height; None where that is not needed.
@@ -51,6 +53,7 @@ class _Place(eqx.Module):
     w: Lane  # The penetration there, but for what gravity adds,
     force: Lane  # the periodic part of the forcing,
     push: Lane  # w'',
+    jerk: Lane  # w''',
     drive: Lane  # and the derivative of the forcing.
     converged: Bool[Array, "lane"]
 
@@ -118,6 +121,7 @@ def _rough_place(wall: SoftWall, course: ContactCourse, hop: tuple[Bool[Array, "
         at.w + step * (at.rate + step * (0.5 * at.push + step * (1 / 6) * at.jerk)),
         at.force * cosine + at.drive * sine * (1 / PI),
         at.push + step * (at.jerk + step * (0.5 * snap + step * (1 / 6) * fifth)),
+        at.jerk + step * (snap + step * 0.5 * fifth),
         at.drive * cosine - PI * at.force * sine,
         reached & converged,
     )
@@ -183,18 +187,18 @@ def rough_crest(
     inside = (wall.omega1 * way > DOUBT) & (way < (1 - DOUBT) * wall.span)
     highest = _stays_below(wall, at) if deep and wall.ebb is not None else None
     first = at.converged & first & (wall.omega1 * when > DOUBT)
-    return FirstCrest(at.s, first, only & inside, highest)
+    return FirstCrest(at.s, at.push, at.jerk, first, only & inside, highest)
 
 
-def deepest(wall: SoftWall, entry: ContactEntry, crest: Lane) -> tuple[Lane, Bool[Array, "lane"]]:
-    """Find the greatest depth, and whether `crest`, its rough time from the free contact's, was close enough for it.
+def deepest(wall: SoftWall, entry: ContactEntry, crest: FirstCrest) -> tuple[Lane, Bool[Array, "lane"]]:
+    """Find the greatest depth, and whether the rough time of the crest was close enough for it.
 
     The depth is stationary: with Newton's step h to the crest, w + h w'/2 misses it by terms of h^3 alone.
     """
-    at = motion(wall, _crest_course(wall, entry), crest.astype(entry.speed.dtype))
+    at = motion(wall, _crest_course(wall, entry), crest.s.astype(entry.speed.dtype))
     # No more of the state is stored: each value that is takes a pass of its own.
-    depth, rate, push, jerk = share((entry.penetration(at), at.rate, at.push, at.jerk))
-    step = share(-rate / push)
+    depth, rate = share((entry.penetration(at), at.rate))
+    step = share(-rate.astype(crest.push.dtype) / crest.push)
     close = _CREST_STEP * converged_step(jnp.finfo(depth.dtype).eps)
-    near = (wall.omega1 * jnp.abs(step) < close) & (jnp.abs(jerk * step) < close * jnp.abs(push))
-    return depth + 0.5 * step * rate, near
+    near = converges(step, wall.omega1.astype(step.dtype), crest.push, crest.jerk, close)
+    return depth + 0.5 * step.astype(depth.dtype) * rate, near

@@ -287,6 +287,7 @@ def sampled_step(
     *,
     unsure: bool = False,
     deep: bool = False,
+    work: bool = False,
     tangent: bool = False,
 ) -> tuple[LaneImpact, Mask]:
     """Take every lane one impact on by certified sampling.
@@ -294,7 +295,8 @@ def sampled_step(
     Args:
         arrival: The end of the flight, where a cheaper way to it is known.
         unsure: Look for the end of flights whose `arrival` is not sure; else such a lane is declined.
-        deep: Also find the greatest depth and the work given to the membrane.
+        deep: Also find the greatest depth.
+        work: Also find the work given to the membrane.
         tangent: Also give the tangent map of the step, flight and saltations included.
 
     Returns:
@@ -306,27 +308,27 @@ def sampled_step(
     onset_n, v_in = lane.n + passed, side * speed
 
     def rigid(wall: ImpactPair) -> _Contacted:
-        out, depth, work, contact = wall.r * speed, None, None, None
-        if deep:
-            depth, work = speed * energy.rigid_depth(wall), energy.membrane_work_rigid(v_in, wall.r)
+        out, contact = wall.r * speed, None
+        depth = speed * energy.rigid_depth(wall) if deep else None
+        given = energy.membrane_work_rigid(v_in, wall.r) if work else None
         if tangent:
             push = flow.acceleration(pair.gamma, onset_t)
             contact = (-wall.r, jnp.zeros_like(out), (1 + wall.r) * push / v_in, -wall.r)
-        return _Contacted(jnp.zeros_like(speed), out, depth, work, contact, out > 10 * stick_speed(out.dtype))
+        return _Contacted(jnp.zeros_like(speed), out, depth, given, contact, out > 10 * stick_speed(out.dtype))
 
     def soft(wall: ImpactPair) -> _Contacted:
-        m, work, contact = flow.membrane(wall), None, None
+        m, given, contact = flow.membrane(wall), None, None
         duration, out, depth, certain = _touch(m, flow.contact_force(pair.gamma, side, onset_t), speed, deep)
-        if deep:
-            work = energy.membrane_work(m.kappa, m.mu, pair.gamma, side, onset_t, duration, v_in, -side * out)
+        if work:
+            given = energy.membrane_work(m.kappa, m.mu, pair.gamma, side, onset_t, duration, v_in, -side * out)
         if tangent:
             h, slope = flow.free_response(m, duration)
             contact = (slope, h, -m.kappa * m.kappa * h, slope + m.mu * h)
-        return _Contacted(duration, out, depth, work, contact, certain)
+        return _Contacted(duration, out, depth, given, contact, certain)
 
-    duration, out, depth, work, contact, certain = pair.met(side, rigid, soft)
+    duration, out, depth, given, contact, certain = pair.met(side, rigid, soft)
     sure = sure & certain
     leave_t, passed = flow.wrap_phase(onset_t + duration)
     after = Ball(0.5 * side * pair.d, -side * out, leave_t, onset_n + passed)
     matrix = None if contact is None else through(contact, flight)
-    return LaneImpact(onset_t, onset_n, side, v_in, -side * out, flight, duration, after, depth, work, matrix), sure
+    return LaneImpact(onset_t, onset_n, side, v_in, -side * out, flight, duration, after, depth, given, matrix), sure

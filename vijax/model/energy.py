@@ -39,7 +39,9 @@ def stretch(device: Harvester, depth: Values) -> Values:
     # 1 - cos(alpha) = rise/(over reach): the difference itself has no digit left below depth 1e-8 R0.
     rise = x * x * (tangent * (1 + tangent) + ball * (2 * ball - x))
     over = (1 + tangent) ** 2
-    return rise / (over * (ball * (ball - x) + tangent)) * (1 - ball * ball * rise / (over * reach))
+    # One division for both quotients: it takes as long as all the rest.
+    near, far = ball * (ball - x) + tangent, over * reach
+    return rise * (far - ball * ball * rise) / (over * near * far)
 
 
 def _rest_capacitance(device: Harvester) -> Values:
