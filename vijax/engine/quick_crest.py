@@ -108,7 +108,7 @@ def _rough_place(wall: SoftWall, course: ContactCourse, hop: tuple[Bool[Array, "
         reached = reached & in_reach(wall, s)
     at = share(motion(wall, course, jnp.where(reached, s, 0.0)))
     snap, fifth = share(further(wall, at))
-    step = share(_toward(wall, at))
+    step = share(householder(at.rate, at.push, at.jerk, snap))
     missed = share(correction(step, (at.rate, at.push, at.jerk, snap, fifth)))
     step, s = share((step + missed, s + step + missed))
     converged = converges(step, wall.omega1, at.push, at.jerk, _STEP) & (at.push < 0)

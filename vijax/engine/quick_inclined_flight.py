@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float32
 from vijax.engine.impact import Ball, Lane
 from vijax.engine.polynomial import phase
 from vijax.engine.quick_flight import Flight, reflected
-from vijax.engine.roots import householder, single
+from vijax.engine.roots import correction, householder, single
 from vijax.model.flow import PI
 from vijax.runtime.arrays import choose
 from vijax.runtime.xla import share, shared
@@ -232,10 +232,8 @@ def _root(goal: _Motion, guess: Rough, width: Rough) -> _Root:
     y = share(y.astype(goal.level.dtype))
     f, f1, f2, f3, f4 = share(_derivatives(goal, y))
     step = share(householder(f, f1, f2, f3))
-    value = f + step * (f1 + step * (0.5 * f2 + step * ((1 / 6) * f3 + step * ((1 / 24) * f4 - step * (1 / 120) * f3))))
-    slant = f1 + step * (f2 + step * (0.5 * f3 + step * (1 / 6) * f4))
-    more = share(value / slant)
-    step = step - more
+    more = share(correction(step, (f, f1, f2, f3, f4, -f3)))
+    step = step + more
     square = step * step
     turn_sine, turn_cosine = step * (1 - square * (1 / 6)), 1 - square * (0.5 - square * (1 / 24))
     sine, cosine = f3 * turn_cosine + f4 * turn_sine, f4 * turn_cosine - f3 * turn_sine
