@@ -8,6 +8,7 @@ import pytest
 
 import vijax
 from benchmarks.derivatives import derivatives, differences, events, relative
+from vijax.batch import exact_run
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Status
 
@@ -54,6 +55,20 @@ def test_starts_may_be_lists():
     jax.tree.map(np.testing.assert_array_equal, listed, arrays)
     with pytest.raises(ValueError, match="v0 must be a real number or an array of them; got"):
         vijax.trajectory(pair, 0.0, [0.3, "fast"], 2)
+
+
+@pytest.mark.parametrize(
+    ("kappa", "dtype", "periods"), [(40.0, "float64", 6), (None, "float32", 6), (40.0, "float64", 900)]
+)
+def test_the_program_that_is_begun_beside_is_the_one_that_is_needed(monkeypatch, kappa, dtype, periods):
+    begun, needed, strobes = [], [], exact_run.balls_at
+    monkeypatch.setattr(exact_run, "begin", lambda work, rows: begun.append(rows))
+    monkeypatch.setattr(exact_run, "balls_at", lambda rows: needed.append(rows) or strobes(rows))
+    pair = jax.tree.map(lambda x: np.asarray(x, dtype), impact_pair(0.2, kappa, 0.5))
+    vijax.trajectory(pair, np.zeros(8, dtype), np.full(8, 0.3, dtype), periods)
+    (rows,), first = begun, needed[0]
+    shapes = (jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), each) for each in (rows, first))
+    assert next(shapes) == next(shapes)
 
 
 def test_too_few_impacts_are_said():
