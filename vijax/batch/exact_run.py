@@ -127,12 +127,12 @@ def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Re
     parts = []
     reached = _nowhere(starts[0].size, starts[0].dtype)
     for first in range(0, steps, _STRETCH):
-        reached, flown = _stretch(asked, pair, starts, reached, np.int32(first))
-        parts.append(jax.tree.map(np.asarray, flown))
-        if np.asarray(reached.over).all():
+        # NumPy's arrays, as the first ones are: with JAX's own JAX compiles the program once more.
+        reached, flown = jax.tree.map(np.asarray, _stretch(asked, pair, starts, reached, np.int32(first)))
+        parts.append(flown)
+        if reached.over.all():
             break
-    flown = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
-    return jax.tree.map(np.asarray, reached), flown
+    return reached, jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
 
 
 def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Trajectory:
