@@ -11,8 +11,8 @@ import pytest
 from vijax.engine.ground import Ground
 from vijax.engine.impact import Ball
 from vijax.engine.quick_contact import _guess, _rough_exit, free_reference
-from vijax.engine.quick_course import ContactEntry, course_at, entry_of, in_reach, motion
-from vijax.engine.quick_crest import _crest_course, _rough_place
+from vijax.engine.quick_course import ContactEntry, course_at, entry_of, further, in_reach, motion
+from vijax.engine.quick_crest import FirstCrest, _crest_course, _rough_place, deepest
 from vijax.engine.quick_flight import fly
 from vijax.engine.quick_inclined_flight import fly as fly_inclined
 from vijax.engine.quick_wall import SoftWall, prepare
@@ -95,3 +95,29 @@ def test_the_contact_at_the_crest_is_that_of_its_closed_form(contacts):
     assert np.max((np.abs(place.push - at.push) / size)[some]) < 3e-5
     assert np.max((np.abs(place.w - at.w) * wall.kappa**2 / size)[some]) < 3e-5
     assert np.max((np.abs(at.rate) * wall.kappa / size)[some]) < 3e-5
+
+
+@jax.jit
+def depths(wall: SoftWall, entry: ContactEntry, away):
+    """Take depths so far from crests, in radians of the swing: where they are known, which pass as near, errors."""
+    place, _ = crests(wall, entry)
+    course, s = _crest_course(wall, entry), place.s.astype(float)
+    for _ in range(4):
+        at = motion(wall, course, s)
+        step = householder(at.rate, at.push, at.jerk, further(wall, at)[0])
+        s = s + step
+    known = place.converged & (wall.omega1 * jnp.abs(step) < 1e-12)
+    push, jerk = single((at.push, at.jerk))
+    depth, near = deepest(wall, entry, FirstCrest(s + away / wall.omega1, push, jerk, known, known, None))
+    best = entry.penetration(motion(wall, course, s))
+    # Rounding is that of the parts of w, whose sum is small where contacts are shallow.
+    parts = jnp.hypot(entry.steady_cos, entry.steady_sin) + jnp.hypot(entry.free_cos, entry.free_sin)
+    return known, near, jnp.abs(depth - best) / parts
+
+
+@pytest.mark.parametrize(("away", "share"), [(1e-6, 0.99), (1e-5, 0.9), (1.6e-5, 0.0)])
+def test_a_depth_is_taken_near_the_crest_alone_and_is_right_there(contacts, away, share):
+    known, near, error = map(np.asarray, depths(contacts.wall, contacts.entry, away))
+    assert known.mean() > 0.97
+    assert (near[known].mean() > share) if share else not near[known].any()
+    assert error[known & near].max(initial=0) < 2e-15
