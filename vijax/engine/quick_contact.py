@@ -84,7 +84,7 @@ def touch(
     Args:
         wall, flight: Those that meet.
         deep: Whether the depth is asked for.
-        work: Whether what the work needs is, `Exit.drive`.
+        work: Whether `Exit.drive` is, of which the work is made.
         begins: Phase of the forcing towards the wall at the onset.
     """
     eps = jnp.finfo(wall.half.dtype).eps

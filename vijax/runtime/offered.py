@@ -1,7 +1,7 @@
-"""What a package offers, loaded name by name: a room is when something of it is first asked for.
+"""What a package offers, loaded name by name: a room is loaded when something of it is first asked for.
 
-All rooms of vijax take half a second to load, those of one question half of that. The imports of a file say to a type
-checker what is offered and where it stands; the same lines are read here, and not run.
+All rooms of vijax take half a second to load, those that a trajectory needs half of that. The imports of a file say to
+a type checker what is offered and where it stands; the same lines are read here, and not run.
 """
 
 import ast
