@@ -26,10 +26,11 @@ _MOST_STEPS = 15
 _HALF = 0.5
 _ARRIVED = 1e-10
 # A contact is looked for at so many durations, closer to each other where they are short, up to so many half turns of
-# the membrane.
-_DURATIONS, _HALF_TURNS = 64, 8
+# the membrane; the longest is shorter than that by this share of the way between two.
+_DURATIONS, _HALF_TURNS, _SHORTEST = 65, 8, 1e-6
 # Of an interval so many motions are told: where the miss changes its sign, and two each where it turns back.
 _CROSSINGS, _TURNS = 4, 2
+_HALVINGS = 10  # of the way between two durations, until Newton goes on
 _MOTIONS = _CROSSINGS + 2 * _TURNS
 # Places in a contact and in a flight where the ball must be on the right side of the walls.
 _PLACES = tuple(k / 8 for k in range(1, 8))
@@ -110,7 +111,8 @@ def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Motion:
     longest = jnp.minimum(_HALF_TURNS * jnp.pi / wall.omega1, ends.next_t - ends.t)
 
     def stay_at(place: Values) -> Values:
-        return (place / (_DURATIONS + 1)) ** 1.5 * longest
+        # The last leaves room for the shortest flight.
+        return (jnp.minimum(place, _DURATIONS - _SHORTEST) / _DURATIONS) ** 1.5 * longest
 
     def at(place: Scalar) -> tuple[Scalar, Motion]:
         """Give the miss, times the impulse response, and the speed that fits both conditions best."""
@@ -122,10 +124,11 @@ def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Motion:
         speed = (slope * (wanted - z) - stiff * h * w) / (stiff * h * h + slope * slope)
         return h * (z - wanted) - w * slope, Motion(speed, stay)
 
-    places = 1 + jnp.arange(_DURATIONS, dtype=ends.t.dtype)
+    places = 1.0 + jnp.arange(_DURATIONS, dtype=ends.t.dtype)
     miss, _ = jax.vmap(at)(places)
-    crosses = miss[:-1] * miss[1:] < 0
-    crossings = _first(crosses, places[:-1] + miss[:-1] / (miss[:-1] - miss[1:]), _CROSSINGS)
+    # Of two motions that are close to each other Newton finds one twice, from where neither is much nearer.
+    before_crossing = _first(miss[:-1] * miss[1:] < 0, places[:-1], _CROSSINGS)
+    crossings = jax.vmap(partial(_halved, lambda place: at(place)[0]))(before_crossing)
     before, here, after = miss[:-2], miss[1:-1], miss[2:]
     bend, rise = (before + after) / 2 - here, (after - before) / 2
     turns = (before * here > 0) & (here * after > 0) & (here * bend > 0) & (jnp.abs(rise) <= 2 * jnp.abs(bend))
@@ -134,6 +137,17 @@ def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Motion:
     found = jnp.concatenate([crossings, *(_first(turns, root, _TURNS) for root in roots)])
     _, guess = jax.vmap(at)(found)
     return jax.tree.map(lambda x: jnp.where(guess.speed > 0, x, jnp.nan), guess)
+
+
+def _halved(miss: Callable[[Scalar], Scalar], low: Scalar) -> Scalar:
+    """Find where a function changes its sign between `low` and `low` + 1, to a thousandth."""
+    sign = jnp.sign(miss(low))
+
+    def half(k: Array, low: Scalar) -> Scalar:
+        middle = low + 0.5 ** (k + 1)
+        return jnp.where(sign * miss(middle) > 0, middle, low)
+
+    return lax.fori_loop(0, _HALVINGS, half, low) + 0.5 ** (_HALVINGS + 1)
 
 
 def _first(real: Array, values: Array, count: int) -> Array:
