@@ -8,6 +8,7 @@ import pytest
 from benchmarks.yardstick import TILE, both_ways, long_contact, march, pairs, start
 from vijax.engine import exact, sampled
 from vijax.engine.impact import Arrival, Ball
+from vijax.engine.sampling import joined, least
 from vijax.model.records import State
 from vijax.runtime.unrolled import unrolled
 
@@ -40,6 +41,22 @@ def both(request):
         parts.append(jax.tree.map(np.asarray, program(jax.tree.map(jnp.asarray, pair), lane)))
     hit, sure = jax.tree.map(lambda *x: np.stack(x, axis=1).reshape(TILE * many), *parts)
     return request.param, flat, hit, sure
+
+
+@pytest.mark.parametrize("count", [1, 2, 31, 32])
+def test_samples_are_joined_however_many(count):
+    samples = jnp.asarray(np.random.default_rng(count).normal(size=(count, 5)))
+    np.testing.assert_array_equal(least(samples), samples.min(axis=0))
+    order = jnp.arange(count, dtype=float)[:, None] + jnp.zeros(5)
+    height, when = joined(sampled._higher_of, (samples, order))
+    np.testing.assert_array_equal((height, when), (samples.max(axis=0), samples.argmax(axis=0)))
+
+
+@pytest.mark.parametrize("places", [(3, 17), (15, 16), (1, 30, 31)])
+def test_of_equal_samples_the_first_is_the_highest(places):
+    heights = jnp.zeros((32, 1)).at[jnp.asarray(places)].set(1.0)
+    _, when = joined(sampled._higher_of, (heights, jnp.arange(32.0)[:, None]))
+    assert when == places[0]
 
 
 def test_where_sure_it_agrees_with_the_exact_step(both):

@@ -124,10 +124,19 @@ def test_half_turn_is_relative_near_zero_and_exact_at_quadrants():
             )
             for value, true, size in zip(values[:, k], truth, sizes, strict=True):
                 assert abs(value - true) <= 3 * EPS * size, (s[k], value)
-    sine, cosine, _, _ = flow.half_turn(jnp.arange(-8, 9) / 2)
+    sine, cosine = flow.phasor(jnp.arange(-8, 9) / 2)
     assert np.all(np.asarray(sine)[::2] == 0)
     assert np.all(np.asarray(cosine)[1::2] == 0)
     assert np.all(np.abs(np.asarray(sine)[1::2]) == 1)
+
+
+def test_a_phasor_moves_as_sine_and_cosine_do():
+    s = jnp.concatenate([jnp.linspace(-3.0, 3.0, 61), jnp.asarray([1e-9, 0.25, 1.75])])
+    sine, cosine = flow.phasor(s)
+    moved = jax.jvp(flow.phasor, (s,), (jnp.ones_like(s),))[1]
+    np.testing.assert_array_equal(moved, (np.pi * cosine, -np.pi * sine))
+    bent = jax.vmap(jax.grad(jax.grad(lambda s: flow.phasor(s)[0])))(s)
+    np.testing.assert_allclose(bent, -(np.pi**2) * sine, rtol=0, atol=4 * EPS * np.pi**2)
 
 
 def test_steady_response_solves_the_equation(contacts):

@@ -59,7 +59,7 @@ def _free_end(m: Membrane, w: Scalar, z: Scalar) -> Scalar:
 
 def _amplitude(m: Membrane, steady: Force, w: Scalar, z: Scalar, s: Scalar) -> Scalar:
     """Bound the homogeneous part from time s on: it only decays."""
-    sin_s, cos_s, _, _ = flow.half_turn(s)
+    sin_s, cos_s = flow.phasor(s)
     free = w - (steady.c * cos_s - steady.q * sin_s - steady.g)
     rate = z + PI * (steady.c * sin_s + steady.q * cos_s)
     return jnp.hypot(free, (rate + m.zeta * free) / m.omega1)
@@ -230,26 +230,23 @@ def turning_points(
     sign = jnp.where(rising, 1.0, -1.0).astype(w0.dtype)
     start = _Visit(jnp.int32(length is not None), zero, sign, wanted, no, blank)
     end = lax.while_loop(lambda v: v.going & (v.number <= patience), visit, start)
-    seen = _settled_turns(contact, end)
+    seen = _settled_turns(steady, end)
     return eqx.tree_at(lambda t: t.lost, seen, end.going | seen.lost)
 
 
-def _settled_turns(contact: _Oscillator, end: _Visit) -> Turns:
+def _settled_turns(steady: Force, end: _Visit) -> Turns:
     """Add the turning points of the steady response to those seen, where nothing else is left of the oscillation.
 
     It is highest at a phase and lowest half a period later: each once, the first still ahead.
     """
-    known = -jnp.arctan2(contact.steady.q, contact.steady.c) / PI
-
-    def look(low: Array, seen: Turns) -> Turns:
-        when = known + low.astype(known.dtype)
+    size = jnp.hypot(steady.c, steady.q)
+    highest = -jnp.arctan2(steady.q, steady.c) / PI
+    seen = end.seen
+    for when, w, rises in ((highest, size, False), (highest + 1, -size, True)):
         ahead = when + 2 * jnp.ceil(0.5 * (end.s - when))
         there = end.settled & (ahead > 0) & (ahead < seen.exit)
-        w, _ = contact.at(jnp.where(there, ahead, 0.0))
-        return compared(seen, ahead, w, there, there & (low == 1))
-
-    # A loop, so that a program holds the membrane's flow once for both.
-    return lax.fori_loop(0, 2, look, end.seen)
+        seen = compared(seen, ahead, w - steady.g, there, there & rises)
+    return seen
 
 
 def compared(seen: Turns, s: Scalar, w: Scalar, turns: Flag, rises: Flag) -> Turns:

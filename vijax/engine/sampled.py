@@ -4,7 +4,7 @@ A lane whose crossing `sampling` cannot tell for sure is declined, and `exact.st
 in it that has to converge, which makes it several times cheaper than the careful step.
 """
 
-from functools import partial, reduce
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ from vijax.engine.sampling import (
     chord,
     curb_of,
     first_crossing,
+    joined,
     least,
     onward,
     powers,
@@ -55,14 +56,14 @@ def _fly(pair: ImpactPair, lane: Ball, known: Arrival | None = None) -> Arrival:
     order = jnp.arange(1, SAMPLES + 1, dtype=half.dtype)[:, None]
 
     def advance(at: Pass) -> Pass:
-        sine, cosine, _, _ = flow.half_turn(lane.t + at.s)
+        sine, cosine = flow.phasor(lane.t + at.s)
         u = level + at.s * (drift - 0.5 * gamma * at.s) - cosine / PI**2
         v = drift - gamma * at.s + sine / PI
         # Where the flight begins the gap is 0, not its rounding.
         right, left = jnp.maximum(half - u, 0.0), jnp.maximum(half + u, 0.0)
         safe = jnp.minimum(safe_for(right, -v, bend), safe_for(left, v, bend))
         h = share(jnp.minimum(FINEST * at.zoom, 0.5 * safe))
-        turn_sine, turn_cosine, _, _ = flow.half_turn(h)
+        turn_sine, turn_cosine = flow.phasor(h)
         re, im = powers(turn_cosine, turn_sine)
         s = at.s + h * order
         push = share(cosine * re - sine * im)
@@ -79,7 +80,7 @@ def _fly(pair: ImpactPair, lane: Ball, known: Arrival | None = None) -> Arrival:
     at = chord(found)
     for _ in range(2):
         rise, v = flow.flight(force, lane.v, at)
-        sine, cosine, _, _ = flow.half_turn(lane.t + at)
+        sine, cosine = flow.phasor(lane.t + at)
         push, jerk = gamma - cosine, PI * sine
         step = householder(distance - found.side * rise, -found.side * v, found.side * push, found.side * jerk)
         at, step = share((at + step, step))
@@ -191,7 +192,7 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
         finest = FINEST * at.zoom * jnp.minimum(1.0, PI / m.omega1)
         h = share(jnp.minimum(finest, 0.5 * safe_for(jnp.maximum(w, 0.0), z, bend)))
         decay, turn = jnp.exp(-m.zeta * h), m.omega1 * h
-        drive_sine, drive_cosine, _, _ = flow.half_turn(h)
+        drive_sine, drive_cosine = flow.phasor(h)
         turns = jnp.stack([decay * jnp.cos(turn), drive_cosine]), jnp.stack([decay * jnp.sin(turn), drive_sine])
         real, imaginary = powers(*share(turns))
         (re, drive_re), (im, drive_im) = share((real[:, 0], real[:, 1])), share((imaginary[:, 0], imaginary[:, 1]))
@@ -223,9 +224,11 @@ def _touch(m: Membrane, force: Force, speed: Lane, deep: bool) -> tuple[Lane, La
     return share((duration, out, depth, sure))
 
 
-def _higher_of(one: tuple[Lane, Lane], other: tuple[Lane, Lane]) -> tuple[Lane, Lane]:
+def _higher_of(one: tuple[Samples, Samples], other: tuple[Samples, Samples]) -> tuple[Samples, Samples]:
     """Take the higher of two samples with its time, the first of equals: heights that recur may differ in rounding."""
-    return jax.tree.map(partial(jnp.where, other[0] > one[0]), other, one)
+    (height, when), (other_height, other_when) = one, other
+    beaten = (other_height > height) | ((other_height == height) & (other_when < when))
+    return jax.tree.map(partial(jnp.where, beaten), other, one)
 
 
 @shared
@@ -255,7 +258,7 @@ def _higher(at: Pass, w: Samples, push: Samples, s: Samples, h: Lane, bounds: tu
     most_bend, bend_size = share(_bends(push, h, *bounds))
     order = jnp.arange(SAMPLES, dtype=w.dtype)[:, None]
     seen = share(jnp.where(order <= last, w, -jnp.inf))
-    top, when = share(reduce(_higher_of, zip(seen, s, strict=True)))
+    top, when = share(joined(_higher_of, (seen, s)))
     former = at.crest
     better = share(top > former.height)
     when, height = share((jnp.where(better, when, former.when), jnp.where(better, top, former.height)))

@@ -6,8 +6,8 @@ one if a - b > M h^2/2. A lane with a closer call is told to be in doubt.
 """
 
 from collections.abc import Callable
-from functools import reduce
-from typing import NamedTuple
+from operator import itemgetter
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,8 @@ from vijax.runtime.xla import on_cpu, share, shared
 Samples = Float[Array, "sample lane"]
 Rows = Float[Array, "*row lane"]
 Powers = Float[Array, "sample *row lane"]
+
+T = TypeVar("T")
 
 SAMPLES = 32  # A pass takes so many; a power of two, as `powers` doubles them.
 _PASSES = 6  # After these a lane is declined, for the careful step to do: more keep the others waiting.
@@ -60,10 +62,24 @@ def powers(re: Rows, im: Rows) -> tuple[Powers, Powers]:
     return real, imaginary
 
 
+def joined(join: Callable[[T, T], T], samples: T) -> T:
+    """Join all samples of each lane, half with half until one is left: whole rows, of which LLVM makes vectors.
+
+    Args:
+        join: Makes one of two, arrays or trees of them: in any order, and a sample may be its own partner.
+        samples: Any number of rows; a chain of joins would be six times as much to compile.
+    """
+    count = jax.tree.leaves(samples)[0].shape[0]
+    while count > 1:
+        count = (count + 1) // 2
+        samples = join(*(jax.tree.map(itemgetter(half), samples) for half in (slice(count), slice(-count, None))))
+    return jax.tree.map(itemgetter(0), samples)
+
+
 @shared
 def least(samples: Samples) -> Lane:
-    """Find the smallest of each lane: a chain over whole rows is one vector loop, XLA's reduction a scalar one."""
-    return reduce(jnp.minimum, samples)
+    """Find the smallest of each lane; XLA's reduction is a scalar loop."""
+    return joined(jnp.minimum, samples)
 
 
 def safe_for(gap: Lane, rate: Lane, bend: Lane) -> Lane:

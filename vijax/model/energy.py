@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from vijax.model import units
 from vijax.model.device import Harvester, check_device
-from vijax.model.flow import half_turn
+from vijax.model.flow import half_turn, phasor
 from vijax.model.pair import ImpactPair
 from vijax.model.units import Given
 from vijax.runtime import checks
@@ -250,7 +250,7 @@ def membrane_work(
     Source: physics.md, "Energy and power"; both forms against quadrature in test_energy.py.
     """
     side = jnp.asarray(side, v_in.dtype)
-    sin_0, cos_0, _, _ = half_turn(t_in)
+    sin_0, cos_0 = phasor(t_in)
     turn = half_turn(duration)
     sin_s, cos_s, _, _ = turn
     c, q, steady = side * cos_0, side * sin_0, side * gamma

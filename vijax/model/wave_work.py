@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from vijax.model.energy import SHORT_REACH, short_contact_work
-from vijax.model.flow import PI, Membrane, half_turn
+from vijax.model.flow import PI, Membrane, half_turn, phasor
 from vijax.model.waves import Wave, Waves, later, pushing
 from vijax.runtime.arrays import Values
 
@@ -67,7 +67,7 @@ def _received(
 ) -> Values:
     """Integrate one harmonic's push times the velocity; `bends` is the acceleration at onset and at exit."""
     n = wave.order * PI
-    sine, cosine, _, _ = half_turn(wave.order * duration)
+    sine, cosine = phasor(wave.order * duration)
     (z_in, z_out), (bend_in, bend_out) = z, bends
     cos_f, sin_f = _against_slopes(wave.order, waves, duration)
     cos_side = cos_f - (cosine * bend_out - bend_in + n * sine * z_out + m.mu * (cosine * z_out - z_in))

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vijax.model.flow import PI, Force, Membrane, flight, half_turn, oscillate, steady_response
+from vijax.model.flow import PI, Force, Membrane, flight, oscillate, phasor, steady_response
 from vijax.model.pair import ImpactPair
 from vijax.runtime.arrays import Values
 
@@ -23,7 +23,7 @@ class Wave(eqx.Module):
 
     def later(self, s: Values) -> "Wave":
         """Start its clock a time s later."""
-        sine, cosine, _, _ = half_turn(self.order * s)
+        sine, cosine = phasor(self.order * s)
         return Wave(self.order, self.c * cosine - self.q * sine, self.q * cosine + self.c * sine)
 
     def times(self, factor: Values) -> "Wave":
@@ -40,7 +40,7 @@ Waves = tuple[Wave, ...]
 
 def sine(t: Values) -> Waves:
     """Give the paper's forcing, cos(pi t), from a phase on."""
-    sin_t, cos_t, _, _ = half_turn(t)
+    sin_t, cos_t = phasor(t)
     return (Wave(1, cos_t, sin_t),)
 
 
