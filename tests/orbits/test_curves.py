@@ -108,7 +108,10 @@ def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
     assert told == [("flip", 2, 2), ("flip", 3, 2), ("fold", 3, 2), ("grazing", 2, 2), ("grazing", 4, 4)]
     for curve in grown:
         assert (np.asarray(curve.orbit.residual) < 1e-12).all()
-        assert (np.asarray(curve.orbit.status)[1:-1] == Status.OK).all()
+        # A curve may begin within rounding of its end, where rounding says whether its orbits are real.
+        off = np.abs(curve.values - curve.values[[0, -1], None]).max(axis=2).min(axis=0)
+        assert (off[2:-2] > 1e-12).all()
+        assert (np.asarray(curve.orbit.status)[off > 1e-12] == Status.OK).all()
 
 
 def test_a_fold_and_a_flip_touch_their_graze_at_its_resonance(grown):

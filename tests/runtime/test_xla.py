@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jax import export, lax
 
 import vijax
 from vijax.runtime import xla
-from vijax.runtime.xla import first, in_blocks, kernel, put, search, share, whole_blocks
+from vijax.runtime.xla import each, first, in_blocks, kernel, put, search, share, whole_blocks
 
 X = jnp.linspace(0.1, 2.0, 192)
 MARK = "xla_cpu_small_call"
@@ -195,3 +196,24 @@ def test_a_misspelt_switch_is_named():
         done.stderr.splitlines()[-1]
         == "ValueError: VIJAX_KERNELS must be 0 (no kernels) or 1; got 'off'; see docs: limits"
     )
+
+
+def loops(work, *balls):
+    """Whether a program of the work has a loop over balls."""
+    return any(eqn.primitive.name == "scan" for eqn in jax.make_jaxpr(work)(*balls).eqns)
+
+
+def test_few_balls_are_taken_one_after_another_and_many_abreast(monkeypatch):
+    def work(x, row, *, factor):
+        return {"one": factor * jnp.sin(x), "row": x + row.sum()}
+
+    few, many = (jnp.linspace(0.1, 1.0, count) for count in (64, 65))
+    some = partial(each(work), factor=2.0)
+    for x in (few, many):
+        rows = jnp.stack([x, x * x], axis=1)
+        near = partial(np.testing.assert_allclose, rtol=1e-15)
+        jax.tree.map(near, some(x, rows), jax.vmap(partial(work, factor=2.0))(x, rows))
+        assert loops(some, x, rows) == (xla.on_cpu() and x.size == 64)
+    monkeypatch.setattr(xla, "on_cpu", lambda: False)
+    # Another function: JAX remembers what it traced.
+    assert not loops(partial(each(work), factor=2.0), few, jnp.stack([few, few], axis=1))

@@ -1,11 +1,9 @@
 """One impact of every lane by the exact engine: the quick step, a service for what it declines."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from vijax.batch.cell import Cell, Event, Lane, Mask, Plan, Settings
@@ -95,12 +93,12 @@ def sampled_answer(plan: Plan, request: Request) -> Answer:
     return Answer(Event(impact, sure, no, no, no), no, sure)
 
 
-def careful_answer(plan: Plan, request: Request) -> Answer:
-    """Answer by `exact.step`, which is sure of every lane."""
+def careful_answer(plan: Plan, request: Request, *, rolled: bool = False) -> Answer:
+    """Answer by `exact.step`, which is sure of every lane; `rolled` is as there."""
     pair, ball, held = request.pair, request.ball, request.held
     horizon = 2 * (jnp.maximum(request.end - ball.n, 0.0) + QUIET)
     state = State(ball.u, ball.v, ball.t, jnp.zeros(ball.n.shape, jnp.int32), held.astype(jnp.int32))
-    out = jax.vmap(partial(exact.step, deep=plan.deep))(pair, state, horizon)
+    out = xla.each(exact.step)(pair, state, horizon, deep=plan.deep, rolled=rolled)
     matrix = None
     if plan.tangent:
         rows = exact.tangent(pair, out)

@@ -17,7 +17,7 @@ from vijax.model.records import Impact, State, Status
 from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray, choose
 from vijax.runtime.programs import begin, jitted
-from vijax.runtime.xla import once
+from vijax.runtime.xla import each, once
 
 # The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
 # call, and few enough that the host waits for no long one after every ball has arrived.
@@ -86,7 +86,7 @@ def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArr
 
         @once
         def fly():
-            return jax.vmap(partial(exact.step, rolled=True))(pair, state, horizon)
+            return each(exact.step)(pair, state, horizon, rolled=True)
 
         def rest():
             return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(fly))

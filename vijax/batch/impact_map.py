@@ -57,6 +57,11 @@ def _sampled_answer(plan: Plan, request: advance.Request) -> advance.Answer:
     return advance.sampled_answer(plan, request)
 
 
+def _careful_answer(plan: Plan, request: advance.Request) -> advance.Answer:
+    """Answer by the careful step, whose program is compiled for longer than it runs."""
+    return advance.careful_answer(plan, request, rolled=True)
+
+
 @lru_cache(maxsize=16)
 def _compiled(answer: Callable, plan: Plan):
     def work(request: advance.Request) -> tuple[Next, Bool[AnyArray, "ball"]]:
@@ -103,7 +108,7 @@ def next_impacts(
     # What one step is not sure of is left to the next, which costs several times as much. For a few balls that is less
     # than what the programs of the others take to compile.
     few = requests.held.size <= _TILES[0]
-    first, *others = [advance.careful_answer] if few else [_quick_answer, _sampled_answer, advance.careful_answer]
+    first, *others = [_careful_answer] if few else [_quick_answer, _sampled_answer, _careful_answer]
     found, sure = _answered(_compiled(first, plan), requests)
     for step in others:
         rest = np.flatnonzero(~sure)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from vijax.engine.contact_search import PATIENCE, exit_and_crest, first_return
 from vijax.engine.flight_search import next_wall
 from vijax.engine.forcing_sign import spell_after
-from vijax.engine.roots import implicit_root
+from vijax.engine.roots import implicit_root, implicit_state
 from vijax.model import energy, flow
 from vijax.model.flow import Membrane
 from vijax.model.pair import ImpactPair
@@ -65,29 +65,33 @@ def _soft_contact(
     if deep:
         duration, when = exit_and_crest(*frozen, wanted, patience)
     else:
-        duration = first_return(*frozen, wanted, patience)
-    ends = wanted & jnp.isfinite(duration)
-    duration = jnp.where(ends, implicit_root(_penetration, jnp.where(ends, duration, 1.0), args), duration)
-    _, z = flow.oscillate(*args, jnp.where(ends, duration, 0.0))
-    if not deep:
-        return duration, -z, jnp.full_like(z, jnp.nan)
-    turned = wanted & (when > 0)
-    when = jnp.where(turned, implicit_root(_penetration_rate, jnp.where(turned, when, 1.0), args), when)
-    depth, _ = flow.oscillate(*args, when)
-    return duration, -z, depth
+        duration, when = first_return(*frozen, wanted, patience), jnp.zeros_like(w0)
+    ends, turned = wanted & jnp.isfinite(duration), wanted & (when > 0)
+
+    def look(which: Array, seen: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+        exits = which == 0
+        # Where there is none, the harmless time 1 stands there meanwhile; a crest that is not known is NaN.
+        known, s = jnp.where(exits, ends, turned), jnp.where(exits, duration, when)
+        found, state = implicit_state(_exit_or_crest, jnp.where(known, s, 1.0), (which, args))
+        s, state = jnp.where(known, found, s), jnp.where(known, state, jnp.where(exits, z0, w0 + 0.0 * when))
+        return jnp.where(exits, s, seen[0]), jnp.where(exits, state, seen[1]), state
+
+    # A loop, so that a program holds the membrane's flow once for both, and its derivatives.
+    duration, z, depth = lax.fori_loop(0, 1 + deep, look, (duration, z0, when))
+    return duration, -z, depth if deep else jnp.full_like(z, jnp.nan)
 
 
-def _penetration(s, args):
-    return flow.oscillate(*args, s)[0]
-
-
-def _penetration_rate(s, args):
-    return flow.oscillate(*args, s)[1]
+def _exit_or_crest(s, of):
+    """Say what vanishes there, and give what else there is: w and w', or w' and w."""
+    which, args = of
+    w, z = flow.oscillate(*args, s)
+    return jnp.where(which == 0, w, z), jnp.where(which == 0, z, w)
 
 
 def _crossing(s, args):
     force, side, distance, v0 = args
-    return distance - side * flow.flight(force, v0, s)[0]
+    rise, v = flow.flight(force, v0, s)
+    return distance - side * rise, v
 
 
 def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, held: Flag):
@@ -115,16 +119,15 @@ def _onset(pair: ImpactPair, state: State, horizon: Scalar, wanted: Flag) -> tup
     """
     room = (0.5 * pair.d + state.u, 0.5 * pair.d - state.u)
     force = flow.flight_force(pair.gamma, state.t)
-    # The search is not differentiated: `implicit_root` adds the derivatives of the time that it finds. Where it finds
+    # The search is not differentiated: `implicit_state` adds the derivatives of the time that it finds. Where it finds
     # none, the harmless time 1 stands there meanwhile, as both sides of a `where` are differentiated.
     sought = lax.stop_gradient((force, room, state.v, horizon))
     flight, side = next_wall(*sought, wanted)
     reached = wanted & (side != 0)
     side = jnp.where(state.mode != 0, state.mode.astype(flight.dtype), jnp.where(reached, side, 1.0))
     args = (force, side, jnp.where(side > 0, room[1], room[0]), state.v)
-    flight = jnp.where(reached, implicit_root(_crossing, jnp.where(reached, flight, 1.0), args), 0.0)
-    _, v_in = flow.flight(force, state.v, flight)
-    return flight, side, v_in, reached
+    flight, v_in = implicit_state(_crossing, jnp.where(reached, flight, 1.0), args)
+    return jnp.where(reached, flight, 0.0), side, jnp.where(reached, v_in, state.v), reached
 
 
 def step(
@@ -144,7 +147,7 @@ def step(
         horizon: Time beyond which no onset is looked for.
         deep: Whether to look for the greatest depth (and the work); NaN else.
         patience: Stages that a contact may take to be decided; if they do not do, its `stay` or depth is NaN.
-        rolled: For programs that are differentiated; see `flow.Membrane`.
+        rolled: For programs that are differentiated, or run briefly; see `flow.Membrane`.
 
     Differentiable in pair and state, forward and reverse, to any order: event times by the implicit function.
     """

@@ -16,21 +16,33 @@ _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def implicit_root(residual: Callable, root: Scalar, args: Any) -> Scalar:
-    """Make `root` a function of `args` by residual(root, args) = 0: value unchanged, derivatives of every order right.
+def implicit_state(course: Callable, root: Scalar, args: Any) -> tuple[Scalar, Any]:
+    """Make `root` a function of `args` by what must vanish there, and give what else there is: its state.
 
-    The tangent rule calls itself on the root, so second derivatives are right too (one Newton step would not do).
+    Values are unchanged, derivatives of every order right: the tangent rule calls itself on the root, so that second
+    ones are right too (one Newton step would not do).
+
+    Args:
+        course: (s, args) -> what vanishes at the root, and the state at s.
+        root: Where it vanishes.
+        args: What root and state are functions of.
     """
-    return root
+    return root, course(root, args)[1]
 
 
-@implicit_root.defjvp
-def _implicit_root_jvp(residual, primals, tangents):
+@implicit_state.defjvp
+def _implicit_state_jvp(course, primals, tangents):
     root, args = primals
-    root = implicit_root(residual, root, args)
-    _, moved = jax.jvp(lambda a: residual(root, a), (args,), (tangents[1],))
-    _, slope = jax.jvp(lambda x: residual(x, args), (root,), (jnp.ones_like(root),))
-    return root, -moved / slope
+    root, state = implicit_state(course, root, args)
+    _, (moved, change) = jax.jvp(lambda a: course(root, a), (args,), (tangents[1],))
+    _, (slope, rate) = jax.jvp(lambda s: course(s, args), (root,), (jnp.ones_like(root),))
+    pace = -moved / slope
+    return (root, state), (pace, jax.tree.map(lambda x, rate: x + rate * pace, change, rate))
+
+
+def implicit_root(residual: Callable, root: Scalar, args: Any) -> Scalar:
+    """Make `root` a function of `args` by residual(root, args) = 0; see `implicit_state`."""
+    return implicit_state(lambda s, args: (residual(s, args), ()), root, args)[0]
 
 
 def bracketed_root(function: Callable, low: Scalar, high: Scalar, guess: Scalar, wanted: Flag) -> Scalar:

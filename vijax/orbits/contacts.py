@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vijax.engine import contact_search, ode_contact, turn_search
-from vijax.engine.roots import implicit_root
+from vijax.engine.roots import implicit_state
 from vijax.engine.taylor import Oscillator, Push
 from vijax.model import energy, flow
 from vijax.model.flow import Membrane
@@ -181,7 +181,7 @@ def given(pair: ImpactPair, side, knot: Float[Array, "3"], v_out, crest) -> Give
 
 def _given_to_membrane(wall: ImpactPair, side, t, speed, stay, v_out, crest) -> Given:
     of = wall, side, t, speed
-    depth, _ = within(wall, side, t, speed, implicit_root(_rate, crest, of))
+    _, depth = implicit_state(_rate_and_depth, crest, of)
     if wall.law is not None:
         return Given(depth, ode_contact.held(ode_contact.contact(*of), stay).work)
     if wall.waves is not None:
@@ -190,6 +190,7 @@ def _given_to_membrane(wall: ImpactPair, side, t, speed, stay, v_out, crest) -> 
     return Given(depth, energy.membrane_work(wall.kappa, wall.mu, wall.gamma, side, t, stay, side * speed, v_out))
 
 
-def _rate(s: Scalar, of: Any) -> Scalar:
+def _rate_and_depth(s: Scalar, of: Any) -> tuple[Scalar, Scalar]:
     wall, side, t, speed = of
-    return within(wall, side, t, speed, s)[1]
+    depth, rate = within(wall, side, t, speed, s)
+    return rate, depth

@@ -1,8 +1,8 @@
 """How far an orbit is from grazing: what makes the solution of its equations a real motion, as smooth functions."""
 
+from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -10,6 +10,7 @@ from vijax.model.pair import ImpactPair
 from vijax.orbits import contacts, flights, shooting
 from vijax.orbits.flights import NOTHING, SAME_TURN
 from vijax.orbits.shooting import Knots, Sequence
+from vijax.runtime.xla import each
 
 
 class Clearance(NamedTuple):
@@ -31,7 +32,7 @@ class Between(NamedTuple):
 def _contacts(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real):
     """Find when each contact is deepest, and its least penetration at a minimum inside where there is one, and when."""
     t, speed, stay = knots.T
-    turns = jax.vmap(contacts.turns, in_axes=(None, 0, 0, 0, 0, 0))(pair, departure.side, t, speed, stay, real)
+    turns = each(partial(contacts.turns, pair))(departure.side, t, speed, stay, real)
     deepest = jnp.where(turns.lost | (turns.crest == 0), jnp.nan, turns.crest)
     shallow = jnp.where(jnp.isfinite(turns.lowest), turns.lowest, NOTHING)
     return deepest, jnp.where(turns.lost, jnp.nan, shallow), turns.trough
@@ -80,8 +81,8 @@ def between(
 
 def _flights(pair: ImpactPair, departure: shooting.Departure, real, touch):
     """Find the least room in every flight, and how long after the contact it is."""
-    each = jax.vmap(flights.nearest_turn, in_axes=(None, 0, 0, 0, 0, 0, 0))
-    return each(pair, departure.side, departure.speed, departure.t, departure.next_t - departure.t, real, touch)
+    flight = departure.side, departure.speed, departure.t, departure.next_t - departure.t
+    return each(partial(flights.nearest_turn, pair))(*flight, real, touch)
 
 
 def _halves(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real, split):

@@ -22,6 +22,7 @@ from vijax.runtime import checks, context, tiles
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
 from vijax.runtime.programs import begin, jitted
+from vijax.runtime.xla import each
 
 _TOUCH = 1e-6  # least speed of an impact: slower ones are those of a motion that just touches the wall
 # How closely the impact map must meet the next impact of a real orbit, in time, speed and duration together; marks of
@@ -243,8 +244,9 @@ def _prove_between(rows: tuple) -> Orbit:
 def _between(pair: ImpactPair, sequence: Sequence, knots: shooting.Knots) -> tuple[Clearance, Any, Any]:
     """Find the clearances of one claim, and depth and work of each impact."""
     motion, departure = between(pair, sequence, knots), shooting.departures(pair, sequence, knots)
-    out, each = -departure.side * departure.speed, jax.vmap(partial(contacts.given, pair))
-    return motion.clearance, *each(departure.side, knots, out, jnp.nan_to_num(motion.deepest))
+    out = -departure.side * departure.speed
+    given = each(partial(contacts.given, pair))(departure.side, knots, out, jnp.nan_to_num(motion.deepest))
+    return motion.clearance, *given
 
 
 @jitted

@@ -6,6 +6,7 @@ crossing is searched for, so the equations are smooth wherever an impact sits in
 grazing. What they do not say is that nothing happens in between: that is for the impact map to verify.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from vijax.orbits import contacts, flights
 from vijax.runtime import ring_solve
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.ring_solve import Ring
+from vijax.runtime.xla import each
 
 Knots = Float[Array, "impact 3"]
 """Onset time, speed into the wall (> 0) and contact time of each impact."""
@@ -118,7 +120,7 @@ def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None
         onward: Knots of the next turn, a span earlier than they come, where they differ from those of this one.
     """
     side, wall, joined = joined_knots(sequence, knots, onward)
-    pieces, _ = jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
+    pieces, _ = each(partial(_pieces, pair))(side, wall, joined)
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
 
 
@@ -141,18 +143,18 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
     """
     side, wall, joined = joined_knots(sequence, knots)
 
-    def each(pair):
-        return jax.vmap(_pieces, in_axes=(None, 0, 0, 0))(pair, side, wall, joined)
+    def parts(pair):
+        return each(partial(_pieces, pair))(side, wall, joined)
 
     def along(change):
-        return jax.jvp(each, (pair,), (change,), has_aux=True)
+        return jax.jvp(parts, (pair,), (change,), has_aux=True)
 
     if moved:
         # All in one: equations that each derivative computed anew would be most of what is compiled of a curve.
         together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *moved)
         pieces, changes, blocks = jax.vmap(along, out_axes=(None, -1, None))(together)
     else:
-        pieces, blocks = each(pair)
+        pieces, blocks = parts(pair)
         changes = jnp.zeros((*pieces.shape, 0), knots.dtype)
     real, dtype = sequence.real[:, None, None], knots.dtype
     # Where there is no impact the identity keeps the matrix regular, and the step there zero.
@@ -183,7 +185,7 @@ def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
     """Say how each contact ends, and where the flight after it is to lead."""
     side, wall, joined = joined_knots(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
-    rate = jax.vmap(lambda side, knot: contacts.end(pair, side, *knot[:3]).rate)(side, joined)
+    rate = each(lambda side, knot: contacts.end(pair, side, *knot[:3]).rate)(side, joined)
     next_stay = knots[_following(sequence)[0], 2]
     return Departure(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
 

@@ -31,6 +31,7 @@ from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
 from vijax.runtime.derivatives import differentiable, shared_slopes
 from vijax.runtime.pages import see
+from vijax.runtime.xla import each
 
 
 class Steady(WithStatus):
@@ -262,8 +263,9 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
     """
     real, side = sequence.real, jnp.where(sequence.real, sequence.side, 1)
     departure = shooting.departures(pair, sequence, knots)
-    out, each = -departure.side * shared_slopes(departure.speed), jax.vmap(partial(contacts.given, pair))
-    depth, work = shared_slopes(each(departure.side, knots, out, jnp.nan_to_num(deepest)))
+    out = -departure.side * shared_slopes(departure.speed)
+    given = each(partial(contacts.given, pair))(departure.side, knots, out, jnp.nan_to_num(deepest))
+    depth, work = shared_slopes(given)
     if pair.rigid:
         depth = depth * device.omega / (flow.PI * at(device.omega0, side))
     depth = jnp.where(real, depth, 0.0) * device.length_unit

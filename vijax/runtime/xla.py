@@ -15,7 +15,7 @@ knows, as on an accelerator, and lanes do not stay in a GPU's registers (`regist
 
 import os
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -63,6 +63,7 @@ _BRIEF = {"xla_backend_optimization_level": 0}
 _STAYS = {"inlineable": "false"}  # a call that XLA does not see through
 _ONE_KERNEL = {"xla_cpu_small_call": "true"} | _STAYS
 _TRIPS = 4  # of a short loop, between two looks whether it goes on, on an accelerator
+_FEW = 64  # balls that a CPU takes one after another
 _BLOCK = 64  # lanes: what a step stores of them stays in the first cache; with 32 LLVM runs out of registers
 
 once = jax.jit
@@ -195,6 +196,21 @@ def search(goes_on: Callable[[T], Bool[Array, ""]], work: Callable[[T], T], stat
     return lax.while_loop(goes_on, some, state)
 
 
+def each(work: Callable[P, T]) -> Callable[P, T]:
+    """Make what does `work` for every ball: arguments and results have a leading axis more.
+
+    A CPU takes few balls one after another. What is made of numbers alone, not of rows, is half as much to compile, and
+    no ball waits for the longest search of another. Many, and all on an accelerator, go abreast.
+    """
+
+    def call(*balls: P.args, **kwargs: P.kwargs) -> T:
+        if on_cpu() and jax.tree.leaves(balls)[0].shape[0] <= _FEW:
+            return lax.map(lambda ball: work(*ball, **kwargs), balls)
+        return jax.vmap(partial(work, **kwargs))(*balls)
+
+    return call
+
+
 def first(mask: Bool[Array, "lane"], width: int) -> tuple[Int[Array, "width"], Bool[Array, "lane"]]:
     """Find the first `width` lanes of a mask, any others where there are fewer; and for every lane whether it is one.
 
@@ -249,8 +265,11 @@ def put(lanes: T, part: T, rows: Int[Array, "row"], count: Int[Array, ""]) -> T:
         return choose(source >= 0, new, lanes)
 
     def one(i, lanes):
+        # No row is counted from the end: to allow for it is three operations a leaf, half of what there is to compile.
+        at, row = i.astype(jnp.uint32), rows[i].astype(jnp.uint32)
+
         def replaced(leaf, new):
-            return lax.dynamic_update_slice_in_dim(leaf, lax.dynamic_slice_in_dim(new, i, 1), rows[i], 0)
+            return lax.dynamic_update_slice_in_dim(leaf, lax.dynamic_slice_in_dim(new, at, 1), row, 0)
 
         return jax.tree.map(replaced, lanes, part)
 
