@@ -199,8 +199,8 @@ def search(goes_on: Callable[[T], Bool[Array, ""]], work: Callable[[T], T], stat
 def each(work: Callable[P, T]) -> Callable[P, T]:
     """Make what does `work` for every ball: arguments and results have a leading axis more.
 
-    A CPU takes few balls one after another. What is made of numbers alone, not of rows, is half as much to compile, and
-    no ball waits for the longest search of another. Many, and all on an accelerator, go abreast.
+    A CPU takes few balls one after another. What is made of numbers alone, not of rows, is a quarter less to compile,
+    and no ball waits for the longest search of another. Many, and all on an accelerator, go abreast.
     """
 
     def call(*balls: P.args, **kwargs: P.kwargs) -> T:
