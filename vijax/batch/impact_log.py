@@ -139,7 +139,7 @@ def _fly(pair: ImpactPair, states: State, over: Any, periods: Any, *, steps: int
         left = jnp.where(over, 0.0, 2.0 * (periods - state.n).astype(state.t.dtype) - state.t)
         wanted = ~over & (left > 0)
         if walls is None:
-            out, sure = jax.vmap(partial(exact.step, rolled=True))(pair, state, left), jnp.ones_like(over)
+            out, sure = jax.vmap(exact.step)(pair, state, left), jnp.ones_like(over)
         else:
             out, sure = _quick_outcome(walls, pair, state)
         waits = waits | (wanted & ~sure)

@@ -30,7 +30,7 @@ _ARRIVED = 1e-10
 _DURATIONS, _HALF_TURNS, _SHORTEST = 65, 8, 1e-6
 # Of an interval so many motions are told: where the miss changes its sign, and two each where it turns back.
 _CROSSINGS, _TURNS = 4, 2
-_HALVINGS = 10  # of the way between two durations, until Newton goes on
+_HALVINGS = 10  # A change of sign between two durations is narrowed down so often before Newton begins.
 _MOTIONS = _CROSSINGS + 2 * _TURNS
 # Places in a contact and in a flight where the ball must be on the right side of the walls.
 _PLACES = tuple(k / 8 for k in range(1, 8))
