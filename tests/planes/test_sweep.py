@@ -497,16 +497,19 @@ def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
             np.testing.assert_array_equal(got, wanted, err_msg=f"{name}, {where}")
 
 
-def test_planes_of_every_size_share_one_program(tmp_path, monkeypatch):
+def test_planes_of_every_size_share_two_programs(tmp_path, monkeypatch):
+    """One for few cells, one for all others."""
     made, jitted = [], export_cache.TracedProgram._jitted
     monkeypatch.setattr(
         export_cache.TracedProgram, "_jitted", lambda *args: made.append(args[0]._name) or jitted(*args)
     )
     simulate.compiled.cache_clear()
     sweep(d=[0.2, 0.25], r=0.5, periods=1)
+    sweep(d=np.linspace(0.02, 0.6, 16), kappa=[5.0, 50.0, 90.0, 500.0], r=0.5, periods=1)
+    assert len(made) == 1
     sweep(d=np.linspace(0.02, 0.6, 37), kappa=np.geomspace(2, 3000, 61), r=0.5, periods=1)
     sweep(d=[0.2, 0.25], kappa=np.geomspace(2, 3000, 1000), r=0.5, periods=1, out=tmp_path / "plane.zarr")
-    assert len(made) == 1
+    assert len(made) == 2
 
 
 @pytest.mark.long

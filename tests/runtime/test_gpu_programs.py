@@ -88,9 +88,9 @@ def test_the_program_that_leaves_its_last_cells_is_lowered_for_a_gpu(known, call
 def test_a_gpu_has_larger_tiles_and_more_lanes(monkeypatch):
     monkeypatch.delenv("VIJAX_TILE", raising=False)
     assert tile_size.largest() == lanes.TABLE == 32_768
-    assert {lanes.width_of(cells) for cells in (10, 4_096, 10**6)} == {64}
-    assert [lanes.table_rows(cells, 1) for cells in (10, 32_768, 10**6)] == [32_768, 32_768, 10**6]
-    assert [lanes.table_rows(cells, 64) for cells in (10, 1_024)] == [512, 1_024]
+    assert [lanes.width_of(cells) for cells in (10, 64, 65, 4_096, 10**6)] == [16, 16, 64, 64, 64]
+    assert [lanes.table_rows(cells, 1) for cells in (10, 65, 32_768, 10**6)] == [64, 32_768, 32_768, 10**6]
+    assert [lanes.table_rows(cells, 64) for cells in (10, 65, 1_024)] == [64, 512, 1_024]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert tile_size.largest() == 4_194_304
     assert lanes.table_rows(10, 1) == 10

@@ -124,7 +124,7 @@ def run_round(program: Program, width: int, at: AtWork) -> Carry:
         width: How many lanes are served together.
         at: The lanes.
     """
-    carry = program.kernel(partial(_steps, program))(*at)
+    carry = program.kernel(partial(steps, program))(*at)
     if service := program.service:
         due = program.kernel(partial(_service_due, program, width))
         serve = partial(_serve, program, service, width)
@@ -132,7 +132,7 @@ def run_round(program: Program, width: int, at: AtWork) -> Carry:
     return program.kernel(program.review)(carry)
 
 
-def _steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+def steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Take up to so many steps; fewer once half the lanes that set out wait for something else."""
 
     def some_steps(at: AtWork) -> AtWork:

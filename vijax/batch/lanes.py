@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.batch import accelerator_lanes, held_lanes
+from vijax.batch import accelerator_lanes, few_lanes, held_lanes
 from vijax.batch.lane_rounds import AtWork, Carry, Program, able, batch_of, run_round, take
 from vijax.runtime.arrays import choose
 from vijax.runtime.xla import on_cpu, put, whole_blocks
@@ -23,6 +23,8 @@ _SHARE, _FEWEST = 32, 4
 # Rows of a CPU's table, and its lanes, however many cells there are: one program, which takes as long to compile as to
 # run half a million cells, serves every plane. With 512 lanes planes of 10^5 cells would run a thirtieth sooner.
 TABLE, _LANES = 32_768, 64
+# So few cells of a CPU have a program of their own, `few_lanes`, as have as many chains as it has lanes.
+FEW = 64
 
 
 class _Queue(NamedTuple):
@@ -40,16 +42,25 @@ class _Table(NamedTuple):
     real: Int[Array, ""]
 
 
+def few(cells: int) -> bool:
+    """Say whether so many cells have the program of `few_lanes`."""
+    return on_cpu() and cells <= FEW
+
+
 def width_of(cells: int) -> int:
     """Choose the lanes of a tile: enough to fill vectors and hide loop overhead, few enough for cache and refilling.
 
     At the end of a tile they stand idle: 4,096 cells take half again as long with 512 lanes as with 64.
     """
+    if few(cells):
+        return few_lanes.LANES
     return _LANES if on_cpu() else accelerator_lanes.width_of(cells)
 
 
 def table_rows(cells: int, variants: int) -> int:
     """Choose how many rows the table of a tile has, each with results for so many variants of a device."""
+    if few(cells):
+        return FEW
     return max(cells, TABLE // variants) if on_cpu() else cells
 
 
@@ -70,7 +81,7 @@ def run(
         cells: One row of parameters a cell.
         count: How many are real; the table may be padded.
         outputs: Length of a result row.
-        lanes: How many cells are worked on at once, at least.
+        lanes: How many cells are worked on at once, at least; up to `few_lanes.LANES` of a CPU: as many as those.
 
     A cell's result depends on its row alone: lanes never exchange anything, and each is advanced by the same
     elementwise arithmetic wherever it sits. To the last bit only if what several results need is stored (`xla.share`):
@@ -79,6 +90,8 @@ def run(
     """
     if not on_cpu():
         return accelerator_lanes.run(program, cells, count, outputs, lanes)
+    if lanes <= few_lanes.LANES:
+        return few_lanes.run(program, cells, count, outputs)
     return _run(program, _Table(cells, count), outputs, lanes).results
 
 
@@ -183,6 +196,8 @@ def chain(
     much as many steps.
     """
     lanes, most, columns = links.shape
+    if on_cpu() and lanes <= few_lanes.LANES:
+        return few_lanes.chain(program, succeed, links, count, length, outputs)
     width = _served(lanes)
     load, record, moved = _held(program, columns, links.dtype, lanes)
     enough = max(lanes // _SHARE, 1)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from vijax.batch import simulate
+from vijax.batch import lanes, simulate
 from vijax.planes import tile_size
 from vijax.planes.cells import Places
 from vijax.planes.dataset import SweepPlan
@@ -50,7 +50,7 @@ class Call(NamedTuple):
 
 def rows_for(cells: int) -> int:
     """Find how many rows the call for so many cells has at least: a power of two, so that few programs are compiled."""
-    return max(padded(cells), tile_size.smallest())
+    return padded(cells) if lanes.few(cells) else max(padded(cells), tile_size.smallest())
 
 
 def rows_each(cells: int) -> int:
