@@ -225,7 +225,8 @@ def _steadily(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: np
     """Compute steady states of many orbits, in tiles."""
 
     def one_of(pair: ImpactPair, sequence: Sequence, knots: Any) -> Steady:
-        return response(device, pair, sequence, *find(pair, sequence, knots))
+        found = find(pair, sequence, knots)
+        return response(device, pair, sequence, found.knots, found.residual)
 
     one = jax.jit(jax.vmap(one_of))
     return tiles.map_tiles(lambda rows: one(*rows), (pair, sequence, knots), (512,))

@@ -218,6 +218,9 @@ def test_a_pitchfork_is_told_from_a_fold_however_roughly_it_is_met():
     (simple,) = (one for one in branches if bool(one.orbit.sequence.mirrored[0]) and one.points)
     (of_pairs,), (of_simple,) = points([pairs], "pitchfork"), points([simple], "pitchfork")
     assert of_pairs.value == pytest.approx(of_simple.value, abs=1e-14)
+    # Orbits closed half way are as wide as those in full, to be followed by the same programs.
+    assert {one.orbit.knots.shape[1] for one in branches} == {2}
+    assert {int(one.orbit.count[0]) for one in branches} == {1, 2}
 
 
 def test_an_orbit_closed_half_way_folds_where_a_multiplier_passes_one():

@@ -142,9 +142,9 @@ def test_contacts_that_steps_do_not_resolve_make_no_orbit():
 def test_what_is_uncertain_of_a_contact_is_part_of_the_residual(springs, monkeypatch):
     orbit = springs[1]
     told = orbit.pair, orbit.sequence, orbit.knots
-    assert float(shooting.residuals(*told)[0]) < 1e-11
+    assert float(shooting.measured(*told)[0][0]) < 1e-11
     monkeypatch.setattr(contacts, "uncertainty", lambda *of: jnp.asarray(0.25))
-    assert float(shooting.residuals(*told)[0]) == 0.25
+    assert float(shooting.measured(*told)[0][0]) == 0.25
 
 
 def test_a_ball_that_meets_a_wall_between_is_seen():

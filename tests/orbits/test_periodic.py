@@ -91,7 +91,8 @@ def test_a_symmetric_orbit_closed_half_way_is_the_same():
     assert half.count[0] == 1
     assert half.status[0] == Status.OK
     np.testing.assert_allclose(np.sort_complex(half.multipliers[0]), np.sort_complex(full.multipliers[0]), atol=1e-12)
-    for again in (symmetry.unfolded(half), symmetry.doubled(half)):
+    wide = periodic.widened(half, 3)
+    for again in (symmetry.unfolded(half), symmetry.doubled(half), symmetry.unfolded(wide)):
         np.testing.assert_allclose(again.knots, full.knots, rtol=0, atol=1e-13)
     with pytest.raises(ValueError, match="orbit must be symmetric"):
         symmetry.halved(guessed(reference_orbits()[1].knots, reference_orbits()[1].side, reference_orbits()[1].pair))

@@ -71,10 +71,13 @@ def test_newton_comes_back_from_afar_and_says_when_it_does_not():
     nonsense = np.array([[0.5, 3.0, 0.01], [0.6, 0.01, 1.0]])
     guesses = jnp.asarray(np.stack([far, nonsense, np.full_like(far, np.nan)]))
     wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, *jnp.shape(leaf))), (orbit.pair, sequence(*orbit.side)))
-    knots, residual = jax.jit(shooting.newton)(*wide, guesses)
+    knots, residual, departure = jax.jit(shooting.newton)(*wide, guesses)
     np.testing.assert_allclose(knots[0], orbit.knots, rtol=0, atol=1e-14)
     assert residual[0] < 1e-14
     assert np.isinf(residual[1:]).all()
+    known = jax.jit(jax.vmap(shooting.departures))(*wide, knots)
+    np.testing.assert_allclose(departure.speed[0], known.speed[0], rtol=1e-14)
+    assert [x[0].tolist() for x in departure[2:]] == [x[0].tolist() for x in known[2:]]
 
 
 def test_impossible_knots_are_told():

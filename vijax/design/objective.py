@@ -95,7 +95,7 @@ def _settled(scene: Scene, batch: Batch, z, factors, guess):
     sequence = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), batch.sequence)
     flat = jax.tree.map(lambda x: x.reshape(starts * count, *x.shape[2:]), (pair, guess))
     found = shooting.newton(flat[0], sequence, flat[1], _MOST_ITERATIONS)
-    return jax.tree.map(lambda x: x.reshape(starts, count, *x.shape[1:]), found)
+    return jax.tree.map(lambda x: x.reshape(starts, count, *x.shape[1:]), (found.knots, found.residual))
 
 
 def begin(scene: Scene, batch: Batch) -> Known:

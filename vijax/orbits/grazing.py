@@ -42,6 +42,7 @@ def between(
     pair: ImpactPair,
     sequence: Sequence,
     knots: Knots,
+    departure: shooting.Departure | None = None,
     touch: Float[Array, "impact"] | None = None,
     split: Float[Array, "impact"] | None = None,
 ) -> Between:
@@ -51,6 +52,7 @@ def between(
     that decides.
 
     Args:
+        departure: How each contact ends, where that is known already.
         touch: How long after the end of each contact the ball is known to touch a wall; NaN where it is not.
         split: How long after its onset each contact is known to come back to its wall; NaN where none is. None is
             deepest then.
@@ -58,7 +60,7 @@ def between(
     real = sequence.real
     # Padded impacts are given harmless knots.
     knots = jnp.where(real[:, None], knots, 1.0)
-    departure = shooting.departures(pair, sequence, knots)
+    departure = shooting.departures(pair, sequence, knots) if departure is None else departure
 
     def least(values):
         return jnp.where(real, values, NOTHING).min()

@@ -203,19 +203,20 @@ class Claim(NamedTuple):
 
 @jitted
 def _shoot(pair: ImpactPair, sequence: Sequence, guess: Float[AnyArray, "orbit impact 3"]) -> Claim:
-    knots, residual = shooting.newton(pair, sequence, guess)
+    knots, residual, departure = shooting.newton(pair, sequence, guess)
     touches = (sequence.real & (knots[..., 1] < _TOUCH)).any(axis=1)
-    return _claim(pair, sequence, knots, jnp.where(touches, jnp.inf, residual))
+    return _claim(pair, sequence, knots, jnp.where(touches, jnp.inf, residual), departure)
 
 
 @jitted
 def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit impact 3"]) -> Claim:
-    return _claim(pair, sequence, knots, shooting.residuals(pair, sequence, knots))
+    return _claim(pair, sequence, knots, *shooting.measured(pair, sequence, knots))
 
 
-def _claim(pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"]) -> Claim:
+def _claim(
+    pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"], departure: shooting.Departure
+) -> Claim:
     around = jax.vmap(multipliers.monodromy)(pair, sequence, knots)
-    departure = jax.vmap(shooting.departures)(pair, sequence, knots)
     return Claim(
         knots, residual, multipliers.floquet(around, sequence.mirrored), departure, *flow.wrap_phase(departure.t)
     )
@@ -235,15 +236,17 @@ def _prove(ground: Ground, rows: tuple) -> Orbit:
 def _prove_between(rows: tuple) -> Orbit:
     """Judge claims by their turning points, between which nothing can happen."""
     pair, sequence, claim = rows
-    clearance, depth, work = jax.vmap(_between)(pair, sequence, claim.knots)
+    clearance, depth, work = jax.vmap(_between)(pair, sequence, claim.knots, claim.departure)
     found = (claim.residual < SAME) & sequence.real.any(axis=1)
     verified = found & (jnp.stack(clearance).min(axis=0) > 0)
     return _as_orbits(pair, sequence, claim, found, verified, depth, work)
 
 
-def _between(pair: ImpactPair, sequence: Sequence, knots: shooting.Knots) -> tuple[Clearance, Any, Any]:
+def _between(
+    pair: ImpactPair, sequence: Sequence, knots: shooting.Knots, departure: shooting.Departure
+) -> tuple[Clearance, Any, Any]:
     """Find the clearances of one claim, and depth and work of each impact."""
-    motion, departure = between(pair, sequence, knots), shooting.departures(pair, sequence, knots)
+    motion = between(pair, sequence, knots, departure)
     out = -departure.side * departure.speed
     given = each(partial(contacts.given, pair))(departure.side, knots, out, jnp.nan_to_num(motion.deepest))
     return motion.clearance, *given

@@ -62,7 +62,15 @@ class LinearisedEquations(NamedTuple):
         return self.ring.dense
 
 
-def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Float[Array, "3"], Float[Array, "3 5"]]:
+class _ImpactEquations(NamedTuple):
+    """The equations of a contact and the flight after it, their derivatives in the joint knots, and w' at its end."""
+
+    value: Float[Array, "3"]
+    slope: Float[Array, "3 5"]
+    rate: Float[Array, ""]
+
+
+def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> _ImpactEquations:
     """Compute the equations of one contact and the flight after it to the wall `onward`, and their derivatives.
 
     `knot` ends with the next time and speed. Divided by the contact's length, and by the flight's where it returns to
@@ -83,7 +91,8 @@ def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> tuple[Fl
     place = jnp.where(back, rise / length, rise - onward * pair.d)
     d_place = jnp.where(back, (d_rise - rise / length * (d_next - d_leave)) / length, d_rise)
     value = jnp.stack([contact.place, place, onward * v - next_speed])
-    return value, jnp.stack([jnp.pad(contact.place_slope, (0, 2)), d_place, onward * d_v - d_next_speed])
+    slope = jnp.stack([jnp.pad(contact.place_slope, (0, 2)), d_place, onward * d_v - d_next_speed])
+    return _ImpactEquations(value, slope, contact.rate)
 
 
 def _following(sequence: Sequence):
@@ -120,19 +129,8 @@ def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None
         onward: Knots of the next turn, a span earlier than they come, where they differ from those of this one.
     """
     side, wall, joined = joined_knots(sequence, knots, onward)
-    pieces, _ = each(partial(_pieces, pair))(side, wall, joined)
+    pieces = each(partial(_pieces, pair))(side, wall, joined).value
     return jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1)
-
-
-def residuals(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Float[Array, "orbit"]:
-    """Find the largest violation of the equations by each of a batch, and by how much its contacts are uncertain."""
-    return jax.vmap(_residual)(pair, sequence, knots)
-
-
-def _residual(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, ""]:
-    side, _, joined = joined_knots(sequence, knots)
-    uncertain = jax.vmap(lambda side, knot: contacts.uncertainty(pair, side, *knot[:3]))(side, joined)
-    return jnp.maximum(jnp.abs(gap(pair, sequence, knots)).max(), jnp.where(sequence.real, uncertain, 0.0).max())
 
 
 def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: ImpactPair) -> LinearisedEquations:
@@ -144,7 +142,8 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
     side, wall, joined = joined_knots(sequence, knots)
 
     def parts(pair):
-        return each(partial(_pieces, pair))(side, wall, joined)
+        piece = each(partial(_pieces, pair))(side, wall, joined)
+        return piece.value, piece.slope
 
     def along(change):
         return jax.jvp(parts, (pair,), (change,), has_aux=True)
@@ -183,11 +182,33 @@ class Departure(NamedTuple):
 
 def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
     """Say how each contact ends, and where the flight after it is to lead."""
+    side, _, joined = joined_knots(sequence, knots)
+    rate = each(lambda side, knot: contacts.end(pair, side, *knot[:3]).rate)(side, joined)
+    return _departure(sequence, knots, rate)
+
+
+def _departure(sequence: Sequence, knots: Knots, rate: Float[Array, "impact"]) -> Departure:
     side, wall, joined = joined_knots(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
-    rate = each(lambda side, knot: contacts.end(pair, side, *knot[:3]).rate)(side, joined)
-    next_stay = knots[_following(sequence)[0], 2]
-    return Departure(side, -rate, t + stay, wall, next_t, next_speed, next_stay)
+    return Departure(side, -rate, t + stay, wall, next_t, next_speed, knots[_following(sequence)[0], 2])
+
+
+def measured(
+    pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]
+) -> tuple[Float[Array, "orbit"], Departure]:
+    """Find the largest violation of the equations by each of a batch, and how its contacts end.
+
+    Where the ends of contacts are uncertain by more than the violation, it is that.
+    """
+    return jax.vmap(_measured)(pair, sequence, knots)
+
+
+def _measured(pair: ImpactPair, sequence: Sequence, knots: Knots) -> tuple[Float[Array, ""], Departure]:
+    side, wall, joined = joined_knots(sequence, knots)
+    piece = each(partial(_pieces, pair))(side, wall, joined)
+    uncertain = jax.vmap(lambda side, knot: contacts.uncertainty(pair, side, *knot[:3]))(side, joined)
+    largest = jnp.maximum(jnp.abs(piece.value).max(axis=1), uncertain)
+    return jnp.where(sequence.real, largest, 0.0).max(), _departure(sequence, knots, piece.rate)
 
 
 def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, ""]:
@@ -215,18 +236,29 @@ def _step(linear: LinearisedEquations) -> Knots:
     return step[..., 0]
 
 
+class Solution(NamedTuple):
+    """What Newton's search of a batch came to.
+
+    Attributes:
+        knots: Of each orbit.
+        residual: Its largest violation of the equations; inf where the search stalled, or left what is possible.
+        departure: How its contacts end.
+    """
+
+    knots: Float[Array, "orbit impact 3"]
+    residual: Float[Array, "orbit"]
+    departure: Departure
+
+
 # optimistix in its place (`python benchmarks/newton.py`): Newton without damping takes 1.1 to 1.2 times as long near
 # orbits and finds a third fewer from random guesses; the dogleg finds about as many, in 1.3 to 3.4 times the time.
 def newton(
     pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"], max_iterations: int = _MOST_ITERATIONS
-) -> tuple[Float[Array, "orbit impact 3"], Float[Array, "orbit"]]:
+) -> Solution:
     """Search a batch of orbits by damped Newton: a step that does not shorten what is missing is halved.
 
     Args:
         max_iterations: That a search may take, one evaluation each; the batch takes as many as its slowest search.
-
-    Returns:
-        The knots, and the largest residual at each; inf where the search stalled, or left what is possible.
     """
 
     def look(knots):
@@ -260,6 +292,6 @@ def newton(
     end = lax.while_loop(lambda d: d.going.any() & (d.iteration < max_iterations), advance, start)
     arrived = (end.missing < jnp.inf) & ((size(end.step) <= _LAST_STEP) | (end.missing < _FLOOR))
     knots = jnp.where(arrived[:, None, None], end.knots - end.step, end.knots)
-    residual = residuals(pair, sequence, knots)
+    residual, departure = measured(pair, sequence, knots)
     arrived = arrived & jax.vmap(possible)(pair, sequence, knots)
-    return knots, jnp.where(arrived, residual, jnp.inf)
+    return Solution(knots, jnp.where(arrived, residual, jnp.inf), departure)

@@ -25,7 +25,7 @@ from vijax.model.waves import Waves
 from vijax.orbits import contacts, shooting
 from vijax.orbits.grazing import Between, Clearance
 from vijax.orbits.periodic import Orbit
-from vijax.orbits.shooting import Knots, Sequence
+from vijax.orbits.shooting import Departure, Knots, Sequence
 from vijax.orbits.validity import Validity, validity
 from vijax.runtime import checks, linear_solve
 from vijax.runtime.context import door
@@ -146,8 +146,7 @@ def _pair_of(moved: Moved, kind: Walls) -> ImpactPair:
 def _found(moved: Moved, about: tuple[Sequence, Knots], *, kind: Walls) -> Found:
     """Find the orbit near a guess."""
     (sequence, guess), pair = about, _pair_of(moved, kind)
-    knots, residual = find(pair, sequence, jnp.where(sequence.real[:, None], guess, 0.0))
-    return judged(pair, sequence, knots, residual)
+    return _judged(pair, sequence, *find(pair, sequence, jnp.where(sequence.real[:, None], guess, 0.0)))
 
 
 def _like_found(about: tuple[Sequence, Knots]) -> Found:
@@ -200,16 +199,17 @@ def _law(orbit: Orbit, pair: ImpactPair | None, membrane: Any) -> Laws | None:
     return None if given is Linear else membrane
 
 
-def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> tuple[Knots, Float[Array, ""]]:
-    """Find the knots of the orbit near a guess and their residual, constants of differentiation."""
+def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> shooting.Solution:
+    """Find the orbit near a guess, a constant of differentiation."""
     batch = jax.tree.map(lambda x: lax.stop_gradient(x)[None], (pair, sequence, guess))
-    knots, residual = shooting.newton(*batch)
-    return lax.stop_gradient(knots[0]), lax.stop_gradient(residual[0])
+    return jax.tree.map(lambda x: lax.stop_gradient(x[0]), shooting.newton(*batch))
 
 
-def judged(pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]) -> Found:
+def _judged(
+    pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""], departure: Departure | None = None
+) -> Found:
     """Judge the orbit with the given knots, a constant of differentiation."""
-    frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual))
+    frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual, departure))
     return Found(frozen[2], frozen[3], validity(*frozen))
 
 
@@ -217,7 +217,7 @@ def response(
     device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]
 ) -> Steady:
     """Compute what the orbit with the given knots yields; these follow device and pair under differentiation."""
-    return _response(device, pair, sequence, judged(pair, sequence, knots, residual))
+    return _response(device, pair, sequence, _judged(pair, sequence, knots, residual))
 
 
 def _response(device: Harvester, pair: ImpactPair, sequence: Sequence, found: Found) -> Steady:

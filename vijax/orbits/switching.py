@@ -1,5 +1,6 @@
 """Switching: the branches that begin at flips and pitchforks, and the family of all that begin on these in turn."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, 
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
 from vijax.orbits.parameter import able, check_bounds, skews
-from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit
+from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit, widened
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.programs import begin, jitted
@@ -112,10 +113,18 @@ def family(
     # What follow and switch are told alike.
     told: Any = {"device": device, "points": points, "settings": settings}
     grown: list[Branch] = []
-    starts = [_halved(orbit[index : index + 1], along) for index in range(len(orbit))]
-    for one in starts[1:]:
+    alone = [orbit[index : index + 1] for index in range(len(orbit))]
+    half = [not skews(along) and bool(symmetry.symmetric(one)[0]) for one in alone]
+    # Closed half way an orbit is as wide as the others, for one program: a place without an impact costs little.
+    width = orbit.knots.shape[1]
+
+    def starts(close: Callable[[Orbit], Orbit]) -> list[Orbit]:
+        return [widened(close(one), width) if symmetric else one for one, symmetric in zip(alone, half, strict=True)]
+
+    # What takes longest to compile begins first, while orbits that are closed half way are solved.
+    for one in starts(symmetry.cut):
         begin(upwards, *set_out(one, along, within, device, settings))
-    for one in starts:
+    for one in starts(symmetry.halved):
         grown += _new(follow(one, along, within, **told), grown, settings)
     youngest = grown
     for _ in range(max_switches):
@@ -129,11 +138,6 @@ def family(
             youngest += _new([one for one in begun if len(one.values) > 1], grown + youngest, settings)
         grown = grown + youngest
     return grown
-
-
-def _halved(orbit: Orbit, along: str) -> Orbit:
-    """Close an orbit half way where it is symmetric, and stays so along the branch."""
-    return symmetry.halved(orbit) if not skews(along) and bool(symmetry.symmetric(orbit)[0]) else orbit
 
 
 def _new(found: list[Branch], known: list[Branch], settings: ContinuationSettings) -> list[Branch]:

@@ -1,10 +1,14 @@
 """Mirror symmetry of periodic orbits: those closed half way onto their mirror image, and the same in full."""
 
+from dataclasses import replace
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import Bool
 
 from vijax.orbits.periodic import Orbit, check_orbit, guessed, proven, solved
+from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks
 from vijax.runtime.context import door
 
@@ -41,12 +45,21 @@ def halved(orbit: Orbit, tolerance: float = 1e-9) -> Orbit:
         raise ValueError(f"orbit must be symmetric to be closed half way; got one that is not at index {index}")
     if bool(orbit.sequence.mirrored.all()):
         return orbit
+    half = jax.tree.map(np.asarray, cut(orbit))
+    return solved(half.pair, *guessed(half.sequence.side, half.sequence.span, half.sequence.mirrored, half.knots))
+
+
+def cut(orbit: Orbit) -> Orbit:
+    """Take the first half of orbits, of symmetric ones all that there is, as it stands: `halved` solves for it."""
+    if bool(orbit.sequence.mirrored.all()):
+        return orbit
     host = jax.tree.map(np.asarray, orbit)
     kept = np.arange(host.knots.shape[1]) < (host.count // 2)[:, None]
     width = host.knots.shape[1] // 2
     side = np.where(kept, host.sequence.side, 0)[:, :width]
     knots = np.where(kept[..., None], host.knots, 0.0)[:, :width]
-    return solved(host.pair, *guessed(side, 0.5 * host.sequence.span, np.ones(len(orbit), bool), knots))
+    walls: Any = side, 0.5 * host.sequence.span, np.ones(len(orbit), bool)
+    return replace(host, sequence=Sequence(*walls), knots=knots, depth=host.depth[:, :width], work=host.work[:, :width])
 
 
 @door
@@ -66,7 +79,7 @@ def _unfolded(orbit: Orbit, twice: Bool[np.ndarray, "orbit"]) -> Orbit:
     """Append the second turn to the first where asked."""
     host = jax.tree.map(np.asarray, orbit)
     count, width = host.count[:, None], host.knots.shape[1]
-    index = np.arange(2 * width)
+    index = np.arange(int((host.count * (1 + twice)).max(initial=1)))
     again = index >= count
     from_first = np.where(again, index - count, index)
     there = (index < count) | (twice[:, None] & again & (index < 2 * count))

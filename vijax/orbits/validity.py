@@ -9,7 +9,7 @@ from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import multipliers
 from vijax.orbits.grazing import Between, between
-from vijax.orbits.shooting import Knots, Sequence
+from vijax.orbits.shooting import Departure, Knots, Sequence
 
 _CONVERGED = 1e-10  # residual of an orbit's equations: where Newton converged, it is near rounding
 # Nearer than this to |multiplier| = 1 an orbit is at its bifurcation, and derivatives have lost half of their digits.
@@ -33,13 +33,21 @@ class Validity(NamedTuple):
     motion: Between
 
 
-def validity(pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""]) -> Validity:
-    """Judge an orbit by what is left of its equations, its clearances and its multipliers."""
+def validity(
+    pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""], departure: Departure | None = None
+) -> Validity:
+    """Judge an orbit by what is left of its equations, its clearances and its multipliers.
+
+    Args:
+        pair, sequence, knots: The orbit.
+        residual: Its largest violation of the equations.
+        departure: How its contacts end, where that is known already.
+    """
     around = multipliers.monodromy(pair, sequence, knots)
     multiplier = jnp.abs(multipliers.floquet(around[None], sequence.mirrored[None])).max()
     away = jnp.eye(2, dtype=knots.dtype) - around
     condition = (away * away).sum() / jnp.abs(away[0, 0] * away[1, 1] - away[0, 1] * away[1, 0])
-    motion = between(pair, sequence, knots)
+    motion = between(pair, sequence, knots, departure)
     found = residual < _CONVERGED
     real = jnp.stack(motion.clearance).min() > 0
     attracts = multiplier < 1 - _MARGIN
