@@ -19,6 +19,7 @@ from vijax.model.sides import Sides, apart, at, each, named, with_own
 from vijax.runtime import checks
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
+from vijax.runtime.tiles import library
 
 Own = Real | Sides[Real]
 """A number, or the `Sides` of what the two walls have of their own."""
@@ -166,7 +167,7 @@ class Harvester(eqx.Module):
                 "rigid_left" or "rigid_right" where one of them alone is rigid, and is no membrane.
         """
         checks.choice("wall", wall, WALLS)
-        d, gamma = self.s / self.length_unit, self.g * jnp.sin(self.beta) / self.A
+        d, gamma = self.s / self.length_unit, self.g * library(self.beta).sin(self.beta) / self.A
         kappa = each(lambda omega0: omega0 * (math.pi / self.omega), self.omega0)
         given = {"d": d, **named("kappa", kappa), **named("r", self.r), "gamma": gamma}
         pair = pair_of(given, wall)

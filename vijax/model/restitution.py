@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.context import door
+from vijax.runtime.tiles import library
 
 
 @door
@@ -30,7 +31,9 @@ def damped_frequency(kappa: Float[AnyArray, "..."], r: Float[AnyArray, "..."]) -
 
     It comes from r, as kappa pi/sqrt(pi^2 + ln^2 r): the difference would cancel.
     """
-    return kappa * math.pi / jnp.sqrt(math.pi**2 + jnp.log(r) ** 2)
+    own = library((kappa, r))
+    kappa, r = own.asarray(kappa), own.asarray(r)
+    return kappa * math.pi / own.sqrt(math.pi**2 + own.log(r) ** 2)
 
 
 def calibrated(kappa: Float[AnyArray, "..."], r: Float[AnyArray, "..."]) -> tuple[Float[AnyArray, "..."], ...]:
