@@ -83,9 +83,12 @@ def _follows_jvp(primals, tangents):
     pair, sequence, knots = primals
     # The rule calls itself on the knots, so that second derivatives see them move too.
     knots = _follows(pair, sequence, knots)
-    # Not the last column of `linearise`: reverse mode cannot tell it from the matrix.
-    _, moved = jax.jvp(lambda pair: shooting.gap(pair, sequence, knots), (pair,), (tangents[0],))
-    slope = shooting.linearise(pair, sequence, knots).slope
+
+    def equations(pair):
+        linear = shooting.linearise(pair, sequence, knots)
+        return linear.gap, linear.slope
+
+    _, moved, slope = jax.jvp(equations, (pair,), (tangents[0],), has_aux=True)
     return knots, -linear_solve.solve(slope, moved).reshape(knots.shape)
 
 
