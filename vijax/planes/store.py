@@ -103,18 +103,15 @@ def write_blank(path: Path, attributes: Mapping[str, Any], arrays: "Mapping[str,
     Here zarr makes the metadata and does not write them: it takes two milliseconds to create an array, for all arrays
     of a map as long as a thousand cells run.
     """
-    import zarr
     from zarr.buffer import default_buffer_prototype
     from zarr.core.group import ConsolidatedMetadata, GroupMetadata
 
     group = GroupMetadata(attributes=dict(attributes), consolidated_metadata=ConsolidatedMetadata(dict(arrays)))
     metadata: dict[str, GroupMetadata | ArrayV3Metadata] = {"": group, **arrays}
-    # Unless lines are indented Python writes JSON in C, in a tenth of the time.
-    with zarr.config.set({"json_indent": None}):
-        for folder, described in metadata.items():
-            (path / folder).mkdir()
-            for name, content in described.to_buffer_dict(default_buffer_prototype()).items():
-                (path / folder / name).write_bytes(content.to_bytes())
+    for folder, described in metadata.items():
+        (path / folder).mkdir()
+        for name, content in described.to_buffer_dict(default_buffer_prototype()).items():
+            (path / folder / name).write_bytes(content.to_bytes())
 
 
 def array(variable: "xr.Variable", shape: tuple[int, ...], chunks: tuple[int, ...], void: Any) -> "ArrayV3Metadata":
