@@ -265,15 +265,18 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
     Where several results need a derivative XLA would compute it for each of them: sharing them halves what it compiles.
     """
     real, side = sequence.real, jnp.where(sequence.real, sequence.side, 1)
-    departure = shooting.departures(pair, sequence, knots)
-    out = -departure.side * shared_slopes(departure.speed)
-    given = each(partial(contacts.given, pair))(departure.side, knots, out, jnp.nan_to_num(deepest))
-    depth, work = shared_slopes(given)
+    wall, _, joined = shooting.joined_knots(sequence, knots)
+    depth, work = shared_slopes(each(partial(_given, pair))(wall, joined[:, :3], jnp.nan_to_num(deepest)))
     if pair.rigid:
         depth = depth * device.omega / (flow.PI * at(device.omega0, side))
     depth = jnp.where(real, depth, 0.0) * device.length_unit
     work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
     return depth, energy.harvested_energy(device.at(side), depth), work
+
+
+def _given(pair: ImpactPair, side, knot: Float[Array, "3"], deepest) -> contacts.Given:
+    v_out = side * contacts.end(pair, side, *knot).rate
+    return contacts.given(pair, side, knot, v_out, deepest)
 
 
 def image_energy(device: Harvester, sequence: Sequence, depth, harvested) -> Float[Array, "impact"]:
