@@ -5,7 +5,6 @@ program is made of. It compiles a second sooner, and runs some tens of cells as 
 before the last of so few end. What becomes of a cell is the same, to the last bit. Begin with `run`.
 """
 
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vijax.batch.lane_rounds import AtWork, Carry, Program, Service, asking, steps
+from vijax.batch.lane_rounds import AtWork, Carry, Program, Service, Succeed, asking, steps
 
 # Twice the numbers of 64 bits that the widest vectors hold. With 8 lanes LLVM unrolls its loops, and takes longer; with
 # one or two it fuses other multiplications and additions than in vectors, which would be other last bits.
@@ -38,7 +37,7 @@ def run(
 
 def chain(
     program: Program,
-    succeed: Callable[[Carry, Float[Array, "lane in"]], Float[Array, "lane in"]],
+    succeed: Succeed,
     links: Float[Array, "lane link in"],
     count: Int[Array, ""],
     length: Int[Array, ""],
@@ -97,7 +96,7 @@ def _flown(program: Program, there: Bool[Array, "lane"], rows: Float[Array, "lan
 def _serve(program: Program, service: Service, cell: Int[Array, "lane"], carry: Carry) -> Carry:
     """Give all easy lanes their second try; if there is none, a hard one the careful try."""
     easy, hard = asking(program, AtWork(cell, carry))
-    first = jnp.argmax(hard)
+    turn, first = easy.any(), jnp.argmax(hard)
 
     def careful(requests):
         answer = program.kernel(service.careful)(
@@ -105,6 +104,6 @@ def _serve(program: Program, service: Service, cell: Int[Array, "lane"], carry: 
         )
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LANES, *leaf.shape[1:])), answer)
 
-    answers = lax.cond(easy.any(), program.kernel(service.second), careful, service.request(carry))
-    served = jnp.where(easy.any(), easy, jnp.arange(LANES) == first)
+    answers = lax.cond(turn, program.kernel(service.second), careful, service.request(carry))
+    served = jnp.where(turn, easy, jnp.arange(LANES) == first)
     return program.kernel(service.settle)(carry, answers, served)

@@ -21,6 +21,9 @@ T = TypeVar("T")
 Carry = Any
 """A pytree of arrays whose leading axis is the lane."""
 
+Succeed = Callable[[Carry, Float[Array, "lane in"]], Float[Array, "lane in"]]
+"""Carries that are done, and the rows of the next cells -> these rows, with what is handed on."""
+
 # Quick steps between two rounds of serving, reviewing and refilling: with fewer, the rounds cost more than the steps,
 # with more, lanes that wait stand idle. No result depends on it.
 STEPS = 16

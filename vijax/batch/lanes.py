@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vijax.batch import accelerator_lanes, few_lanes, held_lanes
-from vijax.batch.lane_rounds import AtWork, Carry, Program, able, batch_of, run_round, take
+from vijax.batch.lane_rounds import AtWork, Carry, Program, Succeed, able, batch_of, run_round, take
 from vijax.runtime.arrays import choose
 from vijax.runtime.xla import on_cpu, put, whole_blocks
 
@@ -68,7 +68,7 @@ def _served(lanes: int) -> int:
     """Choose how many lanes are served or refilled together."""
     if not on_cpu():
         return accelerator_lanes.served(lanes)
-    return min(max(lanes // _SHARE, _FEWEST), lanes)
+    return max(lanes // _SHARE, _FEWEST)
 
 
 def run(
@@ -177,7 +177,7 @@ class _Chains(NamedTuple):
 
 def chain(
     program: Program,
-    succeed: Callable[[Carry, Float[Array, "lane in"]], Float[Array, "lane in"]],
+    succeed: Succeed,
     links: Float[Array, "lane link in"],
     count: Int[Array, ""],
     length: Int[Array, ""],
@@ -187,7 +187,7 @@ def chain(
 
     Args:
         program: What a cell is.
-        succeed: Carries that are done, and the rows of the next cells -> these rows, with what is handed on.
+        succeed: What a cell hands on to the next.
         links: The rows of every chain in order.
         count, length: How many lanes and links are real; the others come back as zeros.
         outputs: Length of a result row.

@@ -200,7 +200,7 @@ class CurvePath(eqx.Module):
             plus, minus = multipliers.multiplier_conditions(pair, self.sequence, knots)
             loads = self._loads(self.device, y[-2:], pair, knots)
             push = jnp.where(self.touch.alike, 1.0, loads[self.touch.impact] - loads).min()
-        room = grazing.between(pair, self.sequence, knots, None, **touches).clearance
+        room = grazing.between(pair, self.sequence, knots, **touches).clearance
         z = y[-2:]
         return CurveTests(
             # Where a limit turns back its orbit has met its mirror image or has doubled, which `push` says.

@@ -43,6 +43,7 @@ def between(
     sequence: Sequence,
     knots: Knots,
     departure: shooting.Departure | None = None,
+    /,
     touch: Float[Array, "impact"] | None = None,
     split: Float[Array, "impact"] | None = None,
 ) -> Between:
