@@ -212,6 +212,25 @@ def test_a_trajectory_by_a_method_of_ones_own():
     np.testing.assert_allclose(found.impacts.duration, exact.impacts.duration, atol=2 / LEAPFROG.steps)
 
 
+class Impatient(Leapfrog):
+    """Stopped long before its last period."""
+
+    def most_steps(self, pair, periods, max_impacts):
+        """As many as a period has, and a little more."""
+        return int(self.steps) + 1
+
+
+def test_a_run_is_stopped_after_so_many_steps():
+    pair, method = impact_pair(0.2, 20.0, 0.5), Impatient(1000.0)
+    starts = np.linspace(0.3, 0.4, 3)
+    for runs in (
+        vijax.trajectory(pair, 0.0, starts, 6, method=method),
+        jax.vmap(lambda v: vijax.trajectory(pair, 0.0, v, 6, method=method))(starts),
+    ):
+        assert (np.asarray(runs.status) == Status.EVENT_BUDGET).all()
+        np.testing.assert_array_equal(np.isfinite(runs.states.u), [[True] + [False] * 5] * 3)
+
+
 def test_a_plane_by_a_method_of_ones_own():
     d = jnp.asarray([0.1, 0.2, 0.3])
     one = jnp.ones_like(d)

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +81,9 @@ CALLS = {
     ),
     "trajectory, starts": lambda i, known: vijax.trajectory(pair(i), np.full((2, 4 + i), 0.02), 0.3, periods=5),
     "trajectory, grad": lambda i, known: jax.grad(lambda v: vijax.trajectory(pair(i), 0.02, v, 5).states.u[-1])(0.3),
-    "trajectory, rk4": lambda i, known: vijax.trajectory(pair(i), 0.02, 0.3, periods=5 + i, method="rk4", steps=100),
+    "trajectory, rk4": lambda i, known: vijax.trajectory(
+        pair(i), 0.02, 0.3, periods=5 + 20 * i, max_impacts=9 + 400 * i, method="rk4", steps=100
+    ),
     "orbit_search.search": lambda i, known: orbit_search.search(pair(i), "RL", guesses=60 + i),
     "orbit_search.from_state": lambda i, known: orbit_search.from_state(
         pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + 40 * i
@@ -143,14 +146,22 @@ def test_derivatives_and_batches_of_other_periods_compile_slices_alone():
 
 def test_what_is_traced_flies_the_same():
     starts = np.linspace(-0.3, 0.3, 3)
-    for wall in (40.0, None):
+    for wall, settings in ((40.0, {}), (None, {}), (40.0, {"method": "rk4", "steps": 100})):
         flat = vijax.impact_pair(0.2, wall, 0.5, 0.05)
-        plain = vijax.trajectory(flat, 0.02, starts, 40)
-        traced = jax.vmap(lambda v, flat=flat: vijax.trajectory(flat, 0.02, v, 40))(starts)
+        fly = partial(vijax.trajectory, flat, 0.02, periods=40, **settings)
+        plain, traced = fly(v0=starts), jax.vmap(lambda v, fly=fly: fly(v0=v))(starts)
         assert jax.tree.structure(plain) == jax.tree.structure(traced)
         for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(traced), strict=True):
             assert one.dtype == other.dtype
             np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
+
+
+def test_records_of_many_starts_are_those_of_few():
+    starts = np.linspace(-0.3, 0.3, 70)
+    many, few = (vijax.trajectory(pair(0), 0.02, some, 5, method="rk4", steps=100) for some in (starts, starts[:3]))
+    assert jax.tree.map(lambda leaf: leaf[:3].shape, many) == jax.tree.map(lambda leaf: leaf.shape, few)
+    for one, other in zip(jax.tree.leaves(many), jax.tree.leaves(few), strict=True):
+        np.testing.assert_allclose(one[:3], other, rtol=0, atol=1e-12)
 
 
 def test_a_compilation_is_seen():

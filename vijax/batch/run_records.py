@@ -45,11 +45,11 @@ class Asked(NamedTuple):
 
 
 class Room(NamedTuple):
-    """How many of each a program has room for."""
+    """How many of each a program has room for; of chunks for any number (None) where no derivative is taken."""
 
     periods: int
     impacts: int
-    chunks: int
+    chunks: int | None
 
 
 def start_of(pair: ImpactPair, u0, v0, t0) -> State:

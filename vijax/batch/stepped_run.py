@@ -82,13 +82,19 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, r
             broken=r.broken | (real & ~jnp.isfinite(impact.v_out)),
         )
 
-    def chunk(r: _Recording, index):
-        def go(r):
-            return lax.scan(lambda r, _: (advance(r), None), r, None, length=CHUNK)[0]
+    def chunk(r: _Recording) -> _Recording:
+        return lax.scan(lambda r, _: (advance(r), None), r, None, length=CHUNK)[0]
 
-        return lax.cond(runs(r).any() & (index < chunks), repeated(go), lambda r: r, r), None
+    def goes_on(r: _Recording, index):
+        return runs(r).any() & (index < chunks)
 
-    end, _ = lax.scan(chunk, start, jnp.arange(room.chunks, dtype=jnp.int32))
+    def if_needed(r: _Recording, index):
+        return lax.cond(goes_on(r, index), repeated(chunk), lambda r: r, r), None
+
+    if room.chunks is None:
+        end, _ = lax.while_loop(lambda at: goes_on(*at), lambda at: (chunk(at[0]), at[1] + 1), (start, jnp.int32(0)))
+    else:
+        end, _ = lax.scan(if_needed, start, jnp.arange(room.chunks, dtype=jnp.int32))
     m = end.carry
     held = (m.mode != 0) & (m.n >= periods) & (m.onset_n < periods)
     short = runs(end) | ((end.filled >= max_impacts) & (m.n < periods))

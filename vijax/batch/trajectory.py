@@ -25,6 +25,8 @@ from vijax.runtime.context import door
 _IMPACT, _STATE = 56, 32  # bytes of a record: what a run asks of memory is told from them before it begins
 # Starts fly together in calls of few sizes, so that few programs are compiled.
 _TILES = (1, 8, 64, 512, 4096)
+# The records of so few starts have room for so many periods at least: one program serves all shorter runs.
+_FEW, _ROOMS = 64, (64, 512)
 
 
 def _precision(pair: ImpactPair) -> str:
@@ -116,18 +118,33 @@ def _followed(
     rows = jax.tree.map(lambda x: own.broadcast_to(own.asarray(x, dtype), shape).reshape(-1), (pair, starts))
     most = _most(periods) if max_impacts is None else max_impacts
     chunks = 0 if method is None else -(-method.most_steps(pair, periods, most) // CHUNK)
-    numbers: Any = (np.int32(number) for number in (periods, most, chunks))
-    asked = Asked(*numbers)
-    wide = tiles.padded(periods)
-    room = Room(wide, _most(wide) if max_impacts is None else tiles.padded(max_impacts), tiles.padded(chunks))
+    counts: Any = (np.int32(count) for count in (periods, most, chunks))
+    asked = Asked(*counts)
     if method is None and own is np:
         work = partial(exact_run, asked, room=Room(periods, most, chunks))
     elif method is None:
-        work = partial(exact_traced, asked, room=room)
+        work = partial(exact_traced, asked, room=_traced_room(periods, max_impacts, chunks))
     else:
+        numbers = tiles.library((pair, starts, method)) is np
+        few = numbers and math.prod(shape) <= _FEW
+        room = _room_of_numbers(periods, most, few) if numbers else _traced_room(periods, max_impacts, chunks)
         method = jax.tree.map(lambda x: jnp.asarray(x, dtype), method)
         work = partial(stepped_run, asked, method, room=room)
     return tiles.map_tiles(lambda row: work(row[0], *row[1]), rows, _TILES), shape
+
+
+def _traced_room(periods: int, max_impacts: int | None, chunks: int) -> Room:
+    """Make room for twice what is asked for at most: a derivative remembers all of it."""
+    wide = tiles.padded(periods)
+    return Room(wide, _most(wide) if max_impacts is None else tiles.padded(max_impacts), tiles.padded(chunks))
+
+
+def _room_of_numbers(periods: int, most: int, few: bool) -> Room:
+    """Make room for so many periods and impacts, and of few starts for more, where that is little memory."""
+    for size in _ROOMS if few else ():
+        if periods <= size and most <= _most(size):
+            return Room(size, _most(size), None)
+    return Room(tiles.padded(periods), tiles.padded(most), None)
 
 
 def _most(periods: int) -> int:
