@@ -81,7 +81,7 @@ class Arc(eqx.Module):
         """Compute the gap and its derivatives in knots and parameter."""
         knots, x = self.unpack(y)
         pair, moved = jax.jvp(self.at, (x,), (self.high - self.low,))
-        gap, ring = shooting.linearise(pair, self.sequence, knots, moved)
+        gap, ring, *_ = shooting.linearise(pair, self.sequence, knots, moved)
         return PathEquations(gap, jnp.zeros(0, y.dtype), ring)
 
     def tests(self, y, tangent, former) -> Tests:

@@ -153,7 +153,8 @@ class CurvePath(eqx.Module):
         device = dataclasses.replace(device, **own)
         # When a contact is deepest is found by a search, and moves with the knots by its own equation.
         frozen = jax.tree.map(lax.stop_gradient, (pair, self.sequence, knots))
-        depth, energy, work = steady.yields(device, pair, self.sequence, knots, grazing.between(*frozen).deepest)
+        out = shooting.departures(pair, self.sequence, knots).speed
+        depth, energy, work = steady.yields(device, pair, self.sequence, knots, out, grazing.between(*frozen).deepest)
         # An orbit closed half way is as deep at the other wall, too.
         side, mirrored = self.sequence.side, self.sequence.mirrored
         limit = jnp.minimum(*(at(device.depth_limit, wall) for wall in (side, jnp.where(mirrored, -side, side))))
@@ -167,7 +168,7 @@ class CurvePath(eqx.Module):
         """Compute the gap and the condition, and their derivatives in all unknowns."""
         pair, knots = self.pair_and_knots(y)
         moved = [jax.jvp(self.at, (y[-2:],), (unit,))[1] for unit in jnp.eye(2, dtype=y.dtype)]
-        gap, ring = shooting.linearise(pair, self.sequence, knots, *moved)
+        gap, ring, *_ = shooting.linearise(pair, self.sequence, knots, *moved)
         waits = y.size - gap.size - 2
         idle = jnp.zeros((*ring.beside.shape[:2], waits), y.dtype)
         ring = ring._replace(

@@ -51,10 +51,15 @@ class Sequence(eqx.Module):
 
 
 class LinearisedEquations(NamedTuple):
-    """The equations at a guess: what is missing, and how it changes with every knot (and a parameter, last)."""
+    """The equations at a guess: what is missing, and how it changes with every knot (and a parameter, last).
+
+    With w' at the end of every contact, which they hold, and its derivatives in the knot.
+    """
 
     gap: Float[Array, "equation"]
     ring: Ring
+    rate: Float[Array, "impact"]
+    rate_slope: Float[Array, "impact 3"]
 
     @property
     def slope(self) -> Float[Array, "equation unknown"]:
@@ -63,11 +68,12 @@ class LinearisedEquations(NamedTuple):
 
 
 class _ImpactEquations(NamedTuple):
-    """The equations of a contact and the flight after it, their derivatives in the joint knots, and w' at its end."""
+    """The equations of a contact and the flight after it, and w' at its end; each in the joint knots."""
 
     value: Float[Array, "3"]
     slope: Float[Array, "3 5"]
     rate: Float[Array, ""]
+    rate_slope: Float[Array, "3"]
 
 
 def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> _ImpactEquations:
@@ -92,7 +98,7 @@ def _pieces(pair: ImpactPair, side, onward, knot: Float[Array, "5"]) -> _ImpactE
     d_place = jnp.where(back, (d_rise - rise / length * (d_next - d_leave)) / length, d_rise)
     value = jnp.stack([contact.place, place, onward * v - next_speed])
     slope = jnp.stack([jnp.pad(contact.place_slope, (0, 2)), d_place, onward * d_v - d_next_speed])
-    return _ImpactEquations(value, slope, contact.rate)
+    return _ImpactEquations(value, slope, contact.rate, contact.rate_slope)
 
 
 def _following(sequence: Sequence):
@@ -143,7 +149,7 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
 
     def parts(pair):
         piece = each(partial(_pieces, pair))(side, wall, joined)
-        return piece.value, piece.slope
+        return piece.value, piece[1:]
 
     def along(change):
         return jax.jvp(parts, (pair,), (change,), has_aux=True)
@@ -151,9 +157,9 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
     if moved:
         # All in one: equations that each derivative computed anew would be most of what is compiled of a curve.
         together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *moved)
-        pieces, changes, blocks = jax.vmap(along, out_axes=(None, -1, None))(together)
+        pieces, changes, (blocks, *rates) = jax.vmap(along, out_axes=(None, -1, None))(together)
     else:
-        pieces, blocks = parts(pair)
+        pieces, (blocks, *rates) = parts(pair)
         changes = jnp.zeros((*pieces.shape, 0), knots.dtype)
     real, dtype = sequence.real[:, None, None], knots.dtype
     # Where there is no impact the identity keeps the matrix regular, and the step there zero.
@@ -165,7 +171,7 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
         below=jnp.zeros((0, *pieces.shape), dtype),
         corner=jnp.zeros((0, len(moved)), dtype),
     )
-    return LinearisedEquations(jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1), ring)
+    return LinearisedEquations(jnp.where(sequence.real[:, None], pieces, 0.0).reshape(-1), ring, *rates)
 
 
 class Departure(NamedTuple):

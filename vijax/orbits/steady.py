@@ -72,24 +72,32 @@ class Steady(WithStatus):
     knots: Knots
 
 
+Out = Float[Array, "impact"]
+"""Speed after each contact, away from the wall."""
+
+
 @jax.custom_jvp
-def _follows(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Knots:
-    """Make `knots` a function of the pair by the orbit's equations: value unchanged, derivatives of any order right."""
-    return knots
+def _follows(pair: ImpactPair, sequence: Sequence, knots: Knots, out: Out) -> tuple[Knots, Out]:
+    """Make an orbit a function of the pair by its equations: values unchanged, derivatives of any order right.
+
+    Speeds after contacts move with it, as what the equations are made of holds them.
+    """
+    return knots, out
 
 
 @_follows.defjvp
 def _follows_jvp(primals, tangents):
-    pair, sequence, knots = primals
+    pair, sequence, knots, out = primals
     # The rule calls itself on the knots, so that second derivatives see them move too.
-    knots = _follows(pair, sequence, knots)
+    knots, out = _follows(pair, sequence, knots, out)
 
     def equations(pair):
         linear = shooting.linearise(pair, sequence, knots)
-        return linear.gap, linear.slope
+        return (linear.gap, linear.rate), (linear.slope, linear.rate_slope)
 
-    _, moved, slope = jax.jvp(equations, (pair,), (tangents[0],), has_aux=True)
-    return knots, -linear_solve.solve(slope, moved).reshape(knots.shape)
+    _, (gap, rate), (slope, rate_slope) = jax.jvp(equations, (pair,), (tangents[0],), has_aux=True)
+    step = -linear_solve.solve(slope, gap).reshape(knots.shape)
+    return (knots, out), (step, -rate - (rate_slope * step).sum(axis=1))
 
 
 @door
@@ -127,11 +135,13 @@ class Found(NamedTuple):
 
     Attributes:
         knots: Of the orbit.
+        out: Speed after each contact, away from the wall.
         residual: Largest violation of the equations.
         validity: Whether it is one that attracts, and by how much.
     """
 
     knots: Knots
+    out: Out
     residual: Float[Array, ""]
     validity: Validity
 
@@ -158,7 +168,7 @@ def _like_found(about: tuple[Sequence, Knots]) -> Found:
     zero: Any = np.zeros((), guess.dtype)
     status: Any = np.int32(Status.OK)
     motion = Between(Clearance(zero, zero, zero, zero), guess[:, 0])
-    return Found(guess, zero, Validity(status, zero, zero, motion))
+    return Found(guess, guess[:, 0], zero, Validity(status, zero, zero, motion))
 
 
 def _respond(moved: Moved, about: tuple[Sequence, Knots], found: Found, *, kind: Walls) -> Steady:
@@ -212,8 +222,10 @@ def _judged(
     pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""], departure: Departure | None = None
 ) -> Found:
     """Judge the orbit with the given knots, a constant of differentiation."""
-    frozen = jax.tree.map(lax.stop_gradient, (pair, sequence, knots, residual, departure))
-    return Found(frozen[2], frozen[3], validity(*frozen))
+    given = pair, sequence, knots, residual, departure
+    pair, sequence, knots, residual, departure = jax.tree.map(lax.stop_gradient, given)
+    leaves = shooting.departures(pair, sequence, knots) if departure is None else departure
+    return Found(knots, leaves.speed, residual, validity(pair, sequence, knots, residual, leaves))
 
 
 def response(
@@ -224,13 +236,13 @@ def response(
 
 
 def _response(device: Harvester, pair: ImpactPair, sequence: Sequence, found: Found) -> Steady:
-    knots, residual, (status, multiplier, condition, (room, deepest)) = found
+    knots, out, residual, (status, multiplier, condition, (room, deepest)) = found
     # Harmless numbers where there is no orbit: what is computed from them is thrown away.
     absent = (status == Status.NO_ORBIT) | ~sequence.real
     knots = jnp.where(absent[:, None], jnp.array(_HARMLESS, knots.dtype), knots)
-    knots = shared_slopes(_follows(pair, sequence, knots))
+    knots, out = shared_slopes(_follows(pair, sequence, knots, jnp.where(absent, 1.0, out)))
     valid = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    depth, harvested, work = (valid * x for x in yields(device, pair, sequence, knots, deepest))
+    depth, harvested, work = (valid * x for x in yields(device, pair, sequence, knots, out, deepest))
     mean = 0.5 * (harvested + image_energy(device, sequence, depth, harvested)) if device.unequal else harvested
     P = jnp.where(sequence.real, mean, 0.0).sum() / sequence.span
     left, right = ((sequence.side == wall).sum(dtype=jnp.int32) for wall in (-1, 1))
@@ -258,7 +270,7 @@ def _response(device: Harvester, pair: ImpactPair, sequence: Sequence, found: Fo
 _HARMLESS = (0.0, 1.0, 0.5)  # a knot
 
 
-def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, deepest):
+def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots, out: Out, deepest):
     """Compute depth [m], harvested energy [J] and energy given to the membrane [J] of every impact.
 
     Padded impacts have none of the first two and infinitely much of the last.
@@ -266,17 +278,13 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
     """
     real, side = sequence.real, jnp.where(sequence.real, sequence.side, 1)
     wall, _, joined = shooting.joined_knots(sequence, knots)
-    depth, work = shared_slopes(each(partial(_given, pair))(wall, joined[:, :3], jnp.nan_to_num(deepest)))
+    given = each(partial(contacts.given, pair))(wall, joined[:, :3], -wall * out, jnp.nan_to_num(deepest))
+    depth, work = shared_slopes(given)
     if pair.rigid:
         depth = depth * device.omega / (flow.PI * at(device.omega0, side))
     depth = jnp.where(real, depth, 0.0) * device.length_unit
     work = jnp.where(real, work, jnp.inf) * (device.m_b * device.speed_unit**2)
     return depth, energy.harvested_energy(device.at(side), depth), work
-
-
-def _given(pair: ImpactPair, side, knot: Float[Array, "3"], deepest) -> contacts.Given:
-    v_out = side * contacts.end(pair, side, *knot).rate
-    return contacts.given(pair, side, knot, v_out, deepest)
 
 
 def image_energy(device: Harvester, sequence: Sequence, depth, harvested) -> Float[Array, "impact"]:

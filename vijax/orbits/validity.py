@@ -34,14 +34,14 @@ class Validity(NamedTuple):
 
 
 def validity(
-    pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""], departure: Departure | None = None
+    pair: ImpactPair, sequence: Sequence, knots: Knots, residual: Float[Array, ""], departure: Departure
 ) -> Validity:
     """Judge an orbit by what is left of its equations, its clearances and its multipliers.
 
     Args:
         pair, sequence, knots: The orbit.
         residual: Its largest violation of the equations.
-        departure: How its contacts end, where that is known already.
+        departure: How its contacts end.
     """
     around = multipliers.monodromy(pair, sequence, knots)
     multiplier = jnp.abs(multipliers.floquet(around[None], sequence.mirrored[None])).max()
