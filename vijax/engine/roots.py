@@ -16,11 +16,48 @@ _MOST_ROUNDS = 120  # bisection alone needs 2 x 53; Newton ends most after 6
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
+def implicit_root(residual: Callable, root: Scalar, args: Any) -> Scalar:
+    """Make `root` a function of `args` by residual(root, args) = 0.
+
+    Its value is unchanged, derivatives of every order are right: the tangent rule calls itself on the root, so that
+    second ones are right too (one Newton step would not do).
+    """
+    return root
+
+
+@implicit_root.defjvp
+def _implicit_root_jvp(residual, primals, tangents):
+    root, args = primals
+    root = implicit_root(residual, root, args)
+    _, moved = jax.jvp(lambda a: residual(root, a), (args,), (tangents[1],))
+    _, slope = jax.jvp(lambda s: residual(s, args), (root,), (jnp.ones_like(root),))
+    return root, -moved / slope
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def extreme_value(course: Callable, place: Scalar, args: Any) -> Scalar:
+    """Compute a value at its extremum as a function of `args`; that moves with them, in derivatives beyond the first.
+
+    Args:
+        course: (s, args) -> the value's derivative in s, and the value at s.
+        place: Where the derivative vanishes.
+        args: What both are functions of.
+    """
+    return course(place, args)[1]
+
+
+@extreme_value.defjvp
+def _extreme_value_jvp(course, primals, tangents):
+    place, args = primals
+    place = implicit_root(lambda s, args: course(s, args)[0], place, args)
+    return jax.jvp(lambda a: course(place, a)[1], (args,), (tangents[1],))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def implicit_state(course: Callable, root: Scalar, args: Any) -> tuple[Scalar, Any]:
     """Make `root` a function of `args` by what must vanish there, and give what else there is: its state.
 
-    Values are unchanged, derivatives of every order right: the tangent rule calls itself on the root, so that second
-    ones are right too (one Newton step would not do).
+    Values are unchanged, derivatives of every order right.
 
     Args:
         course: (s, args) -> what vanishes at the root, and the state at s.
@@ -33,16 +70,11 @@ def implicit_state(course: Callable, root: Scalar, args: Any) -> tuple[Scalar, A
 @implicit_state.defjvp
 def _implicit_state_jvp(course, primals, tangents):
     root, args = primals
-    root, state = implicit_state(course, root, args)
-    _, (moved, change) = jax.jvp(lambda a: course(root, a), (args,), (tangents[1],))
+    root = implicit_root(lambda s, args: course(s, args)[0], root, args)
+    (_, state), (moved, change) = jax.jvp(lambda a: course(root, a), (args,), (tangents[1],))
     _, (slope, rate) = jax.jvp(lambda s: course(s, args), (root,), (jnp.ones_like(root),))
     pace = -moved / slope
     return (root, state), (pace, jax.tree.map(lambda x, rate: x + rate * pace, change, rate))
-
-
-def implicit_root(residual: Callable, root: Scalar, args: Any) -> Scalar:
-    """Make `root` a function of `args` by residual(root, args) = 0; see `implicit_state`."""
-    return implicit_state(lambda s, args: (residual(s, args), ()), root, args)[0]
 
 
 def bracketed_root(function: Callable, low: Scalar, high: Scalar, guess: Scalar, wanted: Flag) -> Scalar:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vijax.engine import contact_search, ode_contact, turn_search
-from vijax.engine.roots import implicit_state
+from vijax.engine.roots import extreme_value
 from vijax.engine.taylor import Oscillator, Push
 from vijax.model import energy, flow
 from vijax.model.flow import Membrane
@@ -181,7 +181,7 @@ def given(pair: ImpactPair, side, knot: Float[Array, "3"], v_out, crest) -> Give
 
 def _given_to_membrane(wall: ImpactPair, side, t, speed, stay, v_out, crest) -> Given:
     of = wall, side, t, speed
-    _, depth = implicit_state(_rate_and_depth, crest, of)
+    depth = extreme_value(_rate_and_depth, crest, of)
     if wall.law is not None:
         return Given(depth, ode_contact.held(ode_contact.contact(*of), stay).work)
     if wall.waves is not None:

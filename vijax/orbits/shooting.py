@@ -212,9 +212,15 @@ def measured(
 def _measured(pair: ImpactPair, sequence: Sequence, knots: Knots) -> tuple[Float[Array, ""], Departure]:
     side, wall, joined = joined_knots(sequence, knots)
     piece = each(partial(_pieces, pair))(side, wall, joined)
-    uncertain = jax.vmap(lambda side, knot: contacts.uncertainty(pair, side, *knot[:3]))(side, joined)
-    largest = jnp.maximum(jnp.abs(piece.value).max(axis=1), uncertain)
-    return jnp.where(sequence.real, largest, 0.0).max(), _departure(sequence, knots, piece.rate)
+    missing = jnp.where(sequence.real[:, None], jnp.abs(piece.value), 0.0).max()
+    return jnp.maximum(missing, _uncertainty(pair, sequence, knots)), _departure(sequence, knots, piece.rate)
+
+
+def _uncertainty(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Float[Array, ""]:
+    """Estimate by how much the ends of contacts are off beyond rounding, at most."""
+    side, _, joined = joined_knots(sequence, knots)
+    each_end = jax.vmap(lambda side, knot: contacts.uncertainty(pair, side, *knot[:3]))(side, joined)
+    return jnp.where(sequence.real, each_end, 0.0).max()
 
 
 def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, ""]:
@@ -226,14 +232,36 @@ def possible(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Bool[Array, 
 
 
 class _Descent(eqx.Module):
-    """Newton's search of a batch: knots, the full step from there, how much is missing, the share to try."""
+    """Newton's search of a batch.
+
+    Attributes:
+        knots, step: Where each is, and the full step from there.
+        missing, rate: How much is missing there, and w' at the end of every contact.
+        pace: The share of the step to try.
+        going: Whether a step is tried for less to be missing.
+        arrived: Whether the last step has been taken.
+        iteration: How many trips there were.
+    """
 
     knots: Float[Array, "orbit impact 3"]
     step: Float[Array, "orbit impact 3"]
     missing: Float[Array, "orbit"]
+    rate: Float[Array, "orbit impact"]
     pace: Float[Array, "orbit"]
     going: Bool[Array, "orbit"]
+    arrived: Bool[Array, "orbit"]
     iteration: Int[Array, ""]
+
+    @property
+    def size(self) -> Float[Array, "orbit"]:
+        """Say how long the full step is."""
+        return jnp.abs(self.step).max(axis=(1, 2))
+
+    @property
+    def arrives(self) -> Bool[Array, "orbit"]:
+        """Say of which searches the last step is to be taken."""
+        close = (self.missing < jnp.inf) & ((self.size <= _LAST_STEP) | (self.missing < _FLOOR))
+        return ~self.going & ~self.arrived & close
 
 
 def _step(linear: LinearisedEquations) -> Knots:
@@ -263,41 +291,40 @@ def newton(
 ) -> Solution:
     """Search a batch of orbits by damped Newton: a step that does not shorten what is missing is halved.
 
+    What is missing after the last step, which is taken however that is, is seen in the loop, too: the equations stand
+    in the program once.
+
     Args:
         max_iterations: That a search may take, one evaluation each; the batch takes as many as its slowest search.
     """
 
-    def look(knots):
-        linear = jax.vmap(linearise)(pair, sequence, knots)
-        return jax.vmap(_step)(linear), jnp.abs(linear.gap).max(axis=1)
-
-    def size(step):
-        return jnp.abs(step).max(axis=(1, 2))
-
     def advance(d: _Descent) -> _Descent:
-        trial = d.knots - d.pace[:, None, None] * d.step
-        step, missing = look(trial)
+        arrives = d.arrives
+        trial = d.knots - jnp.where(arrives, 1.0, d.pace)[:, None, None] * d.step
+        linear = jax.vmap(linearise)(pair, sequence, trial)
+        step, missing = jax.vmap(_step)(linear), jnp.abs(linear.gap).max(axis=1)
         # NaN compares false: an overflow is a step too long.
         better = jax.vmap(possible)(pair, sequence, trial) & (missing < (1 - 0.25 * d.pace) * d.missing)
-        better = d.going & better & jnp.isfinite(size(step))
-        pick = better[:, None, None]
+        better = d.going & better & jnp.isfinite(jnp.abs(step).max(axis=(1, 2)))
         pace = jnp.where(better, jnp.minimum(2 * d.pace, 1.0), 0.5 * d.pace)
-        step = jnp.where(pick, step, d.step)
-        return _Descent(
-            knots=jnp.where(pick, trial, d.knots),
-            step=step,
-            missing=jnp.where(better, missing, d.missing),
+        there = better | arrives
+        after = _Descent(
+            knots=jnp.where(there[:, None, None], trial, d.knots),
+            step=jnp.where(better[:, None, None], step, d.step),
+            missing=jnp.where(there, missing, d.missing),
+            rate=jnp.where(there[:, None], linear.rate, d.rate),
             pace=jnp.where(d.going, pace, d.pace),
-            going=d.going & (pace > _LEAST_PACE) & ~(better & (size(step) <= _LAST_STEP)),
+            going=d.going & (pace > _LEAST_PACE) & (d.iteration + 1 < max_iterations),
+            arrived=d.arrived | arrives,
             iteration=d.iteration + 1,
         )
+        return eqx.tree_at(lambda d: d.going, after, after.going & ~(better & (after.size <= _LAST_STEP)))
 
     # The first trial is the guess itself.
     zero, far = jnp.zeros_like(knots), jnp.full(knots.shape[0], jnp.inf)
-    start = _Descent(knots, zero, far, jnp.ones_like(far), far > 0, jnp.int32(0))
-    end = lax.while_loop(lambda d: d.going.any() & (d.iteration < max_iterations), advance, start)
-    arrived = (end.missing < jnp.inf) & ((size(end.step) <= _LAST_STEP) | (end.missing < _FLOOR))
-    knots = jnp.where(arrived[:, None, None], end.knots - end.step, end.knots)
-    residual, departure = measured(pair, sequence, knots)
-    arrived = arrived & jax.vmap(possible)(pair, sequence, knots)
-    return Solution(knots, jnp.where(arrived, residual, jnp.inf), departure)
+    start = _Descent(knots, zero, far, zero[..., 0], jnp.ones_like(far), far > 0, far < 0, jnp.int32(0))
+    end = lax.while_loop(lambda d: (d.going | d.arrives).any(), advance, start)
+    residual = jnp.maximum(end.missing, jax.vmap(_uncertainty)(pair, sequence, end.knots))
+    arrived = end.arrived & jax.vmap(possible)(pair, sequence, end.knots)
+    departure = jax.vmap(_departure)(sequence, end.knots, end.rate)
+    return Solution(end.knots, jnp.where(arrived, residual, jnp.inf), departure)
