@@ -35,6 +35,17 @@ def test_reverse_is_forward(jets):
     assert np.allclose(pushed, first, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.parametrize("kappa", [pytest.param(50.0, marks=pytest.mark.long), None])
+def test_a_hessian_is_forward_derivatives_of_forward_ones(kappa):
+    def place(x):
+        return vijax.trajectory(impact_pair(x[0], kappa, x[1]), 0.02, 0.3, 2, max_impacts=4).states.u[-1]
+
+    x = np.array([0.2, 0.5])
+    forward = jax.jit(jax.jacfwd(jax.jacfwd(place)))(x)
+    assert np.abs(forward).min() > 1e-3
+    np.testing.assert_allclose(jax.jit(jax.hessian(place))(x), forward, rtol=1e-9)
+
+
 def test_restarting_from_a_stroboscopic_state_goes_on_the_same():
     pair = impact_pair([0.2, 0.2, 0.15], [4.0, 40.0, 12.0], [0.5, 0.5, 0.1], [0.0, 0.05, 0.1])
     whole = vijax.trajectory(pair, 0.02, 0.3, 6)

@@ -1,6 +1,7 @@
 """The exact engine: 50-digit sequences, answers chosen first, invariants, and an audit for missed events."""
 
 import jax
+import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
@@ -27,8 +28,9 @@ from benchmarks.yardstick import (
     sensitive,
     start,
 )
-from vijax.engine import contact_search
+from vijax.engine import contact_search, exact
 from vijax.model import flow
+from vijax.model.pair import impact_pair
 from vijax.model.records import State
 
 
@@ -248,6 +250,18 @@ def soft_runs():
 def rigid_runs():
     pair, state = random_cells(np.random.default_rng(22), 3 * TILE, soft=False)
     return pair, march(pair, state)
+
+
+def test_a_second_derivative_is_the_same_either_way():
+    def speed(x):
+        zero = jnp.zeros((), jnp.int32)
+        begun = State(jnp.asarray(0.02), x[1], jnp.asarray(0.3), zero, zero)
+        return exact.step(impact_pair(0.2, x[0], 0.5), begun, jnp.asarray(6.0), deep=False, rolled=True).state.v
+
+    x = jnp.array([50.0, 0.3])
+    forward, reverse = (jax.jit(jax.jacfwd(way(speed)))(x) for way in (jax.jacfwd, jax.jacrev))
+    assert np.abs(forward).min() > 1e-6
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
 
 def test_mirror_symmetry(soft_runs, rigid_runs):

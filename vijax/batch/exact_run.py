@@ -17,7 +17,7 @@ from vijax.model.records import Impact, State, Status
 from vijax.runtime import tiles
 from vijax.runtime.arrays import AnyArray, choose
 from vijax.runtime.programs import begin, jitted
-from vijax.runtime.xla import each, once
+from vijax.runtime.xla import each, loop_body, once
 
 # The exact engine takes so many steps in one compiled call: enough for 15 to 30 periods, so that short runs are one
 # call, and few enough that the host waits for no long one after every ball has arrived.
@@ -98,7 +98,7 @@ def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArr
         after = jax.tree.map(lambda new, old: jnp.where(ends, old, new), out.state, state)
         return _Reached(after, over), _Flown(state, out, idle)
 
-    reached, flown = lax.scan(advance, reached, first + jnp.arange(count, dtype=jnp.int32))
+    reached, flown = lax.scan(loop_body(advance), reached, first + jnp.arange(count, dtype=jnp.int32))
     return reached, jax.tree.map(lambda leaf: leaf.swapaxes(0, 1), flown)
 
 

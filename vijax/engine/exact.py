@@ -22,6 +22,7 @@ from vijax.model.flow import Membrane
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State
 from vijax.runtime.arrays import Flag, Scalar, Values
+from vijax.runtime.xla import loop_body
 
 
 class Outcome(eqx.Module):
@@ -77,7 +78,7 @@ def _soft_contact(
         return jnp.where(exits, s, seen[0]), jnp.where(exits, state, seen[1]), state
 
     # A loop, so that a program holds the membrane's flow once for both, and its derivatives.
-    duration, z, depth = lax.fori_loop(0, 1 + deep, look, (duration, z0, when))
+    duration, z, depth = lax.fori_loop(0, 1 + deep, loop_body(look), (duration, z0, when))
     return duration, -z, depth if deep else jnp.full_like(z, jnp.nan)
 
 

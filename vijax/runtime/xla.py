@@ -196,6 +196,15 @@ def search(goes_on: Callable[[T], Bool[Array, ""]], work: Callable[[T], T], stat
     return lax.while_loop(goes_on, some, state)
 
 
+def loop_body(work: Callable[P, T]) -> Callable[P, T]:
+    """Make the body of a loop that may be differentiated in reverse, and that derivative again, as by `jax.hessian`.
+
+    JAX 0.10 forgets a body's own rules of derivatives on the way (`jax.custom_jvp`) and differentiates what they
+    compute: second derivatives would be wrong without a word. It keeps those of a body that is computed again.
+    """
+    return jax.checkpoint(work, prevent_cse=False)
+
+
 def each(work: Callable[P, T]) -> Callable[P, T]:
     """Make what does `work` for every ball: arguments and results have a leading axis more.
 
@@ -205,7 +214,11 @@ def each(work: Callable[P, T]) -> Callable[P, T]:
 
     def call(*balls: P.args, **kwargs: P.kwargs) -> T:
         if on_cpu() and jax.tree.leaves(balls)[0].shape[0] <= _FEW:
-            return lax.map(lambda ball: work(*ball, **kwargs), balls)
+
+            def one(ball: Any) -> T:
+                return work(*ball, **kwargs)
+
+            return lax.map(loop_body(one), balls)
         return jax.vmap(partial(work, **kwargs))(*balls)
 
     return call
