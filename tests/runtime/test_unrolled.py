@@ -7,6 +7,7 @@ import pytest
 from jax import lax
 
 from vijax.runtime.unrolled import unrolled
+from vijax.runtime.xla import loop_body
 
 LANES = 5
 
@@ -81,7 +82,18 @@ def trips(given):
     return rows[0], rows[1], sums, jnp.arccos(0.4 * x)
 
 
-@pytest.mark.parametrize("work", [powers, turns, halves, inner, own, trips])
+def again(given):
+    """Go round in a body that a derivative computes again."""
+    x, y, _ = given
+    table = np.linspace(0.5, 1.0, 3)[:, None]
+
+    def body(i, x):
+        return jnp.cos(x) * y + i * (jnp.asarray(table) * x).sum(axis=0)
+
+    return (lax.fori_loop(0, 2, loop_body(body), x),)
+
+
+@pytest.mark.parametrize("work", [powers, turns, halves, inner, own, trips, again])
 def test_lane_by_lane_it_comes_out_the_same(work):
     given = lanes()
     found = jax.jit(lambda *given: unrolled(work, list(given)))(*given)

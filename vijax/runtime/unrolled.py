@@ -86,7 +86,8 @@ def _done(eqn: Any, count: int, args: list[Rows]) -> list[Rows]:
     if name == "scan":
         return _trips(params, count, args)
     if inner := params.get("jaxpr") or params.get("call_jaxpr"):
-        return _follow(inner, count, args)
+        # That of a body which is computed again for its derivative (`xla.loop_body`) holds no constants.
+        return _follow(inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ()), count, args)
     if name == "unstack":
         return list(np.moveaxis(args[0], params["axis"], 0))
     if name in _REDUCTIONS:
