@@ -253,15 +253,14 @@ class _Descent(eqx.Module):
     iteration: Int[Array, ""]
 
     @property
-    def size(self) -> Float[Array, "orbit"]:
-        """Say how long the full step is."""
-        return jnp.abs(self.step).max(axis=(1, 2))
-
-    @property
     def arrives(self) -> Bool[Array, "orbit"]:
         """Say of which searches the last step is to be taken."""
-        close = (self.missing < jnp.inf) & ((self.size <= _LAST_STEP) | (self.missing < _FLOOR))
+        close = (self.missing < jnp.inf) & ((_size(self.step) <= _LAST_STEP) | (self.missing < _FLOOR))
         return ~self.going & ~self.arrived & close
+
+
+def _size(step: Float[Array, "orbit impact 3"]) -> Float[Array, "orbit"]:
+    return jnp.abs(step).max(axis=(1, 2))
 
 
 def _step(linear: LinearisedEquations) -> Knots:
@@ -305,20 +304,20 @@ def newton(
         step, missing = jax.vmap(_step)(linear), jnp.abs(linear.gap).max(axis=1)
         # NaN compares false: an overflow is a step too long.
         better = jax.vmap(possible)(pair, sequence, trial) & (missing < (1 - 0.25 * d.pace) * d.missing)
-        better = d.going & better & jnp.isfinite(jnp.abs(step).max(axis=(1, 2)))
+        better = d.going & better & jnp.isfinite(_size(step))
         pace = jnp.where(better, jnp.minimum(2 * d.pace, 1.0), 0.5 * d.pace)
+        going = d.going & (pace > _LEAST_PACE) & ~(better & (_size(step) <= _LAST_STEP))
         there = better | arrives
-        after = _Descent(
+        return _Descent(
             knots=jnp.where(there[:, None, None], trial, d.knots),
             step=jnp.where(better[:, None, None], step, d.step),
             missing=jnp.where(there, missing, d.missing),
             rate=jnp.where(there[:, None], linear.rate, d.rate),
             pace=jnp.where(d.going, pace, d.pace),
-            going=d.going & (pace > _LEAST_PACE) & (d.iteration + 1 < max_iterations),
+            going=going & (d.iteration + 1 < max_iterations),
             arrived=d.arrived | arrives,
             iteration=d.iteration + 1,
         )
-        return eqx.tree_at(lambda d: d.going, after, after.going & ~(better & (after.size <= _LAST_STEP)))
 
     # The first trial is the guess itself.
     zero, far = jnp.zeros_like(knots), jnp.full(knots.shape[0], jnp.inf)
