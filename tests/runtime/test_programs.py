@@ -84,6 +84,9 @@ CALLS = {
     "trajectory, rk4": lambda i, known: vijax.trajectory(
         pair(i), 0.02, 0.3, periods=5 + 20 * i, max_impacts=9 + 400 * i, method="rk4", steps=100
     ),
+    "trajectory, rk4, many": lambda i, known: vijax.trajectory(
+        pair(i), 0.02, np.full(70, 0.3), periods=6 + i, method="rk4", steps=100
+    ),
     "orbit_search.search": lambda i, known: orbit_search.search(pair(i), "RL", guesses=60 + i),
     "orbit_search.from_state": lambda i, known: orbit_search.from_state(
         pair(0), np.full(5 + i, 0.02), 0.3, settle=20 + 40 * i

@@ -123,28 +123,23 @@ def _followed(
     if method is None and own is np:
         work = partial(exact_run, asked, room=Room(periods, most, chunks))
     elif method is None:
-        work = partial(exact_traced, asked, room=_traced_room(periods, max_impacts, chunks))
+        work = partial(exact_traced, asked, room=_room(periods, max_impacts, tiles.padded(chunks)))
     else:
         numbers = tiles.library((pair, starts, method)) is np
         few = numbers and math.prod(shape) <= _FEW
-        room = _room_of_numbers(periods, most, few) if numbers else _traced_room(periods, max_impacts, chunks)
+        room = _room(periods, max_impacts, None if numbers else tiles.padded(chunks), few=few)
         method = jax.tree.map(lambda x: jnp.asarray(x, dtype), method)
         work = partial(stepped_run, asked, method, room=room)
     return tiles.map_tiles(lambda row: work(row[0], *row[1]), rows, _TILES), shape
 
 
-def _traced_room(periods: int, max_impacts: int | None, chunks: int) -> Room:
-    """Make room for twice what is asked for at most: a derivative remembers all of it."""
-    wide = tiles.padded(periods)
-    return Room(wide, _most(wide) if max_impacts is None else tiles.padded(max_impacts), tiles.padded(chunks))
-
-
-def _room_of_numbers(periods: int, most: int, few: bool) -> Room:
-    """Make room for so many periods and impacts, and of few starts for more, where that is little memory."""
+def _room(periods: int, max_impacts: int | None, chunks: int | None, *, few: bool = False) -> Room:
+    """Make room for twice what is asked for at most, as derivatives remember all of it; of few numbers for more."""
     for size in _ROOMS if few else ():
-        if periods <= size and most <= _most(size):
-            return Room(size, _most(size), None)
-    return Room(tiles.padded(periods), tiles.padded(most), None)
+        if periods <= size and (max_impacts or 0) <= _most(size):
+            return Room(size, _most(size), chunks)
+    wide = tiles.padded(periods)
+    return Room(wide, _most(wide) if max_impacts is None else tiles.padded(max_impacts), chunks)
 
 
 def _most(periods: int) -> int:

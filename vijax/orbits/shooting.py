@@ -294,7 +294,8 @@ def newton(
     in the program once.
 
     Args:
-        max_iterations: That a search may take, one evaluation each; the batch takes as many as its slowest search.
+        max_iterations: That a search may take before its last step, one evaluation each; the batch takes as many as its
+            slowest search.
     """
 
     def advance(d: _Descent) -> _Descent:
