@@ -190,7 +190,11 @@ _WIDTHS = (
 
 
 def audit_contacts(pair: ImpactPair, ran: Any) -> np.ndarray:
-    """Find how far w was below zero before the reported end of each contact, over the scale of w (negative: never)."""
+    """Find how far w was below zero before the reported end of each contact, over the scale of w (negative: never).
+
+    It is a sum of the response to the shaking, of that to gravity, and of the swing. In a slow short contact they all
+    but cancel: one rounding of the responses is no way below zero.
+    """
     held = ((ran.out.impact.side != 0) | (ran.before.mode != 0)) & ~np.isnan(ran.out.stay)
     index = np.nonzero(held)
     d, kappa, r, gamma = (np.asarray(x)[index[0]] for x in (pair.d, pair.kappa, pair.r, pair.gamma))
@@ -202,6 +206,7 @@ def audit_contacts(pair: ImpactPair, ran: Any) -> np.ndarray:
     # Long after the oscillation has decayed only the steady response moves: a grid of its own.
     zeta = -np.log(r) / np.hypot(np.pi, np.log(r)) * kappa
     early = np.minimum(length, 60 / np.maximum(zeta, 1e-9))
+    rounding = EPS * (1 / np.abs(kappa**2 - np.pi**2 + 2j * np.pi * zeta) + np.abs(gamma) / kappa**2)
     need = 40 * np.maximum(np.maximum(kappa, np.pi) * early, np.pi * length) / np.pi
     worst = np.empty(len(d))
     for low, high in zip((0, *_WIDTHS[:-1]), (*_WIDTHS[:-1], np.inf), strict=True):
@@ -215,7 +220,7 @@ def audit_contacts(pair: ImpactPair, ran: Any) -> np.ndarray:
             both = [long_contact(*[*columns, s])[0] for s in spans]
             scale = np.maximum(*(np.abs(w).max(axis=-1) for w in both))
             below = np.maximum(*(_peak(-w) for w in both))
-            worst[k] = (below / np.where(scale > 0, scale, 1)).astype(float)
+            worst[k] = ((below - rounding[k]) / np.where(scale > 0, scale, 1)).astype(float)
     return worst
 
 

@@ -7,7 +7,7 @@ interval says at which speed each of its impacts happens, whatever came before. 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -71,6 +71,20 @@ class Interval(eqx.Module):
     outside: Values
 
 
+class _Followed(NamedTuple):
+    """What a speed at the onset and a duration of the contact lead to.
+
+    Attributes:
+        missed: What must be 0: penetration as the contact ends, over its duration, and distance to the next wall.
+        out: Velocity as the contact ends.
+        arrival: Velocity at the next onset.
+    """
+
+    missed: Any
+    out: Any
+    arrival: Any
+
+
 class Restitution(eqx.Module):
     """What is added to r at an impact: offset + slope times its speed. Both are 0; derivatives by them test r."""
 
@@ -97,7 +111,11 @@ def motions(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Interval:
         return jax.tree.map(lambda x: jnp.full(_MOTIONS, jnp.nan).at[0].set(x), _behind_rigid(wall, told))
 
     def soft(wall: ImpactPair) -> Interval:
-        return jax.vmap(lambda near: _behind_soft(wall, told, near))(_crossings(wall, shaking, ends))
+        def of(near: Motion) -> Interval:
+            x, arrived = _solved(wall, told, near)
+            return _held(wall, told, x, _followed(x, wall, told), arrived)
+
+        return jax.vmap(of)(_crossings(wall, shaking, ends))
 
     return pair.met(ends.side, rigid, soft)
 
@@ -127,8 +145,9 @@ def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Motion:
     places = 1.0 + jnp.arange(_DURATIONS, dtype=ends.t.dtype)
     miss, _ = jax.vmap(at)(places)
     # Of two motions that are close to each other Newton finds one twice, from where neither is much nearer.
-    before_crossing = _first(miss[:-1] * miss[1:] < 0, places[:-1], _CROSSINGS)
-    crossings = jax.vmap(partial(_halved, lambda place: at(place)[0]))(before_crossing)
+    crosses = miss[:-1] * miss[1:] < 0
+    low, sign = (_first(crosses, values, _CROSSINGS) for values in (places[:-1], jnp.sign(miss[:-1])))
+    crossings = jax.vmap(partial(_halved, lambda place: at(place)[0]))(low, sign)
     before, here, after = miss[:-2], miss[1:-1], miss[2:]
     bend, rise = (before + after) / 2 - here, (after - before) / 2
     turns = (before * here > 0) & (here * after > 0) & (here * bend > 0) & (jnp.abs(rise) <= 2 * jnp.abs(bend))
@@ -139,9 +158,8 @@ def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Motion:
     return jax.tree.map(lambda x: jnp.where(guess.speed > 0, x, jnp.nan), guess)
 
 
-def _halved(miss: Callable[[Scalar], Scalar], low: Scalar) -> Scalar:
-    """Find where a function changes its sign between `low` and `low` + 1, to a thousandth."""
-    sign = jnp.sign(miss(low))
+def _halved(miss: Callable[[Scalar], Scalar], low: Scalar, sign: Scalar) -> Scalar:
+    """Find where a function that has a sign at `low` changes it before `low` + 1, to a thousandth."""
 
     def half(k: Array, low: Scalar) -> Scalar:
         middle = low + 0.5 ** (k + 1)
@@ -170,40 +188,56 @@ def _behind_rigid(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends]) -> 
 
 def _behind_soft(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], near: Motion) -> Interval:
     """Solve for the speed at the onset and the duration of the contact: it ends, and the flight meets the next wall."""
+    frozen, near = lax.stop_gradient(((pair, told), near))
+    x, arrived = _solved(*frozen, near)
+    # The root moves with what the equations are told: its value stays, its first derivatives are right.
+    slopes, here = jax.jacfwd(_followed)(x, *frozen), _followed(x, pair, told)
+    back = solve(slopes.missed, here.missed - lax.stop_gradient(here.missed))
+    out, arrival = here.out - slopes.out @ back, here.arrival - slopes.arrival @ back
+    return _held(pair, told, x - back, here._replace(out=out, arrival=arrival), arrived)
+
+
+def _solved(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], near: Motion) -> tuple[Float[Array, "2"], Flag]:
+    """Find speed and duration of a contact, from near ones, and say whether they are found."""
+    return _newton(lambda x: _followed(x, pair, told).missed, jnp.stack([near.speed, near.stay]))
+
+
+def _held(
+    pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], x: Float[Array, "2"], follows: _Followed, arrived: Flag
+) -> Interval:
+    """Say all of a contact of this speed and duration and of the flight after it, unless it ends sooner."""
+    shaking, _, ends = told
+    real = arrived & (x[1] <= shaking.longest_contact) & (_shallowest(*lax.stop_gradient((pair, told, x))) > 0)
+    speed, stay, arrival = (jnp.where(real, number, jnp.nan) for number in (x[0], x[1], follows.arrival))
+    return Interval(speed, stay, arrival, _flown_outside(pair, shaking, ends, ends.t + x[1], follows.out))
+
+
+def _shallowest(pair: ImpactPair, told: tuple[Shaking, Restitution, Ends], x: Float[Array, "2"]) -> Scalar:
+    """Find the least penetration at a few places of a contact, which is over when the ball first comes back."""
     shaking, added, ends = told
-    frozen = lax.stop_gradient((pair, told))
-    found, arrived = _newton(partial(_missed, args=frozen), lax.stop_gradient(jnp.stack([near.speed, near.stay])))
-    x = _implicit(_missed, found, (pair, told))
     speed, stay = x[0], x[1]
-    _, out, _, arrival = _contact_and_flight(x, (pair, told))
-    # A contact is over when the ball first comes back.
     wall = _membrane(pair, added, speed)
-    depths = [shaking.contact(wall, pair.gamma, ends.side, ends.t, speed, part * stay)[0] for part in _PLACES]
-    real = arrived & (stay <= shaking.longest_contact) & (jnp.min(jnp.stack(depths)) > 0)
-    speed, stay, arrival = (jnp.where(real, number, jnp.nan) for number in (speed, stay, arrival))
-    return Interval(speed, stay, arrival, _flown_outside(pair, shaking, ends, ends.t + x[1], out))
+
+    def depth(part: Scalar) -> Scalar:
+        return shaking.contact(wall, pair.gamma, ends.side, ends.t, speed, part * stay)[0]
+
+    return jnp.min(jax.vmap(depth)(jnp.asarray(_PLACES)))
 
 
 def _membrane(pair: ImpactPair, added: Restitution, speed: Scalar) -> flow.Membrane:
     return flow.membrane(replace(pair, r=pair.r + added.offset + added.slope * speed), rolled=True)
 
 
-def _contact_and_flight(x: Array, args: Any) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Follow the ball: penetration as the contact ends, velocity then, distance to the next wall, velocity there."""
-    pair, (shaking, added, ends) = args
+def _followed(x: Float[Array, "2"], pair: ImpactPair, told: tuple[Shaking, Restitution, Ends]) -> _Followed:
+    """Follow the ball through the contact and the flight after it."""
+    shaking, added, ends = told
     speed, stay = x[0], x[1]
     w, z = shaking.contact(_membrane(pair, added, speed), pair.gamma, ends.side, ends.t, speed, stay)
     exit_t = ends.t + stay
     rise, arrival = shaking.flight(pair.gamma, exit_t, ends.side * z, ends.next_t - exit_t)
     miss = 0.5 * pair.d * (ends.side - ends.next_side) + rise
-    return w, ends.side * z, miss, arrival
-
-
-def _missed(x: Array, args: Any) -> Float[Array, "2"]:
-    """Say by how much a speed and a duration fail."""
-    w, _, miss, _ = _contact_and_flight(x, args)
     # A penetration has a root at the onset, too.
-    return jnp.stack([w / x[1], miss])
+    return _Followed(jnp.stack([w / stay, miss]), ends.side * z, arrival)
 
 
 def _needed(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar) -> Scalar:
@@ -222,7 +256,8 @@ def _newton(equations: Callable[[Array], Array], x: Float[Array, "2"]) -> tuple[
 
     def go(carry):
         count, x, _ = carry
-        step = solve(jax.jacfwd(equations)(x), -equations(x)) / x
+        slopes, missed = jax.jacfwd(lambda x: 2 * (equations(x),), has_aux=True)(x)
+        step = solve(slopes, -missed) / x
         step = jnp.where(jnp.isfinite(step), jnp.clip(step, -_HALF, _HALF), 0.0)
         return count + 1, x * (1 + step), jnp.abs(step).max()
 
@@ -230,16 +265,11 @@ def _newton(equations: Callable[[Array], Array], x: Float[Array, "2"]) -> tuple[
     return x, (step <= _ARRIVED) & jnp.isfinite(x).all()
 
 
-def _implicit(equations: Callable[[Array, Any], Array], x: Array, args: Any) -> Array:
-    """Make a root a function of what its equations are told: its value stays, its first derivatives are right."""
-    x = lax.stop_gradient(x)
-    slopes = lax.stop_gradient(jax.jacfwd(equations)(x, args))
-    moved = equations(x, args)
-    return x - solve(slopes, moved - lax.stop_gradient(moved))
-
-
 def _flown_outside(pair: ImpactPair, shaking: Shaking, ends: Ends, t: Scalar, out: Scalar) -> Scalar:
     """Find how far a flight leaves the gap, at a few places."""
     whole = ends.next_t - t
-    rises = [shaking.flight(pair.gamma, t, out, part * whole)[0] for part in _PLACES]
-    return jnp.max(jnp.abs(0.5 * pair.d * ends.side + jnp.stack(rises))) - 0.5 * pair.d
+
+    def place(part: Scalar) -> Scalar:
+        return 0.5 * pair.d * ends.side + shaking.flight(pair.gamma, t, out, part * whole)[0]
+
+    return jnp.max(jnp.abs(jax.vmap(place)(jnp.asarray(_PLACES)))) - 0.5 * pair.d
