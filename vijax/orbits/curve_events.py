@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from vijax.model.pair import ImpactPair
 from vijax.orbits import orbit_properties, symmetry
-from vijax.orbits.arclength_step import BATCHES, BranchPlace, advance
+from vijax.orbits.arclength_step import BranchPlace, advance
 from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.criticality import cubic_coefficient
@@ -28,6 +28,9 @@ from vijax.runtime.programs import jitted
 # Part of a tangent that lies in the plane at which a curve stands still there: beside a cusp it is the distance from
 # it, along a curve that only bends it is what it was.
 _STILL = 1e-4
+# Cubic coefficients are computed of so many orbits at once, however many there are: a program of third derivatives
+# takes seconds to compile, for few orbits as for many.
+_AT_ONCE = (64,)
 _MERGED = {"flip-graze": "flip", "pitchfork-graze": "pitchfork"}
 _TEST = {"speed": "impact", "flight": "flight", "contact": "contact", "exit": "exit"}
 
@@ -126,7 +129,7 @@ def _coefficients(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orb
 def _cubics(paths: CurvePath, ys: np.ndarray) -> np.ndarray:
     """Compute the cubic coefficients of points of flips, a path each."""
     pair, knots = paths.pair_and_knots(ys)
-    return tiles.map_tiles(lambda rows: _coefficients(*rows), (pair, paths.sequence, knots), BATCHES)
+    return tiles.map_tiles(lambda rows: _coefficients(*rows), (pair, paths.sequence, knots), _AT_ONCE)
 
 
 def _with_cubics(paths: CurvePath, walked: list[Walked]) -> list[np.ndarray]:

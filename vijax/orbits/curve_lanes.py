@@ -19,7 +19,7 @@ from vijax.orbits.events import orbits_at
 from vijax.orbits.limits import alike
 from vijax.orbits.parameter import able
 from vijax.orbits.periodic import Orbit
-from vijax.runtime import tiles
+from vijax.runtime import context, tiles
 
 # How far from a limit an orbit may be from which Newton is to find it: a cell of a map with few of them.
 _BESIDE = 0.2
@@ -55,11 +55,17 @@ def lanes(starts: list[CurveStart], plane: Plane, device: Harvester, settings: C
     batches: dict[tuple, list[CurveStart]] = {}
     for start in starts:
         batches.setdefault((CONDITIONS.get(start.kind), start.orbit.knots.shape[1]), []).append(start)
-    found, lost = [], []
-    for batch in batches.values():
+
+    def begun(batch: list[CurveStart]) -> tuple[CurvePath, np.ndarray, BranchPlace]:
         paths, y = _set_out(batch, plane, device, settings)
+        return paths, y, settled(on_curve(paths, y) if paths.device is None else _beside(paths, y), FIRST_CURVE_END)
+
+    # Every batch has a program of its own, and what compiles one keeps a single core busy.
+    with context.pool(tiles.workers()) as pool:
+        brought = list(pool.map(begun, batches.values()))
+    found, lost = [], []
+    for batch, (paths, y, first) in zip(batches.values(), brought, strict=True):
         limit = paths.device is not None
-        first = settled(_beside(paths, y) if limit else on_curve(paths, y), FIRST_CURVE_END)
         near = np.abs(first.y - y).max(axis=1) < (_BESIDE if limit else settings.max_step)
         real = (first.tests[:, FIRST_CURVE_END:] > 0).all(axis=1) & near
         for index, good in enumerate(real & first.arrived):

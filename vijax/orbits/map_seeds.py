@@ -1,6 +1,8 @@
 """What the orbits of some cells of a map meet along one of its axes: where curves over the map begin."""
 
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future
 
 import jax
 import numpy as np
@@ -19,7 +21,7 @@ from vijax.orbits.map_borders import LabelledPlane
 from vijax.orbits.map_motions import settled
 from vijax.orbits.parameter import skews
 from vijax.orbits.periodic import Orbit
-from vijax.runtime import tiles
+from vijax.runtime import context, tiles
 
 _MOST_PERIOD, _MOST_IMPACTS = 12, 24  # of the orbits that seed curves; others are rare, and each width is a program
 _NEAR_LIMIT = 0.3  # parts of a limit within which an orbit of a cell beside it is looked at
@@ -59,10 +61,18 @@ def seeds(
                 key = way, orbit.knots.shape[1]
                 groups.setdefault(key, []).append((orbit[np.flatnonzero(some)], rows[some]))
     yield []  # Whoever counts the seconds may stop here.
-    for (way, _), parts in groups.items():
-        orbit = periodic.concatenate([part for part, _ in parts])
-        where = cells[np.concatenate([rows for _, rows in parts])]
-        yield _met(plane, orbit, where, way, reach, steepest, max_points, settings)
+    under_way: deque[Future[list[CurveStart]]] = deque()
+    # Every group has a program of its own, and what compiles one keeps a single core busy.
+    with context.pool(tiles.workers()) as pool:
+        for (way, _), parts in groups.items():
+            orbit = periodic.concatenate([part for part, _ in parts])
+            where = cells[np.concatenate([rows for _, rows in parts])]
+            asked = plane, orbit, where, way, reach, steepest, max_points, settings
+            under_way.append(pool.submit(_met, *asked))
+            if len(under_way) == tiles.workers():
+                yield under_way.popleft().result()
+        while under_way:
+            yield under_way.popleft().result()
 
 
 def limit_seeds(plane: LabelledPlane, cells: np.ndarray, device: Harvester) -> list[CurveStart]:
