@@ -46,6 +46,24 @@ def test_a_hessian_is_forward_derivatives_of_forward_ones(kappa):
     np.testing.assert_allclose(jax.jit(jax.hessian(place))(x), forward, rtol=1e-9)
 
 
+@pytest.mark.parametrize("kappa", [50.0, pytest.param(None, marks=pytest.mark.long)])
+def test_derivatives_of_a_few_starts_at_numbers_are_those_of_differences(kappa):
+    def told(d, r, v):
+        run = vijax.trajectory(impact_pair(d, kappa, r), 0.02, v, 4)
+        return run.states.u[:, -1], run.impacts.v_in[:, 2]
+
+    x = np.array([0.2, 0.25]), np.array([0.5, 0.6]), np.array([0.3, 0.31])
+    h = 1e-5
+    forward, reverse = (derivative(told, argnums=(0, 1, 2))(*x) for derivative in (jax.jacfwd, jax.jacrev))
+    for which in range(3):
+        near = [told(*(a + n * h * (k == which) for k, a in enumerate(x))) for n in (-2, -1, 1, 2)]
+        for place, (far, close, on, away) in enumerate(zip(*near, strict=True)):
+            known = np.asarray(far - 8 * close + 8 * on - away) / (12 * h)
+            for slopes in (forward, reverse):
+                # No start hangs on another.
+                np.testing.assert_allclose(slopes[place][which], np.diag(known), rtol=1e-7, atol=1e-9)
+
+
 def test_restarting_from_a_stroboscopic_state_goes_on_the_same():
     pair = impact_pair([0.2, 0.2, 0.15], [4.0, 40.0, 12.0], [0.5, 0.5, 0.1], [0.0, 0.05, 0.1])
     whole = vijax.trajectory(pair, 0.02, 0.3, 6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax import monitoring
 
-from vijax.runtime.derivatives import differentiable
+from vijax.runtime.derivatives import differentiable, differentiable_rows
 
 
 class Result(NamedTuple):
@@ -121,3 +121,64 @@ def test_other_numbers_and_other_derivatives_trace_nothing_anew(derivative):
     for y in (0.1, 0.2):
         derivative(lambda y: product(GIVEN | {"y": y}))(jnp.array(y))
     assert len(traced) == before
+
+
+rows_traced: list[int] = []
+
+
+def fall(weights, x, y, *, room):
+    """Products of a row's numbers at several times, its sign, and what no row moves."""
+    rows_traced.append(x.shape[0])
+    times = jnp.asarray(weights) * jnp.arange(1.0, room + 1)
+    return x[:, None] * jnp.sin(y)[:, None] * times, (x > 0).astype(jnp.int32), 0 * x + 1
+
+
+FALLING = differentiable_rows(fall, (1, 4))
+X, Y = np.array([0.3, -0.5, 0.7]), np.array([1.0, 1.2, 1.4])
+TIMES = 2.0 * np.arange(1, 4)
+
+
+def fallen(x, y):
+    return FALLING(2.0, x, y, room=3)[0]
+
+
+def test_slopes_of_rows_are_those_by_hand_both_ways():
+    by_x, by_y = np.sin(Y)[:, None] * TIMES, (X * np.cos(Y))[:, None] * TIMES
+    for derivative in (jax.jacfwd, jax.jacrev):
+        # A row hangs on its own numbers alone.
+        for slopes, known in zip(derivative(fallen, argnums=(0, 1))(X, Y), (by_x, by_y), strict=True):
+            np.testing.assert_allclose(slopes, known[..., None] * np.eye(3)[:, None], rtol=1e-15)
+    one, other = jax.grad(lambda x, y: fallen(x, y)[1, 2], argnums=(0, 1))(X, Y)
+    np.testing.assert_allclose(one, [0, by_x[1, 2], 0], rtol=1e-15)
+    np.testing.assert_allclose(other, [0, by_y[1, 2], 0], rtol=1e-15)
+
+
+def test_slopes_of_rows_do_not_hang_on_how_they_are_asked_for():
+    known = jax.grad(lambda y: fallen(X, y).sum())(Y)
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda y: fallen(X, y).sum()))(Y), known, rtol=1e-14)
+    several = jax.vmap(jax.grad(lambda y: fallen(X, y).sum()))(np.stack([Y, 2 * Y]))
+    np.testing.assert_allclose(several[0], known, rtol=1e-14)
+    for twice in (jax.hessian, lambda of: jax.jacrev(jax.jacrev(of)), lambda of: jax.jacfwd(jax.jacfwd(of))):
+        curved = twice(lambda y: fallen(X, y).sum())(Y)
+        np.testing.assert_allclose(curved, np.diag(-X * np.sin(Y) * TIMES.sum()), atol=1e-14)
+
+
+def test_rows_and_derivatives_of_any_number_share_a_program_until_they_are_many():
+    jax.grad(lambda x: fallen(x, Y).sum())(X)
+    before = len(rows_traced)
+    for count in (2, 3, 4):
+        jax.jacfwd(lambda y, count=count: fallen(np.resize(X, count), y))(np.resize(Y, count))
+    assert len(rows_traced) == before
+    slope = jax.grad(lambda x: fallen(x, np.resize(Y, 5)).sum())(np.resize(X, 5))
+    np.testing.assert_allclose(slope, np.sin(np.resize(Y, 5)) * TIMES.sum(), rtol=1e-14)
+    assert 5 in rows_traced[before:]
+
+
+def test_what_no_row_moves_and_what_counts_has_no_slope():
+    (moved, count, still), (slope, none, zero) = jax.jvp(lambda x: FALLING(2.0, x, Y, room=3), (X,), (np.ones(3),))
+    np.testing.assert_array_equal(count, [1, 0, 1])
+    assert none.dtype == jax.dtypes.float0
+    np.testing.assert_array_equal(still, 1.0)
+    np.testing.assert_array_equal(zero, 0.0)
+    np.testing.assert_allclose(slope, np.sin(Y)[:, None] * TIMES, rtol=1e-15)
+    np.testing.assert_allclose(moved, X[:, None] * slope, rtol=1e-15)

@@ -21,12 +21,17 @@ from vijax.model.membrane import Laws, Linear, check_restitution
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
+from vijax.runtime.derivatives import differentiable_rows
+from vijax.runtime.programs import tracing
 
 _IMPACT, _STATE = 56, 32  # bytes of a record: what a run asks of memory is told from them before it begins
 # Starts fly together in calls of few sizes, so that few programs are compiled.
 _TILES = (1, 8, 64, 512, 4096)
 # The records of so few starts have room for so many periods at least: one program serves all shorter runs.
 _FEW, _ROOMS = 64, (64, 512)
+
+
+_exact_sloped = differentiable_rows(exact_run, tuple(size for size in _TILES if size <= _FEW))
 
 
 def _precision(pair: ImpactPair) -> str:
@@ -122,6 +127,8 @@ def _followed(
     asked = Asked(*counts)
     if method is None and own is np:
         work = partial(exact_run, asked, room=Room(periods, most, chunks))
+    elif method is None and math.prod(shape) <= _FEW and not tracing():
+        work = partial(_exact_sloped, asked, room=_room(periods, max_impacts, chunks, few=True))
     elif method is None:
         work = partial(exact_traced, asked, room=_room(periods, max_impacts, tiles.padded(chunks)))
     else:

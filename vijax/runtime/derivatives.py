@@ -81,6 +81,60 @@ def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Call
     return wraps(work)(lambda variables, fixed, *, kind: call(variables, fixed, kind))
 
 
+def differentiable_rows(work: Callable[..., T], sizes: tuple[int, ...]) -> Callable[..., T]:
+    """Make a function of rows, none of which hangs on another, whose derivatives at numbers are one compiled program.
+
+    All slopes of a row are computed forward, which are as many as it has variables: few, where what JAX makes of a
+    derivative in reverse remembers a whole run. Of more rows than the largest size, JAX differentiates the function.
+
+    Args:
+        work: Function of a module, of what is not varied (hashable), of variables (pytrees of arrays [row]), and of
+            `room` (static, by name), to a pytree of arrays [row, ...].
+        sizes: Rows of a compiled call.
+    """
+    part = jax.jit(work, static_argnames="room")
+
+    @partial(jitted, static=("room",), name=f"slopes by row of {work.__module__}.{work.__qualname__}")
+    def slopes(fixed: Any, variables: Any, *, room: Hashable) -> tuple[T, list[jax.Array]]:
+        leaves, tree = jax.tree.flatten(variables)
+
+        def along(direction):
+            moved = [jnp.broadcast_to(step, leaf.shape) for step, leaf in zip(direction, leaves, strict=True)]
+            result, moves = jax.jvp(lambda *rows: work(fixed, *tree.unflatten(rows), room=room), leaves, moved)
+            both = zip(*map(jax.tree.leaves, (result, moves)), strict=True)
+            return result, [move for leaf, move in both if _varies(leaf)]
+
+        return jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(leaves), dtype=leaves[0].dtype))
+
+    @partial(jax.custom_jvp, nondiff_argnums=(0, 2))
+    def call(fixed: Any, variables: Any, room: Hashable) -> T:
+        return part(fixed, *variables, room=room)
+
+    @partial(call.defjvp, symbolic_zeros=True)
+    def derivative(fixed: Any, room: Hashable, primals: Any, tangents: Any) -> tuple[T, T]:
+        (variables,), (moved,) = primals, tangents
+        rows = jax.tree.leaves(variables)
+        if tiles.library(rows) is jnp or len(rows[0]) > sizes[-1]:
+            steps = jax.tree.map(_dense, moved, is_leaf=_is_zero)
+            return jax.jvp(lambda *variables: part(fixed, *variables, room=room), variables, steps)
+        with context.pool(1) as elsewhere:
+            work = partial(slopes, fixed, room=room)
+            result, columns = elsewhere.submit(tiles.map_tiles, work, variables, sizes).result()
+        steps, column = jax.tree.leaves(moved, is_leaf=_is_zero), iter(columns)
+        return tiles.arrays(result), jax.tree.map(lambda leaf: _along_rows(leaf, column, steps), result)
+
+    return wraps(work)(lambda fixed, *variables, room: call(fixed, variables, room))
+
+
+def _along_rows(leaf: Any, columns: Any, moved: list[Any]) -> Any:
+    """Compute the tangent of a result [row, ...], whose slopes have an axis more, the variable, from those of rows."""
+    if not _varies(leaf):
+        return np.zeros(leaf.shape, jax.dtypes.float0)
+    slope, wide = next(columns), (-1, *(1,) * (np.ndim(leaf) - 1))
+    parts = [slope[..., k] * step.reshape(wide) for k, step in enumerate(moved) if not _is_zero(step)]
+    return sum(parts[1:], start=parts[0]) if parts else jnp.zeros_like(leaf)
+
+
 @jax.custom_jvp
 def shared_slopes(value: Any) -> Any:
     """Keep a value that several results need, as `xla.share` does, and its derivative, which that would not."""

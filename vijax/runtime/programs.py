@@ -46,17 +46,21 @@ def jitted(
 
     @wraps(work)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        # Of what JAX makes of constants it says whether it traces a program here.
-        given = jax.tree.leaves((args, kwargs, jnp.zeros(())))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in given):
+        given = jax.tree.leaves((args, kwargs))
+        if tracing() or any(isinstance(leaf, jax.core.Tracer) for leaf in given):
             return part(*args, **kwargs)
-        brief = not often and max(map(_rows, given)) <= _FEW
+        brief = not often and max(map(_rows, given), default=0) <= _FEW
         arrays = all(map(_is_array, jax.tree.leaves(args))) and set(kwargs) <= set(static)
         if known and arrays and cache_folder.kept():
             return traced(tuple(kwargs.items()))(*args, brief=brief)
         return program(brief, xla.platform())(*args, **kwargs)
 
     return call
+
+
+def tracing() -> bool:
+    """Say whether JAX traces a program here: it does where what it makes of a constant is no number."""
+    return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
 _begun: set[Any] = set()
