@@ -206,12 +206,15 @@ def test_conditions_are_those_of_the_monodromy_matrix(met):
         pair, sequence, knots = (
             jax.tree.map(lambda x: x[0], leaf) for leaf in (orbit.pair, orbit.sequence, orbit.knots)
         )
-        around = np.asarray(multipliers.monodromy(pair, sequence, knots))
-        both = multipliers.multiplier_conditions(pair, sequence, knots)
+        around, both = jax.jit(
+            lambda *orbit: (multipliers.monodromy(*orbit), multipliers.multiplier_conditions(*orbit))
+        )(pair, sequence, knots)
         speed = np.asarray(knots)[:, 1]
         weight = np.prod(speed / (speed + 0.1))
         for sign, found in zip((-1, 1), both, strict=True):
-            assert float(found) == pytest.approx(weight * np.linalg.det(around + sign * np.eye(2)), abs=1e-12)
+            assert float(found) == pytest.approx(
+                weight * np.linalg.det(np.asarray(around) + sign * np.eye(2)), abs=1e-12
+            )
 
 
 @pytest.mark.parametrize(
