@@ -127,10 +127,9 @@ def _followed(
     asked = Asked(*counts)
     if method is None and own is np:
         work = partial(exact_run, asked, room=Room(periods, most, chunks))
-    elif method is None and math.prod(shape) <= _FEW and not tracing():
-        work = partial(_exact_sloped, asked, room=_room(periods, max_impacts, chunks, few=True))
     elif method is None:
-        work = partial(exact_traced, asked, room=_room(periods, max_impacts, tiles.padded(chunks)))
+        run = exact_traced if tracing() else _exact_sloped
+        work = partial(run, asked, room=_room(periods, max_impacts, tiles.padded(chunks)))
     else:
         numbers = tiles.library((pair, starts, method)) is np
         few = numbers and math.prod(shape) <= _FEW
