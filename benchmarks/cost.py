@@ -6,26 +6,23 @@
 The planes: d 0.05..0.3 by kappa 3..400 (log), and d by v0 -0.6..0.6 at kappa 400, where rigid walls have as many cells
 to simulate as soft ones; r 0.5, start (0, 0.4), over a window. Microseconds are of whole warm calls of `vijax.sweep`
 for each cell of the plane and period, medians; ratios are against another row of the same round, median and range.
-Printout for 128 x 128 cells and 100 periods, two quiet cores:
+Printout for 128 x 128 cells and 100 periods, two quiet cores with 512-bit registers:
 
-    counts             0.0565 us per cell-period
-    counts, again      0.0556 us per cell-period     1.00 times counts (0.95 to 1.03)
-    lyapunov           0.0653 us per cell-period     1.15 times counts (1.10 to 1.24)
-    P                  0.0698 us per cell-period     1.22 times counts (1.21 to 1.28)
-    P at 8 omega       0.0933 us per cell-period     1.36 times P (1.29 to 1.39)
-    gamma = 0 given    0.0565 us per cell-period     1.00 times counts (0.93 to 1.06)
-    gamma = 0.1        0.0767 us per cell-period     1.37 times counts (1.30 to 1.42)
-    gamma = 0.5        0.1230 us per cell-period     2.18 times counts (2.15 to 2.30)
-    P, gamma = 0.1     0.1016 us per cell-period     1.48 times P (1.44 to 1.54)
-    P, gamma = 0.5     0.1594 us per cell-period     2.34 times P (2.23 to 2.47)
-    soft, starts       0.0746 us per cell-period
-    rigid, starts      0.0514 us per cell-period     0.69 times soft, starts (0.66 to 0.84)
-    rigid map          0.0225 us per cell-period     0.32 times P (0.30 to 0.39)
-
-and for 64 x 64 cells and 50 periods, on another day, when P took 0.1858:
-
-    P, ode            12.0431 us per cell-period    64.93 times P (52.41 to 66.16)
-    P, ode, friction  14.2031 us per cell-period     1.18 times P, ode (1.18 to 1.18)
+    counts             0.0475 us per cell-period
+    counts, again      0.0501 us per cell-period     1.04 times counts (0.99 to 1.17)
+    lyapunov           0.0556 us per cell-period     1.17 times counts (1.15 to 1.18)
+    P                  0.0569 us per cell-period     1.22 times counts (1.16 to 1.29)
+    P at 8 omega       0.0684 us per cell-period     1.19 times P (1.11 to 1.23)
+    gamma = 0 given    0.0474 us per cell-period     1.01 times counts (0.99 to 1.06)
+    gamma = 0.1        0.0712 us per cell-period     1.48 times counts (1.46 to 1.57)
+    gamma = 0.5        0.0963 us per cell-period     2.04 times counts (2.01 to 2.06)
+    P, gamma = 0.1     0.0847 us per cell-period     1.48 times P (1.43 to 1.56)
+    P, gamma = 0.5     0.1352 us per cell-period     2.40 times P (2.27 to 2.42)
+    P, ode            10.2080 us per cell-period   179.49 times P (165.87 to 184.33)
+    P, ode, friction  12.0100 us per cell-period     1.18 times P, ode (1.16 to 1.20)
+    soft, starts       0.0627 us per cell-period
+    rigid, starts      0.0622 us per cell-period     1.01 times soft, starts (0.96 to 1.07)
+    rigid map          0.0072 us per cell-period     0.12 times P (0.12 to 0.17)
 """
 
 import argparse
