@@ -160,9 +160,6 @@ def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Traj
     return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
 
 
-exact_traced = jax.jit(exact_run, static_argnames="room")
-
-
 def _strobes(pair: ImpactPair, flown: _Flown, periods: int) -> State:
     """Find the balls at phase 0 of periods 1 ... periods, [row, period]: each in the last step that began before."""
     own = tiles.library((pair, flown))

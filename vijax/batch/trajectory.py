@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax.batch.exact_run import exact_run, exact_traced
+from vijax.batch.exact_run import exact_run
 from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory
 from vijax.batch.stepped_run import stepped_run
 from vijax.engine.method import Method
@@ -22,7 +22,6 @@ from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.derivatives import differentiable_rows
-from vijax.runtime.programs import tracing
 
 _IMPACT, _STATE = 56, 32  # bytes of a record: what a run asks of memory is told from them before it begins
 # Starts fly together in calls of few sizes, so that few programs are compiled.
@@ -30,8 +29,7 @@ _TILES = (1, 8, 64, 512, 4096)
 # The records of so few starts have room for so many periods at least: one program serves all shorter runs.
 _FEW, _ROOMS = 64, (64, 512)
 
-
-_exact_sloped = differentiable_rows(exact_run, tuple(size for size in _TILES if size <= _FEW))
+_exact_traced = differentiable_rows(exact_run, tuple(size for size in _TILES if size <= _FEW))
 
 
 def _precision(pair: ImpactPair) -> str:
@@ -128,8 +126,7 @@ def _followed(
     if method is None and own is np:
         work = partial(exact_run, asked, room=Room(periods, most, chunks))
     elif method is None:
-        run = exact_traced if tracing() else _exact_sloped
-        work = partial(run, asked, room=_room(periods, max_impacts, tiles.padded(chunks)))
+        work = partial(_exact_traced, asked, room=_room(periods, max_impacts, tiles.padded(chunks)))
     else:
         numbers = tiles.library((pair, starts, method)) is np
         few = numbers and math.prod(shape) <= _FEW

@@ -254,9 +254,13 @@ def _newton(equations: Callable[[Array], Array], x: Float[Array, "2"]) -> tuple[
         count, _, step = carry
         return (count < _MOST_STEPS) & (step > _ARRIVED)
 
+    def twice(x: Array) -> tuple[Array, Array]:
+        missed = equations(x)
+        return missed, missed  # one to differentiate, one as it is
+
     def go(carry):
         count, x, _ = carry
-        slopes, missed = jax.jacfwd(lambda x: 2 * (equations(x),), has_aux=True)(x)
+        slopes, missed = jax.jacfwd(twice, has_aux=True)(x)
         step = solve(slopes, -missed) / x
         step = jnp.where(jnp.isfinite(step), jnp.clip(step, -_HALF, _HALF), 0.0)
         return count + 1, x * (1 + step), jnp.abs(step).max()

@@ -19,7 +19,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 
 from vijax.runtime import context, tiles
-from vijax.runtime.programs import begin, jitted
+from vijax.runtime.programs import begin, jitted, tracing
 from vijax.runtime.xla import share
 
 T = TypeVar("T")
@@ -76,7 +76,7 @@ def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Call
             columns, result = elsewhere.submit(both, slopes, variables, fixed, kind).result()
         moved = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
         rows = iter([_by_variable(np.asarray(column), variables) for column in columns])
-        return result, jax.tree.map(lambda leaf: _along(leaf, rows, moved), result)
+        return result, jax.tree.map(lambda leaf: _along(leaf, rows, moved, _contracted), result)
 
     return wraps(work)(lambda variables, fixed, *, kind: call(variables, fixed, kind))
 
@@ -85,7 +85,8 @@ def differentiable_rows(work: Callable[..., T], sizes: tuple[int, ...]) -> Calla
     """Make a function of rows, none of which hangs on another, whose derivatives at numbers are one compiled program.
 
     All slopes of a row are computed forward, which are as many as it has variables: few, where what JAX makes of a
-    derivative in reverse remembers a whole run. Of more rows than the largest size, JAX differentiates the function.
+    derivative in reverse remembers a whole run. Of more rows than the largest size, and where a program is traced, JAX
+    differentiates the function.
 
     Args:
         work: Function of a module, of what is not varied (hashable), of variables (pytrees of arrays [row]), and of
@@ -117,22 +118,18 @@ def differentiable_rows(work: Callable[..., T], sizes: tuple[int, ...]) -> Calla
         if tiles.library(rows) is jnp or len(rows[0]) > sizes[-1]:
             steps = jax.tree.map(_dense, moved, is_leaf=_is_zero)
             return jax.jvp(lambda *variables: part(fixed, *variables, room=room), variables, steps)
+        # In a thread of its own, as above.
         with context.pool(1) as elsewhere:
-            work = partial(slopes, fixed, room=room)
-            result, columns = elsewhere.submit(tiles.map_tiles, work, variables, sizes).result()
-        steps, column = jax.tree.leaves(moved, is_leaf=_is_zero), iter(columns)
-        return tiles.arrays(result), jax.tree.map(lambda leaf: _along_rows(leaf, column, steps), result)
+            told = partial(slopes, fixed, room=room)
+            result, columns = elsewhere.submit(tiles.map_tiles, told, variables, sizes).result()
+        each, steps = (np.moveaxis(column, -1, 0) for column in columns), jax.tree.leaves(moved, is_leaf=_is_zero)
+        return tiles.arrays(result), jax.tree.map(lambda leaf: _along(leaf, each, steps, _row_by_row), result)
 
-    return wraps(work)(lambda fixed, *variables, room: call(fixed, variables, room))
+    @wraps(work)
+    def run(fixed: Any, *variables: Any, room: Hashable) -> T:
+        return part(fixed, *variables, room=room) if tracing() else call(fixed, variables, room)
 
-
-def _along_rows(leaf: Any, columns: Any, moved: list[Any]) -> Any:
-    """Compute the tangent of a result [row, ...], whose slopes have an axis more, the variable, from those of rows."""
-    if not _varies(leaf):
-        return np.zeros(leaf.shape, jax.dtypes.float0)
-    slope, wide = next(columns), (-1, *(1,) * (np.ndim(leaf) - 1))
-    parts = [slope[..., k] * step.reshape(wide) for k, step in enumerate(moved) if not _is_zero(step)]
-    return sum(parts[1:], start=parts[0]) if parts else jnp.zeros_like(leaf)
+    return run
 
 
 @jax.custom_jvp
@@ -165,11 +162,19 @@ def _dense(moved: Any) -> Any:
     return jnp.zeros(moved.shape, moved.dtype) if _is_zero(moved) else moved
 
 
-def _along(leaf: jax.Array, rows: Any, moved: list[Any]) -> Any:
+def _contracted(slope: Any, step: Any) -> jax.Array:
+    return jnp.tensordot(slope, step, jnp.ndim(step))
+
+
+def _row_by_row(slope: Any, step: Any) -> jax.Array:
+    return slope * step.reshape(-1, *(1,) * (np.ndim(slope) - 1))
+
+
+def _along(leaf: jax.Array, rows: Any, moved: list[Any], times: Callable[[Any, Any], jax.Array]) -> Any:
     """Compute the tangent of a result; of what holds no real numbers, JAX's word for none."""
     if not _varies(leaf):
         return np.zeros(leaf.shape, jax.dtypes.float0)
     # What nobody varies costs nothing.
     pairs = [(row, step) for row, step in zip(next(rows), moved, strict=True) if not _is_zero(step)]
-    parts = [jnp.tensordot(row, step, jnp.ndim(step)) for row, step in pairs]
+    parts = [times(row, step) for row, step in pairs]
     return sum(parts[1:], start=parts[0]) if parts else jnp.zeros_like(leaf)
