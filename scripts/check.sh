@@ -14,8 +14,8 @@ lint-imports
 mypy >.venv/types.txt 2>&1 &
 types=$!
 failed=0
-# A file to a process: the programs that its tests share are compiled once.
-pytest -n 2 --dist loadfile "$@" || failed=$?
+# A file to a process: the programs that its tests share are compiled once. Files run in the order of tests/conftest.py.
+pytest -n 2 --dist loadfile --no-loadscope-reorder "$@" || failed=$?
 wait "$types" || failed=$?
 cat .venv/types.txt
 # Said last, as a line among the reasons of skipped tests is overlooked.

@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import math
 import os
 from pathlib import Path
 
@@ -28,6 +29,7 @@ import pytest
 from hypothesis import settings
 
 import vijax  # noqa: F401  switches x64 on before a test makes its first array
+from tests import seconds
 from vijax.runtime.garbage import SELDOM
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -66,17 +68,62 @@ def resident() -> float:
 
 
 def pytest_addoption(parser):
-    """Take the option by which long tests run."""
+    """Add the options of this suite."""
     parser.addoption("--long", action="store_true", help="run the tests marked long, too")
+    parser.addoption("--record-seconds", action="store_true", help="write the processor time of each test file")
 
 
 def pytest_collection_modifyitems(config, items):
-    """Leave out what is marked long, unless it is asked for: by the option, or by the name of a test."""
+    """Order the files, and deselect tests marked `long` unless the option or the name of a test selects them.
+
+    Several workers run the dearest files first, by their recorded seconds, so that all end together; new ones first.
+    """
+    if hasattr(config, "workerinput"):
+        seconds_of = seconds.recorded()
+        items.sort(key=lambda item: -seconds_of.get(_file(item.nodeid), math.inf))
     if config.getoption("--long") or any("::" in argument for argument in config.args):
         return
     left = [item for item in items if "long" in item.keywords]
     items[:] = [item for item in items if "long" not in item.keywords]
     config.hook.pytest_deselected(items=left)
+
+
+def pytest_collection_finish():
+    """Begin to count processor time: what came before belongs to no file."""
+    _last_report[0] = sum(os.times()[:4])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Attach to the report of each phase the processor time that this process and its children took since the last."""
+    report = yield
+    now = sum(os.times()[:4])
+    report.user_properties = [*report.user_properties, (_SECONDS, now - _last_report[0])]
+    _last_report[0] = now
+    return report
+
+
+def pytest_runtest_logreport(report):
+    """Add up the processor time of each file; with several workers this runs in the process that collects reports."""
+    file = _file(report.nodeid)
+    taken = sum(value for name, value in report.user_properties if name == _SECONDS)
+    _seconds_of[file] = _seconds_of.get(file, 0.0) + taken
+
+
+def pytest_sessionfinish(session):
+    """Write the processor time of each file, where the option is given."""
+    if session.config.getoption("--record-seconds") and not hasattr(session.config, "workerinput"):
+        seconds.record(seconds.recorded() | _seconds_of)
+
+
+_SECONDS = "processor seconds"
+_last_report = [0.0]
+_seconds_of: dict[str, float] = {}
+
+
+def _file(nodeid: str) -> str:
+    """Return the path of the file that a test stands in, relative to the root of the repository."""
+    return nodeid.partition("::")[0]
 
 
 @pytest.fixture
