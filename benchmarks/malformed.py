@@ -259,13 +259,16 @@ CALLS: Table = {
         {"objective": "mean", "tolerances": [Tolerance("omega0", 0.05)]},
         {
             "samples": COUNT,
-            "tolerances": (
-                [Tolerance("omega0", "5%")],
-                [Tolerance("omega0", NAN)],
-                [Tolerance("mass", 0.05)],
-                [Tolerance("omega0", 0.05, "normal")],
-                [Tolerance(3, 0.05)],
-            ),
+            "tolerances": ([("omega0", 0.05)], [Tolerance("omega0", 0.05), Tolerance("k", 0.05)]),
+        },
+    ),
+    "Tolerance": (
+        Tolerance,
+        {"name": "omega0", "spread": 0.05},
+        {
+            "name": (3, None, "mass", "beta", ["omega0"]),
+            "spread": (*REAL, INF, 0, 1, -0.1, 2.0, "5%"),
+            "kind": (*CHOICE, "normal"),
         },
     ),
     "optimise_all": (optimise.optimise_all, {}, {"devices": (3, [], [3], "paper", None, vijax.Harvester())}),
@@ -274,7 +277,7 @@ CALLS: Table = {
         {"optimum": an_optimum(), "tolerances": [Tolerance("omega0", 0.05)]},
         {
             "optimum": (3, None, "best", a_design()),
-            "tolerances": (3, "omega0", [3], [Tolerance("omega0", 2.0)]),
+            "tolerances": (3, "omega0", [3], ["omega0"]),
             "samples": COUNT,
         },
     ),

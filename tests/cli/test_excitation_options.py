@@ -19,6 +19,7 @@ def taken(**given):
 def test_options_make_excitations(tmp_path):
     assert taken() is None
     assert str(taken(harmonics="1,0.3", phases="0,0.5")) == str(Harmonics([1.0, 0.3], [0.0, 0.5]))
+    assert taken(harmonics="1", phases="90deg").phases == (pytest.approx(0.5 * np.pi, rel=1e-15),)
     assert str(taken(noise="0.05,32", seed=4)) == str(Harmonics() + Noise(0.05, 32, 4))
     assert str(taken(noise="0.05,32", harmonics="0.5")) == str(Harmonics(0.5) + Noise(0.05, 32))
     time, shaken = np.linspace(0, 1, 50), np.random.default_rng(0).normal(size=50)

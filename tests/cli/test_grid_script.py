@@ -84,7 +84,7 @@ BAD = [
     (["--method", "ode", "--chi", "0.5"], "chi must be left out"),
     (["--method", "ode", "--exponent", "2"], "exponent must be left out"),
     (["--method", "ode", "--membrane", "hyperelastic", "--radius", "0.1"], "prestretch must be given"),
-    (["--method", "ode", "--membrane", "hyperelastic", "--prestretch", "2"], "radius must be given"),
+    (["--method", "ode", "--membrane", "hyperelastic", "--prestretch", "2", "--radius", "3kg"], "radius must be in m"),
     (["--method", "ode", "--membrane", "hyperelastic", "--chi", "2"], "chi must be left out unless --membrane is hunt"),
     (["--method", "ode", "--stretch-limit", "20"], "stretch_limit must be left out unless --membrane is hyper"),
     (["--method", "ode", "--membrane", "hunt-crossley", "--chi=-1"], "chi must be one finite number"),
@@ -229,6 +229,8 @@ def test_methods_and_membranes_arrive(planned):
     assert (plan.method.law.chi, plan.method.law.exponent) == (0.5, 1.4)
     rubber = ("--membrane", "hyperelastic", "--prestretch", "1.4", "--radius", "0.1")
     assert planned("--method", "ode", *rubber).method.law == vijax.Hyperelastic(1.4, 0.1)
+    assert planned("--method", "ode", *rubber[:-1], "20mm").method.law == vijax.Hyperelastic(1.4, 0.02)
+    assert planned("--method", "ode", *rubber[:-2]).method.law == vijax.Hyperelastic(1.4, 0.0063)  # R0 of the device
     law = planned("--method", "rk4", *rubber, "--stretch-limit", "20").method.law
     assert (law.prestretch, law.radius, law.stretch_limit) == (1.4, 0.1, 20.0)
     plan = planned("--method", "rk4", "--steps", "500", "--membrane", "linear")

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from vijax.design.tolerance import Tolerance, check_tolerances, nodes
+from vijax.model.device import Harvester
+from vijax.model.variables import scattered
 
 
 def mean(cloud, function):
@@ -51,19 +53,36 @@ def test_samples_are_drawn_alike_every_time():
 
 
 @pytest.mark.parametrize(
-    ("tolerance", "bounded", "words"),
+    ("tolerance", "words"),
     [
-        (Tolerance("omega_0", 0.05), False, "tolerances: name must be among"),
-        (Tolerance("omega0", 0.0), False, "between 0 and 1"),
-        (Tolerance("omega0", 0.05, "normal"), False, '"uniform" or "lognormal"'),
-        (Tolerance("omega0", 0.05, "lognormal"), True, "worst case must be uniform"),
+        (("omega_0", 0.05), "name must be among"),
+        (("omega0", 0.0), "spread must be a number between 0 and 1, a part of omega0; got 0.0"),
+        (("omega0", np.nan), "spread must be"),
+        (("omega0", np.inf), "spread must be"),
+        (("omega0", [0.05]), "spread must be"),
+        (("omega0", 0.05, "normal"), 'kind must be "uniform" or "lognormal"'),
     ],
 )
-def test_what_cannot_be_is_told(tolerance, bounded, words):
+def test_what_cannot_be_is_refused_when_it_is_made(tolerance, words):
     with pytest.raises(ValueError, match=words):
-        check_tolerances((tolerance,), bounded)
+        Tolerance(*tolerance)
+
+
+def test_a_worst_case_wants_distributions_that_end():
+    with pytest.raises(ValueError, match="worst case must be uniform"):
+        check_tolerances((Tolerance("omega0", 0.05, "lognormal"),), True)
 
 
 def test_a_constant_scatters_once():
     with pytest.raises(ValueError, match="name a constant once"):
         check_tolerances((Tolerance("r", 0.05), Tolerance("r", 0.1)), False)
+    with pytest.raises(ValueError, match="name a constant once; got k, omega0"):
+        check_tolerances((Tolerance("k", 0.05), Tolerance("omega0", 0.1)), False)
+
+
+def test_another_name_of_a_constant_scatters_as_it_does():
+    device = Harvester(omega0=300.0)
+    made = scattered(device, ("k", "d"), (1.21, 0.9))
+    assert float(made.omega0) == pytest.approx(330.0, rel=1e-14)
+    assert float(made.k) == pytest.approx(1.21 * float(device.k), rel=1e-14)
+    assert float(made.pair().d) == pytest.approx(0.9 * float(device.pair().d), rel=1e-14)

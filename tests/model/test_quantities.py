@@ -11,7 +11,7 @@ import pytest
 
 from vijax.cli import main as command
 from vijax.model import quantities, variables
-from vijax.model.device import Harvester
+from vijax.model.device import Harvester, with_constants
 from vijax.model.pair import ImpactPair
 from vijax.orbits.parameter import MOVED
 from vijax.planes.axes import Axes, Parameters, parse_axis
@@ -31,8 +31,9 @@ def test_every_axis_and_every_constant_of_the_device_is_in_the_table():
     of_walls = {f"{name}_{side}" for name in ("omega0", "r") for side in quantities.SIDES}
     assert of_walls < set(AXES)
     assert set(QUANTITIES) == set(AXES) | set(CONSTANTS)
-    assert set(variables.NAMES) == set(QUANTITIES) - set(quantities.STARTS) - {"penetration_limit"}
-    assert set(MOVED) == set(PARAMETERS)
+    given_only = {name for name, one in QUANTITIES.items() if one.given_only}
+    assert set(variables.NAMES) == set(QUANTITIES) - set(quantities.STARTS) - {"penetration_limit"} - given_only
+    assert set(MOVED) == set(PARAMETERS) - given_only
     assert all(name == one.name for name, one in QUANTITIES.items())
     with pytest.raises(TypeError, match=f"the axes are {', '.join(AXES)}"):
         cells({"colour": 1.0}, Harvester(), "soft")
@@ -64,8 +65,8 @@ def test_what_has_a_unit_is_given_by_the_device():
     from vijax.cli.options import DEVICE, PHYSICAL
 
     of_walls = {f"{name}_{side}" for name in ("omega0", "k") for side in quantities.SIDES}
-    assert {"omega", "A", "beta", "s", "omega0", "k"} | of_walls == DEVICE
-    assert {"s", "omega0", "k"} | of_walls == PHYSICAL
+    assert {"omega", "A", "beta", "s", "distance", "omega0", "k"} | of_walls == DEVICE
+    assert {"s", "distance", "omega0", "k"} | of_walls == PHYSICAL
 
 
 @pytest.mark.parametrize("name", [name for name, axis in PARAMETERS.items() if axis.default])
@@ -84,7 +85,7 @@ def _starts():
     return [axis.default for axis in quantities.STARTS.values()]
 
 
-@pytest.mark.parametrize("name", [name for name, axis in PARAMETERS.items() if axis.alias_of])
+@pytest.mark.parametrize("name", variables.ALIASES)
 def test_another_name_of_a_constant_decides_it(name):
     """The device of a map is the same by whatever name it is given, and two of them are refused."""
     device = Harvester(beta=0.02)
@@ -106,9 +107,9 @@ def test_another_name_of_a_constant_decides_it(name):
 def test_docstrings_name_the_units_of_the_table(name):
     whole = quantities.of_both_walls(name) or name
     said = re.search(rf"^ +{whole}: .*\[(.+?)\]", inspect.getdoc(Harvester), re.MULTILINE)
-    if whole == "k":
+    if whole in ("k", "distance"):
         assert name not in CONSTANTS
-        said = re.search(r"\[(.+?)\]", inspect.getdoc(Harvester.k.fget))
+        said = re.search(r"\[(.+?)\]", inspect.getdoc(getattr(Harvester, whole).fget))
     assert said[1] == QUANTITIES[name].unit
 
 
@@ -137,6 +138,26 @@ def test_no_error_lacks_a_remedy():
     for name, one in QUANTITIES.items():
         assert one.remedy == one.remedy.strip()
         assert not one.remedy.endswith(" in"), f"{name} has no unit and no advice"
+
+
+def test_membranes_are_a_diameter_further_apart_than_the_ball_travels():
+    device = Harvester(r_b=0.004)
+    asked, plain = (
+        cells(given, device, "soft").quantities["d"] for given in ({"distance": [0.05, 0.06]}, {"s": [0.042, 0.052]})
+    )
+    np.testing.assert_allclose(asked, plain, rtol=1e-14)
+    assert asked.dims == ("distance",)
+    made = with_constants(device, distance=0.014, r_b=0.005)
+    assert (float(made.s), float(made.distance)) == (pytest.approx(0.004), pytest.approx(0.014))
+    fits = r"distance must exceed the diameter of the ball, 2 r_b = 0.008 m; got 0.008 at index 1; give s"
+    with pytest.raises(ValueError, match=fits):
+        cells({"distance": [0.05, 0.008]}, device, "soft")
+    with pytest.raises(ValueError, match="distance must exceed the diameter of the ball"):
+        with_constants(device, distance=0.004)
+    with pytest.raises(ValueError, match="s and distance give the same quantity"):
+        cells({"distance": 0.1, "s": 0.1}, device, "soft")
+    with pytest.raises(TypeError, match="a distance D apart have s = D - 2 r_b, the free travel of the ball"):
+        Harvester(distance=0.014)
 
 
 def test_a_diagram_may_be_along_every_parameter():

@@ -116,7 +116,15 @@ def test_a_branch_between_bounds_with_units():
 def test_datasets_write_the_same_units():
     written = {name: axis.cf for name, axis in quantities.AXES.items()}
     assert written == dict.fromkeys(quantities.AXES, "1") | {
-        **{"omega": "rad s-1", "omega0": "rad s-1", "s": "m", "k": "N m-1", "A": "m s-2", "beta": "rad"},
+        **{
+            "omega": "rad s-1",
+            "omega0": "rad s-1",
+            "s": "m",
+            "distance": "m",
+            "k": "N m-1",
+            "A": "m s-2",
+            "beta": "rad",
+        },
         **{f"omega0_{side}": "rad s-1" for side in quantities.SIDES},
         **{f"k_{side}": "N m-1" for side in quantities.SIDES},
     }

@@ -29,7 +29,7 @@ def load(plan: Plan, settings: Settings, entry: Entry) -> Cell:
     return Cell(
         pair=pair,
         wall=quick_wall.prepare(pair, ground=plan.ground) if method is None else None,
-        course=None if method is None else solver_steps.set_off(method, plan, pair, ball, held),
+        course=None if method is None else solver_steps.set_off(method, plan, entry, ball, held),
         length=entry.length,
         speed=entry.speed,
         device=entry.device,

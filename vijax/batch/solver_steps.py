@@ -8,11 +8,12 @@ import jax.numpy as jnp
 
 from vijax.batch.advance import QUIET, neutral
 from vijax.batch.attractor_search import review
-from vijax.batch.cell import Cell, Course, Event, Lane, Plan, Settings
+from vijax.batch.cell import Cell, Course, Entry, Event, Lane, Plan, Settings
 from vijax.batch.cell_end import last_period, out_of_steps
 from vijax.batch.tally import add_event
 from vijax.engine.impact import Ball, LaneImpact
 from vijax.engine.method import Method
+from vijax.model.membrane import has_units, in_units
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State, Status
 from vijax.model.waves import mean_velocity
@@ -23,8 +24,9 @@ from vijax.runtime.xla import share
 STEPS = 32
 
 
-def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane) -> Course:
+def set_off(method: Method, plan: Plan, of: Cell | Entry, ball: Ball, held: Lane) -> Course:
     """Set lanes off at the start of a run or of a round."""
+    pair = _with_law(method, of)
     whole = ball.n.astype(jnp.int32)
     state = State(ball.u, ball.v, ball.t, whole, held.astype(jnp.int32))
     carry = jax.vmap(partial(method.start, deep=plan.deep, tangent=plan.tangent))(pair, state)
@@ -32,6 +34,13 @@ def set_off(method: Method, plan: Plan, pair: ImpactPair, ball: Ball, held: Lane
     _, outcome, _ = jax.eval_shape(jax.vmap(method.step), pair, wall, carry)
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), outcome)
     return Course(wall, carry, jnp.zeros(ball.u.shape, bool), blank)
+
+
+def _with_law(method: Method, of: Cell | Entry) -> ImpactPair:
+    """Return the pairs of lanes; with the method's law in the units of each, where its numbers have a dimension."""
+    if not has_units(method.law):
+        return of.pair
+    return replace(of.pair, law=jax.vmap(partial(in_units, method.law))(of.length, of.speed))
 
 
 def step(method: Method, cell: Cell) -> Cell:
@@ -91,6 +100,6 @@ def review_steps(method: Method, plan: Plan, settings: Settings, cell: Cell) -> 
     course = replace(course, waits=jnp.zeros_like(waits))
     if cell.candidate is not None:
         # A search sets its lanes off again, for another round; a window has one way alone.
-        again = set_off(method, plan, cell.pair, cell.ball, jnp.zeros_like(cell.count))
+        again = set_off(method, plan, cell, cell.ball, jnp.zeros_like(cell.count))
         course = choose(stopped & cell.running, again, course)
     return replace(cell, course=course)

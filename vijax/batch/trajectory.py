@@ -15,14 +15,16 @@ from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory
 from vijax.batch.stepped_run import stepped_run
 from vijax.engine.method import Method
 from vijax.engine.method_choice import choose
+from vijax.model import units
 from vijax.model.choices import MethodName, SolverName
 from vijax.model.excitation import Excitation, check_excitation
-from vijax.model.membrane import Laws, Linear, check_restitution
+from vijax.model.membrane import Laws, Linear, check_restitution, of_pair
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.derivatives import differentiable_rows
 
+_STARTS = {"u0": "displacement", "v0": "velocity", "t0": "phase"}
 _IMPACT, _STATE = 56, 32  # bytes of a record: what a run asks of memory is told from them before it begins
 # Starts fly together in calls of few sizes, so that few programs are compiled.
 _TILES = (1, 8, 64, 512, 4096)
@@ -42,16 +44,13 @@ def _told(pair: ImpactPair, method: Any, options: Mapping[str, Any], excitation:
         method = choose(method, options, wall=pair.walls, dtype=_precision(pair), excitation=excitation)
     elif excitation is not None:
         raise ValueError(f"excitation must be left out with a method of your own; got {checks.shown(excitation)}")
-    check_restitution(pair, Linear() if method is None else method.law)
+    check_restitution(pair, Linear() if method is None else of_pair(method.law))
     return method
 
 
 def _check_starts(pair: ImpactPair, periods: int, starts: dict[str, Any]) -> tuple[Any, ...]:
-    """Give the starts, lists as arrays; raise ValueError unless the ball can start so. Traced ones pass unseen."""
-    for name, start in starts.items():
-        if checks.is_concrete(start):
-            array = checks.finite(name, start)
-            starts = starts | {name: array if isinstance(start, list | tuple) else start}
+    """Return the starts, lists as arrays; raise ValueError unless the ball can start there. Traced ones pass unseen."""
+    starts = {name: units.given(_STARTS[name], start, name) for name, start in starts.items()}
     check_start(pair, "u0", starts["u0"])
     if checks.is_concrete(starts["t0"]):
         t0 = np.asarray(starts["t0"])
@@ -89,7 +88,8 @@ def trajectory(
         max_impacts: Room for impacts; 16 a period and 16 more unless given.
         method: "exact", "ode" or "rk4", as in `sweep`; or a `vijax.engine.method.Method`.
         solver, rtol, atol, membrane, friction, steps: As in `sweep`. The pair's r is None with a membrane
-            that takes none, as `HuntCrossley`.
+            that takes none, as `HuntCrossley`. Numbers of the membrane are in the units of the pair, as
+            `law.nondimensional(device)` gives them.
         excitation: What shakes the capsule, as in `sweep`, in the units of the pair: `record.waveform(device)` for a
             `Record`. The sine unless given.
 

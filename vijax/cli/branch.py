@@ -101,7 +101,7 @@ def _asked(
     constants: tuple[str, ...], along: str, impacts: str, guesses: int, max_switches: int, wall: "Walls", **given: Any
 ) -> BranchRequest:
     from vijax.engine.forcing import with_harmonics
-    from vijax.model.membrane import with_law
+    from vijax.model.membrane import nondimensional, with_law
     from vijax.orbits import orbit_search, parameter, switching
     from vijax.runtime import checks
 
@@ -114,7 +114,8 @@ def _asked(
     pair, made = at_one_point(take_axes(given, start), device(constants), wall)
     pair = _without_r(pair, membrane, own_r)
     excitation = take_excitation(given)
-    with_harmonics(with_law(pair, membrane), excitation)  # which say what such a pair cannot have
+    own = None if membrane is None else nondimensional(membrane, made)
+    with_harmonics(with_law(pair, own), excitation)  # which say what such a pair cannot have
     checks.whole("max_switches", max_switches, 0, switching.MOST_SWITCHES)
     walls, _ = orbit_search.sequences(impacts)
     orbit_search.check_guesses(guesses, len(walls))
@@ -171,7 +172,7 @@ def _found(asked: BranchRequest) -> "Orbit":
 
     for place in asked.places:
         pair = parameter.pair_at(asked.pair, asked.along, place, asked.device)
-        if len(found := _searched(asked, pair)):
+        if len(found := _searched(asked, pair, place)):
             return found
     tried = ", ".join(f"{place:.6g}" for place in asked.places)
     raise ValueError(
@@ -183,12 +184,14 @@ def _found(asked: BranchRequest) -> "Orbit":
     )
 
 
-def _searched(asked: BranchRequest, pair: "ImpactPair") -> "Orbit":
+def _searched(asked: BranchRequest, pair: "ImpactPair", place: float) -> "Orbit":
+    from vijax.model.membrane import nondimensional
     from vijax.orbits import orbit_search
+    from vijax.orbits.limits import device_at
 
-    return orbit_search.search(
-        pair, asked.impacts, guesses=asked.guesses, membrane=asked.membrane, excitation=asked.excitation
-    )
+    here = device_at(asked.device, asked.along, place)
+    law = None if asked.membrane is None else nondimensional(asked.membrane, here)
+    return orbit_search.search(pair, asked.impacts, guesses=asked.guesses, membrane=law, excitation=asked.excitation)
 
 
 def _summary(followed: "list[Branch]", seconds: float) -> str:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from vijax.cli import process
 from vijax.cli.closing import how_many, pace
 from vijax.cli.progress import progress, waiting
-from vijax.model.quantities import PARAMETERS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -77,12 +76,13 @@ def check_map(planned: "SweepPlan") -> None:
     import xarray as xr
 
     from vijax.orbits import map_borders
+    from vijax.orbits.parameter import MOVED
     from vijax.planes.dataset import asked, coordinates
 
     several = [name for name, size in planned.cells.sizes.items() if size > 1]
     if len(several) != 2 or set(several) != set(planned.cells.dynamic):
         raise ValueError(
-            f"two of {', '.join(PARAMETERS)} that the motion depends on, and nothing else, must have several values "
+            f"two of {', '.join(MOVED)} that the motion depends on, and nothing else, must have several values "
             f"for curves; got {', '.join(several) or 'none'}"
         )
     plane = xr.Dataset(coords=coordinates(planned.cells), attrs=asked(planned))

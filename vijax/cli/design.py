@@ -189,7 +189,7 @@ def _devices(
         raise ValueError(f"over must be NAME=VALUES, as in d=0.05:0.3:64; got {over!r}")
     if name in axes:
         raise ValueError(f"over must name an axis that is not given besides; got {name}, also given by --{name}")
-    if constant(name) in map(constant, names):
+    if PARAMETERS[name].constant in map(constant, names):
         raise ValueError(f"over must name what is not tuned; got {name}, with {', '.join(names)} tuned")
     with about("over"):
         values = np.atleast_1d(parse_axis(name, text))
@@ -222,7 +222,8 @@ def _tolerances(texts: Iterable[str]) -> "tuple[Tolerance, ...]":
         spread, _, kind = rest.partition(":")
         if not name or not spread:
             raise ValueError(f"tolerance must be NAME=5%, with :lognormal or not; got {text!r}")
-        found.append(Tolerance(name, part("tolerance", spread), kind or "uniform"))
+        with about("tolerance"):
+            found.append(Tolerance(name, part("tolerance", spread), kind or "uniform"))
     with about("tolerance"):
         return check_tolerances(found)
 

@@ -58,7 +58,7 @@ def take_excitation(given: dict[str, Any]) -> "Excitation | None":
         parts.append(_record(record, looped))
     if harmonics is not None:
         with about("harmonics"):
-            parts.append(Harmonics(_numbers(harmonics), 0.0 if phases is None else _numbers(phases)))
+            parts.append(Harmonics(_numbers(harmonics), 0.0 if phases is None else _numbers(phases, "angle")))
     if noise is not None:
         with about("noise"):
             numbers = _numbers(noise)
@@ -70,11 +70,19 @@ def take_excitation(given: dict[str, Any]) -> "Excitation | None":
     return sum(others, first)
 
 
-def _numbers(text: str) -> list[float]:
+def _numbers(text: str, quantity: str = "") -> list[float]:
+    """Read numbers; of a quantity that has a unit all may have one, as in 90deg, or none."""
+    from vijax.model import units
+
+    parts = [units.split(part) if quantity else (part, "") for part in text.split(",")]
     try:
-        return [float(part) for part in text.split(",")]
+        values = [float(number) for number, _ in parts]
     except ValueError:
         raise ValueError(f"it must be numbers parted by commas; got {text!r}") from None
+    if len({bool(unit) for _, unit in parts}) > 1:
+        raise ValueError(f"it must have a unit at every number or at none; got {text!r}")
+    pairs = zip(values, (unit for _, unit in parts), strict=True)
+    return [units.with_unit(quantity, value, unit) if unit else value for value, unit in pairs]
 
 
 def _record(path: str, looped: bool | None) -> "Excitation":

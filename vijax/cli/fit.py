@@ -10,6 +10,7 @@ from vijax.cli.arguments import at_one_point, device, take_axes
 from vijax.cli.closing import close
 from vijax.cli.columns import columns
 from vijax.cli.excitation import excitation_options, take_excitation
+from vijax.cli.kinds import Number
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
 from vijax.cli.targets import targets
@@ -90,8 +91,10 @@ def _sections() -> Sections:
         "Impacts": [
             click.Argument(["impacts"], metavar="IMPACTS"),
             click.Option(["--unknown"], default="omega0,r", show_default=True, metavar="NAME,NAME", help=names),
-            click.Option(["--timing-error"], type=float, required=True, help="standard error of a time, s"),
-            click.Option(["--speed-error"], type=float, help="standard error of a speed, m/s: the third column counts"),
+            click.Option(["--timing-error"], type=Number("time"), required=True, help="standard error of a time, s"),
+            click.Option(
+                ["--speed-error"], type=Number("speed"), help="standard error of a speed, m/s: the third column counts"
+            ),
             options.wall_option(),
         ],
         "Device": [*options.axis_options(axes), *options.device_options()],

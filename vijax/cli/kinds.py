@@ -42,23 +42,50 @@ class Whole(click.IntRange):
             return checks.whole(_name(param), number, least)
 
 
+class Number(click.ParamType):
+    """A real number; of a quantity that has a unit, with that unit or another one of the kind, as in 20mm.
+
+    Args:
+        quantity: Name of the quantity in `vijax.model.quantities.GIVEN`.
+    """
+
+    name = "float"
+
+    def __init__(self, quantity: str) -> None:
+        self.quantity = quantity
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number in SI units."""
+        if not isinstance(value, str):
+            return value
+        with door():
+            from vijax.model import units
+
+            text, unit = units.split(value)
+            number: Any = text
+            number = click.FLOAT.convert(number, param, ctx)
+            return units.with_unit(self.quantity, number, unit, _name(param)) if unit else number
+
+
 class Real(click.FloatRange):
     """A finite real number within bounds.
 
     Args:
         must: The bounds in words, as Python refuses a number outside of them.
+        quantity: Name of a quantity whose units are taken; "" for a number without one.
         bounds: The least of them, as `click.FloatRange` takes it: min, min_open.
     """
 
     name = "float"
 
-    def __init__(self, must: str, **bounds: Any) -> None:
+    def __init__(self, must: str, quantity: str = "", **bounds: Any) -> None:
         super().__init__(**bounds)
         self.must = must
+        self.number: click.ParamType = Number(quantity) if quantity else click.FLOAT
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the number, if it lies within."""
-        number = click.FLOAT.convert(value, param, ctx)
+        number = self.number.convert(value, param, ctx)
         if math.isfinite(number) and self._holds(number):
             return number
         with door():

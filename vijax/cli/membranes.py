@@ -12,30 +12,35 @@ MEMBRANES = ("linear", "hunt-crossley", "hyperelastic")
 MEMBRANE_NUMBERS = {
     "chi": "hunt-crossley",
     "exponent": "hunt-crossley",
+    "depth": "hunt-crossley",
     "prestretch": "hyperelastic",
     "radius": "hyperelastic",
     "stretch_limit": "hyperelastic",
 }
 
 
+_DEPTH = "penetration at which it pushes as the linear one"
+
+
 def membrane_options(told: str) -> list[click.Parameter]:
     """Make the options; `told` says what it is the membrane of."""
     return [
         click.Option(["--membrane"], type=_Membrane(MEMBRANES), help=f"{told} [linear]"),
-        click.Option(["--chi"], type=_at_least(0), help="of hunt-crossley: damping over stiffness"),
+        click.Option(["--chi"], type=_at_least(0, "damping"), help="of hunt-crossley: damping over stiffness, s/m"),
         click.Option(["--exponent"], type=_at_least(1), help="of hunt-crossley: exponent of the penetration [1.5]"),
+        click.Option(["--depth"], type=_above(0, "length"), help=f"of hunt-crossley: {_DEPTH}, m [1]"),
         click.Option(["--prestretch"], type=_above(1), help="of hyperelastic: stretch without the ball, above 1"),
-        click.Option(["--radius"], type=_above(0), help="of hyperelastic: in units of displacement"),
+        click.Option(["--radius"], type=_above(0, "length"), help="of hyperelastic: radius, m [R0]"),
         click.Option(["--stretch-limit"], type=float, help="of hyperelastic: Gent's J_m [inf]"),
     ]
 
 
-def _above(least: int) -> Real:
-    return Real(f"one finite number above {least}", min=least, min_open=True)
+def _above(least: int, quantity: str = "") -> Real:
+    return Real(f"one finite number above {least}", quantity, min=least, min_open=True)
 
 
-def _at_least(least: int) -> Real:
-    return Real(f"one finite number of at least {least}", min=least)
+def _at_least(least: int, quantity: str = "") -> Real:
+    return Real(f"one finite number of at least {least}", quantity, min=least)
 
 
 class _Membrane(Choice):

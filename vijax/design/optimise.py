@@ -175,6 +175,7 @@ def optimise_all(
     tune, bounds = checks.words("tune", tune, NAMES), {} if bounds is None else bounds
     scatter = check_tolerances(tolerances)
     reliability = check_motion(motion, objective, reliability)
+    samples = None if samples is None else check_samples(samples)
     if objective == "expected" and samples is not None:
         raise ValueError(
             f"samples must be left out with objective expected, whose balls have random devices; got {samples!r}; "
@@ -304,7 +305,6 @@ def check(
     check_names(tune)
     if not devices:
         raise ValueError("devices must hold at least one; got none")
-    checks.choice("objective", objective, OBJECTIVES)
     for device in devices:
         if not any(map(float, named("V", one_device(device).V).values())):
             raise ValueError("V must not be zero for a design to harvest; got 0")
@@ -319,6 +319,7 @@ def check(
 def check_motion(motion: str, objective: str, reliability: float) -> float:
     """Take the reliability, if motion, objective and it go together; raise ValueError as `optimise_all` does."""
     checks.choice("motion", motion, get_args(Motion))
+    checks.choice("objective", objective, OBJECTIVES)
     if motion == "periodic" and objective == "expected":
         raise ValueError(
             see("design", 'motion must be "any" with objective expected, which takes every start; got "periodic"')

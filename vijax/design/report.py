@@ -1,5 +1,6 @@
 """What a design is worth: everything known of it as plain numbers and words; `report_lines` writes them out."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -73,7 +74,7 @@ def describe(
         "surroundings": _surroundings(surroundings) if surroundings else None,
         "extents": [_extent(one) for one in extents],
         "arrival": arrival._asdict() if arrival else None,
-        "tolerances": [one._asdict() for one in tolerances],
+        "tolerances": [dataclasses.asdict(one) for one in tolerances],
         "spread": spread._asdict() if spread else None,
         "ranking": [{"optimum": _place(design, one)} | given._asdict() for one, given in ranking],
         "plane": _plane(plane) if plane else None,

@@ -2,35 +2,47 @@
 
 import itertools
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from vijax.model.device import CONSTANTS, WALLS_OWN
 from vijax.model.quantities import SIDES
+from vijax.model.variables import ALIASES, LINEAR, constant
 from vijax.runtime import checks
 
 _MOST_SAMPLES = 10**5  # random devices: at 1/sqrt(10**5) noise is 0.3 % of the scatter
 _NODES = {1: 17, 2: 9, 3: 5}  # how many nodes a constant has, by the number of constants
 
 
-# beta, often zero, has no relative tolerance.
-SCATTERED = tuple(name for name in CONSTANTS if name != "beta")
+# beta and gamma, often zero, have no relative tolerance.
+SCATTERED = tuple(name for name in (*CONSTANTS, *ALIASES) if name not in LINEAR)
 SCATTERED += tuple(f"{name}_{side}" for name in WALLS_OWN for side in SIDES)
 
 
-class Tolerance(NamedTuple):
-    """How a constant of the device scatters about its nominal value.
+@dataclass(frozen=True)
+class Tolerance:
+    """The scatter of a constant of the device about its nominal value.
 
     Attributes:
-        name: A field of `Harvester`, or of one wall alone, as omega0_left.
+        name: A field of `Harvester` or another name of one, as k; of one wall alone, as omega0_left.
         spread: Relative: half width of a uniform distribution, standard deviation of the logarithm of a log-normal one.
         kind: "uniform" or "lognormal".
+
+    Raises:
+        ValueError: Which field, what must hold, what was given.
     """
 
     name: str
     spread: float
     kind: str = "uniform"
+
+    def __post_init__(self) -> None:
+        checks.choice("name", self.name, SCATTERED)
+        checks.choice("kind", self.kind, ("uniform", "lognormal"))
+        must = f"a number between 0 and 1, a part of {self.name}"
+        object.__setattr__(self, "spread", checks.real("spread", self.spread, must, lambda x: 0 < x < 1))
 
 
 def check_tolerances(tolerances: Iterable[Tolerance], bounded: bool = False) -> tuple[Tolerance, ...]:
@@ -42,14 +54,10 @@ def check_tolerances(tolerances: Iterable[Tolerance], bounded: bool = False) -> 
     """
     found = tuple(checks.sequence("tolerances", tolerances, Tolerance, "vijax.design.tolerance.Tolerance records"))
     for one in found:
-        checks.choice("tolerances: name", one.name, SCATTERED)
-        checks.choice(f"tolerances: kind of {one.name}", one.kind, ("uniform", "lognormal"))
-        must = "a number between 0 and 1, relative"
-        checks.real(f"tolerances: spread of {one.name}", one.spread, must, lambda x: 0 < x < 1)
         if bounded and one.kind != "uniform":
             raise ValueError(f"tolerances of a worst case must be uniform; got {one.kind} of {one.name}")
     names = [one.name for one in found]
-    if len(set(names)) < len(names):
+    if len(set(map(constant, names))) < len(names):
         raise ValueError(f"tolerances must name a constant once; got {', '.join(names)}")
     return found
 

@@ -135,9 +135,10 @@ class Method(eqx.Module, Generic[C]):
         """Give what `step` is told of the walls of a cell; once, where it would compute it every time.
 
         Args:
-            pair: One cell (scalars).
+            pair: One cell (scalars); its `law` goes before that of the method.
         """
-        return membrane.walls(self.law, pair)
+        law: Any = self.law if pair.law is None else pair.law
+        return membrane.walls(law, pair)
 
     @abstractmethod
     def start(self, pair: ImpactPair, state: State, *, deep: bool, tangent: bool) -> C:

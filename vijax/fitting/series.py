@@ -81,15 +81,19 @@ def take_series(
         times=when,
         sides=walls,
         speeds=None if fast is None else np.abs(fast),
-        timing_error=checks.positive("timing_error", units.plain("time", timing_error)),
-        speed_error=0.0 if speed_error is None else checks.positive("speed_error", units.plain("speed", speed_error)),
+        timing_error=_positive("timing_error", "time", timing_error),
+        speed_error=0.0 if speed_error is None else _positive("speed_error", "speed", speed_error),
     )
+
+
+def _positive(name: str, quantity: str, value: Any) -> float:
+    return checks.positive(name, units.plain(quantity, value, name))
 
 
 def _row(name: str, values: Any) -> np.ndarray:
     if isinstance(values, list | tuple) and not len(values):
         raise ValueError(f"{name} must be one number an impact, of at least {_FEWEST}; got none")
-    array = np.asarray(checks.finite(name, units.plain(_KINDS.get(name, name), values)), float)
+    array = np.asarray(checks.finite(name, units.plain(_KINDS.get(name, name), values, name)), float)
     if array.ndim != 1:
         raise ValueError(f"{name} must be a row of numbers, one an impact; got shape {array.shape}")
     return array

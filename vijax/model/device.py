@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +13,7 @@ import numpy as np
 from vijax.model import units
 from vijax.model.choices import Walls
 from vijax.model.pair import WALLS, ImpactPair, Real, check_pair, impact_pair, pair_of
-from vijax.model.quantities import SIDES, check, whole
+from vijax.model.quantities import SIDES, whole
 from vijax.model.sides import Sides, apart, at, each, named, with_own
 from vijax.runtime import checks
 from vijax.runtime.checks import is_concrete
@@ -23,6 +22,12 @@ from vijax.runtime.tiles import library
 
 Own = Real | Sides[Real]
 """A number, or the `Sides` of what the two walls have of their own."""
+
+
+_NO_CONSTANTS = {
+    "k": "; a membrane of stiffness k has omega0 = sqrt(k/m_b)",
+    "distance": "; membranes a distance D apart have s = D - 2 r_b, the free travel of the ball",
+}
 
 
 class Harvester(eqx.Module):
@@ -34,7 +39,8 @@ class Harvester(eqx.Module):
 
     Attributes:
         m_b: Mass of the ball [kg].
-        s: Gap between the membranes [m].
+        s: Free travel of the ball [m], from touching one membrane to touching the other: the membranes are a distance
+            s + 2 r_b apart.
         omega0: Natural frequency of ball and membrane [rad/s].
         r: Coefficient of restitution of a free contact, in (0, 1].
         A: Amplitude of the forcing acceleration [m/s^2].
@@ -75,14 +81,15 @@ class Harvester(eqx.Module):
         known = [field.name for field in dataclasses.fields(cls)]
         for name in named:
             if name not in known:
-                advice = "; a membrane of stiffness k has omega0 = sqrt(k/m_b)" if name == "k" else ""
+                advice = _NO_CONSTANTS.get(name, "")
                 raise TypeError(f"{name} must be a constant of the device; known are {', '.join(known)}{advice}")
         return super().__new__(cls)
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
-            plain = partial(units.plain, field.name)
-            setattr(self, field.name, each(plain, getattr(self, field.name)))
+            value = getattr(self, field.name)
+            if field.name != "penetration_limit" or value is not None:
+                setattr(self, field.name, units.given_each(field.name, value))
 
     def __check_init__(self):
         for field in dataclasses.fields(self):
@@ -92,9 +99,6 @@ class Harvester(eqx.Module):
                     f"{field.name} must be of the whole device, as only {', '.join(WALLS_OWN)} are a wall's own; "
                     f"got {checks.shown(value)}"
                 )
-            if field.name != "penetration_limit" or value is not None:
-                for argument, one in named(field.name, value).items():
-                    check(field.name, one, argument)
         for argument, R0 in named("R0", self.R0).items():
             if is_concrete(self.r_b, R0) and not np.all(np.asarray(self.r_b) < np.asarray(R0)):
                 raise ValueError(
@@ -130,6 +134,12 @@ class Harvester(eqx.Module):
 
     @property
     @door
+    def distance(self) -> Real:
+        """Compute the distance of the membranes, s + 2 r_b [m]: the ball's free travel and its diameter."""
+        return self.s + 2 * self.r_b
+
+    @property
+    @door
     def length_unit(self) -> Real:
         """Compute metres per unit of u, A pi^2/omega^2."""
         return self.A * (math.pi / self.omega) ** 2
@@ -147,8 +157,7 @@ class Harvester(eqx.Module):
         Args:
             coefficient: f, of friction at rest and sliding, at least 0.
         """
-        if is_concrete(coefficient) and not np.all(np.isfinite(coefficient) & (np.asarray(coefficient) >= 0)):
-            raise ValueError(f"coefficient must be a finite number of at least 0; got {checks.shown(coefficient)}")
+        coefficient = units.given("friction_coefficient", coefficient, "coefficient")
         return coefficient * self.g * jnp.cos(self.beta) / self.A
 
     @property
@@ -223,14 +232,14 @@ def with_pair(device: Harvester, pair: ImpactPair) -> Harvester:
 
 @door
 def with_constants(device: Harvester, **constants: Own) -> Harvester:
-    """Change some constants of a device, checked by name; `k` [N/m] sets omega0 = sqrt(k/m_b).
+    """Change some constants of a device, checked by name; `k` [N/m] sets omega0 = sqrt(k/m_b), `distance` [m] sets s.
 
     What one wall alone is to have is given as omega0_left, V_right and so on.
 
     Raises:
         ValueError: An unknown constant, both k and omega0, or a value that cannot be.
     """
-    known = ["k", *(field.name for field in dataclasses.fields(check_device(device)))]
+    known = ["k", "distance", *(field.name for field in dataclasses.fields(check_device(device)))]
     walls = [f"{name}_{side}" for name in ("k", *WALLS_OWN) for side in SIDES]
     for name in constants:
         if name not in (*known, *walls):
@@ -238,24 +247,35 @@ def with_constants(device: Harvester, **constants: Own) -> Harvester:
                 f"{name} must be a constant of the device; got {name!r}; known are {', '.join(known)}; what one wall "
                 f"has of k, {', '.join(WALLS_OWN)} ends in _left or _right"
             )
-    m_b = constants.get("m_b", device.m_b)
+    m_b = units.given("m_b", constants.get("m_b", device.m_b))
     given: dict[str, Any] = {}
     for name, value in constants.items():
-        value = each(partial(units.plain, whole(name)), value)
+        value = units.given_each(whole(name), value, name)
         if whole(name) == "k":
-            for argument, one in named(name, value).items():
-                check("k", one, argument)
-            check("m_b", m_b)
             name, value = name.replace("k", "omega0", 1), each(lambda k: jnp.sqrt(k / m_b), value)
+        elif name == "distance":
+            r_b = units.given("r_b", constants.get("r_b", device.r_b))
+            check_fits(value, r_b)
+            name, value = "s", value - 2 * r_b
         _check_rivals(name, given)
         given[name] = value
     return changed(device, given)
 
 
+def check_fits(distance: Any, r_b: Any) -> None:
+    """Raise ValueError unless a ball of radius r_b fits between membranes a distance apart; traced values pass."""
+    if is_concrete(distance, r_b) and not np.all(good := np.asarray(distance) > 2 * np.asarray(r_b)):
+        raise ValueError(
+            f"distance must exceed the diameter of the ball, 2 r_b = {2 * float(np.max(r_b)):g} m; "
+            f"got {checks.first(distance, good)}; give s, the free travel of the ball, or lower r_b"
+        )
+
+
 def _check_rivals(name: str, given: Mapping[str, Any]) -> None:
     """Raise ValueError where a constant is given twice: by k and omega0, or for both walls and for one of them."""
     if name in given:
-        raise ValueError("k and omega0 must not both be given, as k = m_b omega0^2; got both; leave one out")
+        both = "distance and s" if name == "s" else "k and omega0"
+        raise ValueError(f"{both} must not both be given, as one follows from the other; got both; leave one out")
     of_walls = [f"{name}_{side}" for side in SIDES]
     rivals = [other for other in given if other in of_walls or name in [f"{other}_{side}" for side in SIDES]]
     if rivals:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vijax.model import units
-from vijax.model.device import Harvester
+from vijax.model.device import Harvester, check_device
 from vijax.model.units import Given
 from vijax.runtime import checks
 from vijax.runtime.arrays import AnyArray
@@ -65,6 +65,7 @@ class Excitation(eqx.Module):
 
     def scaled(self, device: Harvester) -> "Excitation":
         """Bring it into the units of a device: records become waveforms, all else has these units already."""
+        check_device(device)
         parts = tuple(part.waveform(device) if isinstance(part, Record) else part for part in self.parts)
         return parts[0] if len(parts) == 1 else Sum(parts)
 
@@ -85,7 +86,7 @@ class Harmonics(Excitation):
 
     def __init__(self, amplitudes: Given = 1.0, phases: Given = 0.0):
         own = np.atleast_1d(checks.finite("amplitudes", amplitudes)).astype(float)
-        turned = np.atleast_1d(checks.finite("phases", phases)).astype(float)
+        turned = np.atleast_1d(checks.finite("phases", units.plain("angle", phases, "phases"))).astype(float)
         if own.ndim > 1 or not own.any():
             raise ValueError(f"amplitudes must be one number a harmonic, not all 0; got {checks.shown(amplitudes)}")
         if turned.shape not in ((1,), own.shape):
@@ -191,7 +192,7 @@ class Record(Excitation):
         """
         scales = {}
         for name in ("A", "omega"):
-            values = np.unique(checks.known(name, getattr(device, name)))
+            values = np.unique(checks.known(name, getattr(check_device(device), name)))
             if values.size > 1:
                 raise ValueError(see("excitation", f"{name} must be one number with a record; got {values.size}"))
             scales[name] = float(values[0])

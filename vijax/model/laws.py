@@ -1,19 +1,37 @@
 """The laws of membranes that are shipped beside the linear one: Hunt and Crossley's, and that of stretched rubber."""
 
 import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from vijax.model.membrane import ShippedLaw
+from vijax.model import units
+from vijax.model.device import Harvester, check_device
+from vijax.model.membrane import ShippedLaw, checked_cell
 from vijax.model.pair import ImpactPair, Real
 from vijax.runtime import checks
 from vijax.runtime.arrays import Values
 
 
+def _number(quantity: str, value: Any, argument: str, must: str, holds: Callable[[float], bool]) -> Any:
+    """Return a number of a law as a plain floating-point one; a traced number is not looked at."""
+    value = units.plain(quantity, value, argument)
+    return checks.real(argument, value, must, holds) if checks.is_concrete(value) else value
+
+
+def _at_least(least: float, quantity: str, value: Any, argument: str) -> Any:
+    must = f"one finite number of at least {least}"
+    return _number(quantity, value, argument, must, lambda x: least <= x < math.inf)
+
+
+def _above(least: float, quantity: str, value: Any, argument: str) -> Any:
+    return _number(quantity, value, argument, f"one finite number above {least}", lambda x: least < x < math.inf)
+
+
 class Hertz(eqx.Module):
-    """-kappa^2 w^n (1 + chi w') for w > 0, else 0."""
+    """-square w^n (1 + chi w') for w > 0, else 0."""
 
     square: Values
     chi: Values
@@ -27,14 +45,19 @@ class Hertz(eqx.Module):
 
 
 class HuntCrossley(ShippedLaw):
-    """Hunt and Crossley's membrane, w'' = -kappa^2 w^n (1 + chi w') + forcing: no restitution r is given to it.
+    """Hunt and Crossley's membrane, w'' = -kappa^2 w (w/depth)^(n-1) (1 + chi w') + forcing; it takes no restitution r.
 
     The loss grows with the speed, so that the restitution is a result: -v_out/v_in is near 1 - 2 chi v_in/3 for slow
     impacts, whatever n is.
 
+    With a device, as in `sweep`, its numbers are in SI; with a pair, as in `trajectory`, they are in the units of the
+    pair: `nondimensional` converts them.
+
     Attributes:
-        chi: Damping over stiffness, in units of time over length (1/u'), >= 0.
+        chi: Damping over stiffness [s/m], >= 0.
         exponent: n >= 1; 1.5 is Hertz's contact of a sphere.
+        depth: Penetration [m] at which a ball at rest feels the force of the linear membrane, > 0. At 1 m the stiffness
+            k = m_b omega0^2 is the number of newtons per metre^n.
 
     Raises:
         ValueError: A number that cannot be (traced values are not looked at).
@@ -42,27 +65,36 @@ class HuntCrossley(ShippedLaw):
 
     chi: Real
     exponent: Real = 1.5
+    depth: Real = 1.0
+    in_si: bool = eqx.field(static=True, init=False, default=False)
     restitution: ClassVar[bool] = False
 
-    def __check_init__(self):
-        for name, least in (("chi", 0), ("exponent", 1)):
-            value = getattr(self, name)
-            if checks.is_concrete(value):
-                must = f"one finite number of at least {least}"
-                checks.real(name, value, must, lambda x, least=least: least <= x < math.inf)
+    def __post_init__(self):
+        self.in_si = checks.has_unit(self.chi) or checks.has_unit(self.depth)
+        self.chi = _at_least(0, "damping", self.chi, "chi")
+        self.exponent = _at_least(1, "exponent", self.exponent, "exponent")
+        self.depth = _above(0, "length", self.depth, "depth")
+
+    def in_units(self, length: Any, speed: Any) -> "HuntCrossley":
+        """Return the law with its numbers in other units of length and speed."""
+        return eqx.tree_at(lambda law: (law.chi, law.depth), self, (self.chi * speed, self.depth / length))
 
     def wall(self, pair: ImpactPair) -> Hertz:
-        """Give the law the numbers of a pair."""
-        kappa = pair._soft_kappa()
-        return Hertz(kappa * kappa, jnp.asarray(self.chi, kappa.dtype), jnp.asarray(self.exponent, kappa.dtype))
+        """Return the acceleration of a cell."""
+        kappa = checked_cell(pair)[0]._soft_kappa()
+        chi, exponent, depth = (jnp.asarray(x, kappa.dtype) for x in (self.chi, self.exponent, self.depth))
+        return Hertz(kappa * kappa * depth ** (1 - exponent), chi, exponent)
 
     def energy(self, pair: ImpactPair, w: Any) -> Any:
-        """Give what the membrane has stored at penetration w >= 0, per mass of the ball."""
-        return pair._soft_kappa() ** 2 * jnp.asarray(w) ** (self.exponent + 1) / (self.exponent + 1)
+        """Return the energy stored at penetration w >= 0, per mass of the ball."""
+        pair, w = checked_cell(pair, w)
+        more = self.exponent + 1
+        return pair._soft_kappa() ** 2 * self.depth ** (1 - self.exponent) * jnp.asarray(w) ** more / more
 
     def __str__(self) -> str:
         """Name it as `--membrane` does."""
-        return f"hunt-crossley with chi {float(self.chi):g}, exponent {float(self.exponent):g}"
+        depth = f", depth {float(self.depth):g}" if self.depth != 1 else ""
+        return f"hunt-crossley with chi {float(self.chi):g}, exponent {float(self.exponent):g}{depth}"
 
 
 _STRAIGHT = 1e-9  # the least part of their limit that is left to chains: beyond, the push is held there
@@ -123,9 +155,12 @@ class Hyperelastic(ShippedLaw):
 
     kappa is the frequency at small w, and r the restitution of a free contact there. The ball is taken for a point.
 
+    With a device, as in `sweep`, its radius is in metres; with a pair, as in `trajectory`, it is in the units of the
+    pair: `nondimensional` converts it.
+
     Attributes:
         prestretch: L > 1, of both directions, without the ball.
-        radius: Of the membrane, > 0, in units of displacement.
+        radius: Radius of the membrane [m], > 0; None for R0 of the device.
         stretch_limit: Gent's J_m, > J at w = 0; inf for Mooney and Rivlin.
 
     Raises:
@@ -133,25 +168,42 @@ class Hyperelastic(ShippedLaw):
     """
 
     prestretch: Real
-    radius: Real
+    radius: Real | None = None
     stretch_limit: Real = math.inf
+    in_si: bool = eqx.field(static=True, init=False, default=False)
 
-    def __check_init__(self):
-        for name, least in (("prestretch", 1), ("radius", 0)):
-            value = getattr(self, name)
-            if checks.is_concrete(value):
-                must = f"one finite number above {least}"
-                checks.real(name, value, must, lambda x, least=least: least < x < math.inf)
-        if checks.is_concrete((self.prestretch, self.stretch_limit)):
+    def __post_init__(self):
+        self.in_si = self.radius is None or checks.has_unit(self.radius)
+        self.prestretch = _above(1, "prestretch", self.prestretch, "prestretch")
+        if self.radius is not None:
+            self.radius = _above(0, "R0", self.radius, "radius")
+        limit = checks.pure("stretch_limit", self.stretch_limit)
+        if checks.is_concrete((self.prestretch, limit)):
             least = 2 * float(self.prestretch) ** 2 + float(self.prestretch) ** -4 - 3
             must = f"one number above {least:.4g}, which this prestretch takes"
-            checks.real("stretch_limit", self.stretch_limit, must, lambda x: x > least)
+            limit = checks.real("stretch_limit", limit, must, lambda x: x > least)
+        self.stretch_limit = limit
+
+    def of_device(self, device: Harvester) -> "Hyperelastic":
+        """Return the law of a device, with the device's R0 for a radius that was not given."""
+        R0 = check_device(device).R0
+        radius: Any = R0 if self.radius is None else self.radius
+        return Hyperelastic(self.prestretch, radius, self.stretch_limit)
+
+    def in_units(self, length: Any, speed: Any) -> "Hyperelastic":
+        """Return the law with its radius in another unit of length."""
+        return eqx.tree_at(lambda law: law.radius, self, self._own_radius() / length)
+
+    def _own_radius(self) -> Any:
+        if self.radius is None:
+            raise ValueError("radius must be given without a device; got None, which is R0 of a device")
+        return self.radius
 
     def wall(self, pair: ImpactPair) -> Cone:
-        """Give the law the numbers of a pair."""
-        kappa = pair._soft_kappa()
+        """Return the acceleration of a cell."""
+        kappa = checked_cell(pair)[0]._soft_kappa()
         square, radius, limit = (
-            jnp.asarray(x, kappa.dtype) for x in (self.prestretch**2, self.radius, self.stretch_limit)
+            jnp.asarray(x, kappa.dtype) for x in (self.prestretch**2, self._own_radius(), self.stretch_limit)
         )
         slack = square**-3
         rest = 1 - (2 * square + 1 / (square * square) - 3) / limit
@@ -159,9 +211,11 @@ class Hyperelastic(ShippedLaw):
 
     def energy(self, pair: ImpactPair, w: Any) -> Any:
         """Give what the membrane has stored at penetration w, per mass of the ball."""
+        pair, w = checked_cell(pair, w)
         return self.wall(pair).energy(jnp.asarray(w))
 
     def __str__(self) -> str:
         """Name it as `--membrane` does."""
+        radius = "R0" if self.radius is None else f"{float(self.radius):g}"
         limit = f", stretch_limit {float(self.stretch_limit):g}" if self.stretch_limit != math.inf else ""
-        return f"hyperelastic with prestretch {float(self.prestretch):g}, radius {float(self.radius):g}{limit}"
+        return f"hyperelastic with prestretch {float(self.prestretch):g}, radius {radius}{limit}"

@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vijax.model import units
+from vijax.model.device import Harvester, check_device
 from vijax.model.pair import ImpactPair
-from vijax.model.sides import Sides, apart
+from vijax.model.sides import Sides, apart, each
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import Values
 from vijax.runtime.pages import see
@@ -48,6 +50,11 @@ class MembraneLaw(eqx.Module):
     restitution: ClassVar[bool] = True
     arithmetic: ClassVar[bool] = False
 
+    @property
+    def in_si(self) -> bool:
+        """Return whether a number of it was given with a unit, or is the device's: a pair cannot have it then."""
+        return False
+
     @abstractmethod
     def acceleration(self, pair: ImpactPair, w: Any, z: Any) -> Any:
         """Compute the acceleration that the wall gives to the ball, positive into the wall.
@@ -58,6 +65,35 @@ class MembraneLaw(eqx.Module):
             z: Its rate.
         """
 
+    def of_device(self, device: Harvester) -> "MembraneLaw":
+        """Return the law of a device, with constants of the device for numbers that were not given; itself unless so.
+
+        Args:
+            device: The device; its walls are equal.
+        """
+        check_device(device)
+        return self
+
+    def in_units(self, length: Any, speed: Any) -> "MembraneLaw":
+        """Return the law with its numbers in other units; itself unless the law says which have a dimension.
+
+        A law overrides it to be the same membrane at every frequency and amplitude: its numbers are in SI then, where
+        it is given with a device.
+
+        Args:
+            length: The new unit of length, in old ones.
+            speed: The new unit of speed, in old ones.
+        """
+        return self
+
+    def nondimensional(self, device: Harvester) -> "MembraneLaw":
+        """Return the law with its numbers in the units of the device's pair; they are in SI.
+
+        Args:
+            device: One device; its walls are equal.
+        """
+        return self.of_device(device).in_units(device.length_unit, device.speed_unit)
+
     def energy(self, pair: ImpactPair, w: Any) -> Any:
         """Give what the membrane has stored at penetration w, per mass of the ball, in units of velocity squared.
 
@@ -67,6 +103,7 @@ class MembraneLaw(eqx.Module):
             pair: One cell (scalars).
             w: Penetrations, in units of displacement, of any shape.
         """
+        pair, w = checked_cell(pair, w)
         share, weight = (jnp.asarray(x) for x in _QUADRATURE)
         w = jnp.asarray(w)
         push = jax.vmap(lambda x: self.acceleration(pair, x, jnp.zeros_like(x)))
@@ -81,6 +118,12 @@ class MembraneLaw(eqx.Module):
         """Name the law and its numbers, as maps do in their attributes."""
         told = [f"{field.name} {_shown(getattr(self, field.name))}" for field in dataclasses.fields(self)]
         return type(self).__name__ + (" with " + ", ".join(told) if told else "")
+
+
+def checked_cell(pair: ImpactPair, w: Any = 0.0) -> tuple[ImpactPair, Any]:
+    """Return a pair and penetrations; raise ValueError unless it is a pair and they are numbers."""
+    checks.instance("pair", pair, ImpactPair, "vijax.impact_pair(...)")
+    return pair, units.given("displacement", w, "w")
 
 
 def _shown(value: Any) -> str:
@@ -105,7 +148,8 @@ class ShippedLaw(MembraneLaw):
 
     def acceleration(self, pair: ImpactPair, w: Values, z: Values) -> Values:
         """Compute the acceleration at penetration w and rate z."""
-        return self.wall(pair)(w, z)
+        pair, w = checked_cell(pair, w)
+        return self.wall(pair)(w, units.given("velocity", z, "z"))
 
     @abstractmethod
     def wall(self, pair: ImpactPair) -> Wall:
@@ -128,11 +172,12 @@ class Linear(ShippedLaw):
 
     def wall(self, pair: ImpactPair) -> Spring:
         """Give the law the numbers of a pair."""
-        kappa = pair._soft_kappa()
+        kappa = checked_cell(pair)[0]._soft_kappa()
         return Spring(kappa * kappa, pair.mu)
 
     def energy(self, pair: ImpactPair, w: Any) -> Any:
-        """Give what the membrane has stored at penetration w, per mass of the ball."""
+        """Return the energy stored at penetration w, per mass of the ball."""
+        pair, w = checked_cell(pair, w)
         return 0.5 * pair._soft_kappa() ** 2 * jnp.asarray(w) ** 2
 
     def __str__(self) -> str:
@@ -162,6 +207,42 @@ def said(law: Laws) -> str:
     return f"left {law.left}, right {law.right}" if isinstance(law, Sides) else str(law)
 
 
+def of_device(law: Laws, device: Harvester) -> Laws:
+    """Return the laws of the walls of a device, in SI: see `MembraneLaw.of_device`."""
+    if not (device.unequal or isinstance(law, Sides)):
+        return law.of_device(device)
+    both = apart(law)
+    return Sides(both.left.of_device(device.at(-1)), both.right.of_device(device.at(1)))
+
+
+def in_units(law: Laws, length: Any, speed: Any) -> Laws:
+    """Return a law, or that of either wall, in other units: see `MembraneLaw.in_units`."""
+    return each(lambda one: one.in_units(length, speed), law)
+
+
+def nondimensional(law: Laws, device: Harvester) -> Laws:
+    """Return the laws of the walls of a device in the units of its pair; their numbers are in SI."""
+    return in_units(of_device(law, device), device.length_unit, device.speed_unit)
+
+
+def has_units(law: Laws) -> bool:
+    """Return whether numbers of a law have a dimension, so that they change with the units of a pair."""
+    return type(one_of(law)).in_units is not MembraneLaw.in_units
+
+
+def of_pair(law: Laws) -> Laws:
+    """Return a law that is given with a pair; raise ValueError if it is surely in SI units."""
+    if any(one.in_si for one in (apart(law).left, apart(law).right)):
+        raise ValueError(
+            see(
+                "methods",
+                f"membrane must be in the units of the pair; got {said(law)} of a device; "
+                "law.nondimensional(device) brings it into them",
+            )
+        )
+    return law
+
+
 _INSIDE = np.geomspace(1e-6, 0.1, 6)
 _NOMINAL = (0.2, 40.0, 0.5, 0.0)
 
@@ -176,7 +257,7 @@ def with_law(pair: ImpactPair, law: Any) -> ImpactPair:
     Raises:
         ValueError: No membrane, or one that the pair cannot have.
     """
-    law = check_laws(Linear() if law is None else law)
+    law = of_pair(check_laws(Linear() if law is None else law))
     check_restitution(pair, law)
     if isinstance(one_of(law), Linear):
         return pair
@@ -234,6 +315,8 @@ def check_law(law: Any) -> MembraneLaw:
         )
     if isinstance(law, ShippedLaw):
         return law
+    for number in jax.tree.leaves(law):
+        checks.pure(f"a number of {type(law).__name__}", number)
     d, kappa, r, gamma = map(jnp.asarray, _NOMINAL)
     nothing: Any = None
     wall = law.wall(ImpactPair(d, kappa, r if law.restitution else nothing, gamma))

@@ -35,7 +35,7 @@ class ImpactPair(eqx.Module):
     Fields are not checked, so that the record can be traced; `impact_pair` is the door that checks.
 
     Attributes:
-        d: Gap between the walls in units of A pi^2/omega^2, > 0.
+        d: Free travel of the ball between the walls in units of A pi^2/omega^2, > 0; the ball is a point at u.
         kappa: Natural frequency of the soft walls, omega0 pi/omega > 0; None for rigid walls.
         r: Coefficient of restitution of a free contact, in (0, 1].
         gamma: Gravity along the axis over the forcing amplitude, g sin(beta)/A.
@@ -228,7 +228,7 @@ def check_pair(pair: Any, *, of_orbit: bool = False) -> ImpactPair:
     fields: dict[str, Any] = {}
     for name, value in given.items():
         for argument, one in named(name, value).items():
-            if one is not None:
+            if one is not None or argument not in _MAY_BE_NONE:
                 check(name, one, argument)
                 fields[argument] = one
     checks.shapes(**fields)
@@ -258,7 +258,7 @@ def impact_pair(
     """Make a checked `ImpactPair`, its fields broadcast to one shape.
 
     Args:
-        d: Gap between the walls, > 0, any shape.
+        d: Free travel of the ball between the walls, > 0, any shape.
         kappa: Natural frequency of the soft walls, > 0 and finite; None for rigid walls.
         r: Coefficient of restitution, in (0, 1]; None with a membrane that takes none, as `HuntCrossley`.
         gamma: Gravity over forcing amplitude, finite.
@@ -270,10 +270,8 @@ def impact_pair(
     """
     given = {"d": d, **named("kappa", kappa), **named("r", r), "gamma": gamma}
     given = {name: value for name, value in given.items() if value is not None or name not in _MAY_BE_NONE}
-    given = {name: units.plain(whole(name), value) for name, value in given.items()}
-    for name, value in given.items():
-        check(whole(name), value, name)
-    arrays = [np.asarray(value) if isinstance(value, list | tuple) else value for value in given.values()]
+    given = {name: units.given(whole(name), value, name) for name, value in given.items()}
+    arrays = list(given.values())
     dtype = jnp.result_type(float, *arrays)  # float64, or float32 where all arrays are
     # By NumPy where it can: JAX would compile a program for every shape.
     own = np if checks.is_concrete(*arrays) else jnp

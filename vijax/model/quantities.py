@@ -22,6 +22,7 @@ _POSITIVE = Rule(lambda x: (x > 0) & (x < math.inf), "must be positive and finit
 _FINITE = Rule(lambda x: abs(x) < math.inf, "must be finite")
 _NOT_NEGATIVE = Rule(lambda x: (x >= 0) & (x < math.inf), "must be finite and not negative")
 _LIMIT = Rule(lambda x: x > 0, "must be positive")
+_REAL = Rule(lambda x: (x == x) | (x != x), "must be a real number")
 _PART = Rule(lambda x: (x > 0) & (x <= 1), "must lie in (0, 1]")
 
 
@@ -39,6 +40,7 @@ class Quantity:
         alias_of: The constant of the device that it is another name for.
         default: What it is unless given, as the command would take it or in words.
         advice: What to do about values that it cannot have, unless to say what it is will do.
+        given_only: Whether it may be given, but is neither tuned nor followed along, as its constant is.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Quantity:
     alias_of: str = ""
     default: str = ""
     advice: str = ""
+    given_only: bool = False
 
     @property
     def constant(self) -> str:
@@ -87,13 +90,22 @@ START, START_REACH = (0.05853, -0.47898), 0.49
 """The start unless given, u0 and v0, off the centre of every gap; the displacement is at most this part of the gap."""
 
 _RIGID = 'a rigid wall is wall="rigid" (kappa=None in an ImpactPair)'
-_GAP = "it is the gap between the walls in units of A pi^2/omega^2"
+_GAP = "it is the free travel of the ball in units of A pi^2/omega^2"
+_TRAVEL = "it is the free travel of the ball in m; membranes a distance D apart have s = D - 2 r_b"
 _AMPLITUDE = "it is the forcing amplitude in m/s^2; without forcing there is no unit of length"
 _GRAVITY = "it is the acceleration of gravity in m/s^2; level ground is beta = 0"
+_MIDDLE, _AT_REST = "0 is the middle of the gap", "0 is at rest"
 _TILT = "it is the inclination in rad; level ground is beta = 0"
 
 _COMMON = _named(
-    Quantity("d", "gap between the walls", _POSITIVE, formula="s omega^2 / (A pi^2)", alias_of="s", advice=_GAP),
+    Quantity(
+        "d",
+        "free travel of the ball between the walls",
+        _POSITIVE,
+        formula="s omega^2 / (A pi^2)",
+        alias_of="s",
+        advice=_GAP,
+    ),
     Quantity(
         "kappa",
         "stiffness of the walls",
@@ -125,7 +137,17 @@ _COMMON = _named(
         default="pi",
         advice="it is the forcing frequency in rad/s",
     ),
-    Quantity("s", "gap between the membranes", _POSITIVE, "m", default="0.3"),
+    Quantity("s", "free travel of the ball between the membranes", _POSITIVE, "m", default="0.3", advice=_TRAVEL),
+    Quantity(
+        "distance",
+        "distance of the membranes",
+        _POSITIVE,
+        "m",
+        formula="s + 2 r_b",
+        symbol="D",
+        alias_of="s",
+        given_only=True,
+    ),
     Quantity(
         "omega0",
         "natural frequency of ball and membrane",
@@ -170,7 +192,7 @@ STARTS = _named(
         formula="in units of A pi^2 / omega^2",
         symbol="u_0",
         default=f"min({START[0]}, {START_REACH} d)",
-        advice="0 is the middle of the gap",
+        advice=_MIDDLE,
     ),
     Quantity(
         "v0",
@@ -179,7 +201,7 @@ STARTS = _named(
         formula="in units of A pi / omega",
         symbol="v_0",
         default=f"{START[1]}",
-        advice="0 is at rest",
+        advice=_AT_REST,
     ),
 )
 """Where the motion of a cell begins."""
@@ -205,6 +227,21 @@ QUANTITIES = AXES | _named(
     ),
 )
 """All that may be given by value: the axes, and the constants of the device that are none."""
+
+GIVEN = QUANTITIES | _named(
+    Quantity("acceleration", "acceleration of the capsule", _FINITE, "m/s^2"),
+    Quantity("damping", "damping over stiffness of a contact", _NOT_NEGATIVE, "s/m"),
+    Quantity("angle", "phase of a harmonic", _FINITE, "rad"),
+    Quantity("depth", "penetration of the membrane", _REAL, "m"),
+    Quantity("length", "length", _POSITIVE, "m"),
+    Quantity("displacement", "displacement", _FINITE, formula="in units of A pi^2 / omega^2", advice=_MIDDLE),
+    Quantity("friction_coefficient", "coefficient of dry friction", _NOT_NEGATIVE, advice="no friction is 0"),
+    Quantity("phase", "time", _FINITE, formula="in half forcing periods, pi / omega", advice="0 is phase 0"),
+    Quantity("speed", "speed of an impact", _FINITE, "m/s"),
+    Quantity("time", "time", _FINITE, "s"),
+    Quantity("velocity", "velocity", _FINITE, formula="in units of A pi / omega", advice=_AT_REST),
+)
+"""All quantities that an argument of a public function may be, whatever the argument is called."""
 
 
 def synonyms(name: str) -> tuple[str, ...]:
@@ -248,7 +285,7 @@ def check(name: str, value: Any, argument: str | None = None) -> None:
 
     if not checks.is_concrete(value):
         return
-    quantity, called = QUANTITIES[name], argument or name
+    quantity, called = GIVEN[name], argument or name
     array = checks.numbers(called, value, quantity.remedy)
     good = quantity.rule.holds(array)
     if not np.all(good):

@@ -6,7 +6,6 @@ converted at the door; pint is imported only where there is one.
 
 import math
 import re
-import sys
 from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, Union
@@ -14,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Union
 import numpy as np
 from jaxtyping import ArrayLike
 
-from vijax.model.quantities import AXES, MEASURED, QUANTITIES, synonyms
+from vijax.model.quantities import AXES, GIVEN, SIDES, check, synonyms
+from vijax.model.sides import Sides
 from vijax.runtime import checks
 from vijax.runtime.pages import see
 
@@ -24,9 +24,8 @@ if TYPE_CHECKING:
 Given = Union[ArrayLike, Sequence[float], "Quantity[Any]"]
 """What may be given for a quantity: a number, an array or list of them, or such a quantity of pint."""
 
-UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
-UNITS |= {"depth": MEASURED["depth"].units, "time": "s", "speed": "m/s", "acceleration": "m/s^2"}
-"""What plain numbers are in; a quantity that is not here has no unit."""
+UNITS = {name: quantity.unit for name, quantity in GIVEN.items() if quantity.unit}
+"""Units of plain numbers; a quantity that is not here has none."""
 
 _PI = r"pi(?![^\W\d])"  # not the pico of picofarads
 _ONE = r"(?:[^\W\d]+|°)(?:(?:\^|\*\*)-?\d)?"
@@ -43,69 +42,115 @@ def split(text: str) -> tuple[str, str]:
     return (written[1], written[2]) if written else (text, "")
 
 
-def with_unit(name: str, value: float, unit: str) -> float:
-    """Convert a value in some unit to a plain number of the quantity `name`.
+def with_unit(quantity: str, value: float, unit: str, argument: str | None = None) -> float:
+    """Return a value in some unit as a plain number of a quantity.
+
+    Args:
+        quantity: Name of the quantity in `GIVEN`.
+        value: The value.
+        unit: Text of its unit.
+        argument: Name that an error uses; that of the quantity unless given.
 
     Raises:
         ValueError: If no such unit is known, or it is not one of the quantity.
     """
-    return value * _factor_of(name, unit)
+    return value * _factor_of(quantity, unit, argument or quantity)
 
 
-def plain(name: str, value: Any) -> Any:
-    """Turn a quantity of pint, or a list of them, into plain numbers; return whatever else comes as it is.
+def given(quantity: str, value: Any, argument: str | None = None) -> Any:
+    """Return what was given for a quantity as plain floating-point numbers, each allowed by the table of quantities.
+
+    Every argument of a public function that is a physical quantity passes through here.
 
     Args:
-        name: The quantity that is meant.
-        value: What came.
+        quantity: Name of the quantity in `GIVEN`.
+        value: A number, an array, a list, or a quantity of pint.
+        argument: Name that an error uses; that of the quantity unless given.
 
     Raises:
-        ValueError: If its unit is not one of the quantity, or only some of a list have one.
+        ValueError: A unit that is not one of the quantity, or a value that the quantity cannot have. Traced values
+            are not looked at.
     """
-    if isinstance(value, list | tuple) and any(map(_has_unit, value)):
-        if not all(map(_has_unit, value)):
+    argument = argument or quantity
+    found = plain(quantity, value, argument)
+    check(quantity, found, argument)
+    return _floating(found)
+
+
+def given_each(quantity: str, value: Any, argument: str | None = None) -> Any:
+    """Return what was given for a quantity of the walls, as `given` does: of both, or `Sides` of what each has."""
+    argument = argument or quantity
+    if not isinstance(value, Sides):
+        return given(quantity, value, argument)
+    return Sides(*(given(quantity, getattr(value, side), f"{argument}_{side}") for side in SIDES))
+
+
+def _floating(value: Any) -> Any:
+    """Return whole numbers as floating-point ones, of which alone JAX computes derivatives."""
+    if isinstance(value, int):
+        return float(value)
+    if isinstance(value, list | tuple):
+        return np.asarray(value, float)
+    return value.astype(float) if getattr(value, "dtype", np.dtype(float)).kind in "iu" else value
+
+
+def plain(quantity: str, value: Any, argument: str | None = None) -> Any:
+    """Return plain numbers for a quantity of pint, or a list of them; anything else is returned as it is.
+
+    Args:
+        quantity: Name of the quantity in `GIVEN`.
+        value: The value.
+        argument: Name that an error uses; that of the quantity unless given.
+
+    Raises:
+        ValueError: If its unit is not one of the quantity, or only some values of a list have one.
+    """
+    argument = argument or quantity
+    if quantity not in UNITS:
+        return checks.pure(argument, value, _hint(quantity))
+    if isinstance(value, list | tuple) and any(map(checks.has_unit, value)):
+        if not all(map(checks.has_unit, value)):
             raise ValueError(
-                see("maps", f"{name} must have a unit at every value or at none; got {checks.shown(value)}")
+                see("maps", f"{argument} must have a unit at every value or at none; got {checks.shown(value)}")
             )
-        return np.array([plain(name, one) for one in value])
-    return value.magnitude * _factor(name, value.units) if _has_unit(value) else value
+        return np.array([plain(quantity, one, argument) for one in value])
+    if checks.is_data_array(value):
+        value = value.data
+    return value.magnitude * _factor(quantity, value.units, argument) if checks.has_unit(value) else value
 
 
-def _has_unit(value: Any) -> bool:
-    # Without it, or while another thread is still importing it, nobody has made a quantity.
-    kind = getattr(sys.modules.get("pint"), "Quantity", None)
-    return kind is not None and isinstance(value, kind)
+def _hint(quantity: str) -> str:
+    """Return a hint at the quantities with a unit that decide the same as one without; "" if there are none."""
+    others = [one for one in synonyms(quantity) if one in UNITS] if quantity in AXES else []
+    return f"; with a unit there is {' or '.join(others)}" if others else ""
 
 
 @cache
-def _factor_of(name: str, text: str) -> float:
+def _factor_of(quantity: str, text: str, argument: str) -> float:
     import pint
 
     try:
-        return _factor(name, pint.application_registry.Unit(text))
+        unit = pint.application_registry.Unit(text)
     except pint.UndefinedUnitError:
         raise ValueError(
-            f"{name} must be in {UNITS.get(name, 'no unit')}, or in a unit that pint knows; got {text!r}"
+            f"{argument} must be in {UNITS.get(quantity, 'no unit')}, or in a unit that pint knows; got {text!r}"
         ) from None
+    if quantity in UNITS:
+        return _factor(quantity, unit, argument)
+    return checks.pure(argument, 1.0 * unit, _hint(quantity))
 
 
-def _factor(name: str, unit: Any) -> float:
-    """Find how many of the quantity's own units a unit of pint is."""
+def _factor(quantity: str, unit: Any, argument: str) -> float:
+    """Return how many of the quantity's own units a unit of pint is."""
     import pint
 
     one = 1.0 * unit
-    if name not in UNITS:
-        if one.unitless:
-            return 1.0
-        others = [one for one in synonyms(name) if one in UNITS] if name in AXES else []
-        hint = f"; with a unit there is {' or '.join(others)}" if others else ""
-        raise ValueError(see("maps", f"{name} must be a number without a unit; got one in {unit}{hint}"))
     try:
-        factor = one.m_as(UNITS[name])
+        factor = one.m_as(UNITS[quantity])
     except pint.errors.PintError:
         raise ValueError(
-            see("maps", f"{name} must be in {UNITS[name]}, or in a unit of that kind; got one in {unit}")
+            see("maps", f"{argument} must be in {UNITS[quantity]}, or in a unit of that kind; got one in {unit}")
         ) from None
-    # Of what turns, hertz counts the turns; to pint it is 1/s, as rad/s is.
-    turns = sum(power for part, power in one.unit_items() if part.endswith("hertz")) if UNITS[name] == "rad/s" else 0
-    return factor * (2 * math.pi) ** turns
+    # Hertz counts the turns of an angular frequency; to pint it is 1/s, as rad/s is.
+    power = sum(power for part, power in one.unit_items() if part.endswith("hertz"))
+    return factor * (2 * math.pi) ** (power if UNITS[quantity] == "rad/s" else 0)

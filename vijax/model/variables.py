@@ -20,21 +20,21 @@ from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.programs import jitted
 
-# Other names of what a constant decides: each is applied after the constants.
-_ALIASES = {name: axis.alias_of for name, axis in PARAMETERS.items() if axis.alias_of}
+ALIASES = {name: axis.alias_of for name, axis in PARAMETERS.items() if axis.alias_of and not axis.given_only}
+"""Other names of constants that are tuned, each with its constant: they are set after the constants."""
 LINEAR = ("beta", "gamma")  # may be zero or negative: their variable is the value, that of others its logarithm
 # Bounds unless given: of kappa, and so of what decides it, the range of README's planes; of r what keeps clear of 0,
 # where no speed is left, and of 1, where nothing is lost; of inclinations [rad] to either side of level ground.
 _LEAST_KAPPA, _MOST_KAPPA = 2.0, 400.0
 _LEAST_R, _MOST_R = 0.05, 0.95
 _TILT = 0.1
-_OF_ONE_WALL = tuple(name for name in PARAMETERS if of_both_walls(name) and name not in _ALIASES)
-NAMES = CONSTANTS + _OF_ONE_WALL + tuple(_ALIASES)
+_OF_ONE_WALL = tuple(name for name in PARAMETERS if of_both_walls(name) and name not in ALIASES)
+NAMES = CONSTANTS + _OF_ONE_WALL + tuple(ALIASES)
 
 
 def constant(name: str) -> str:
     """Name the constant of the device that a name decides."""
-    return _ALIASES.get(name, name)
+    return ALIASES.get(name, name)
 
 
 def moving(name: str) -> bool:
@@ -59,8 +59,8 @@ def variables(names: tuple[str, ...], x: Any) -> np.ndarray:
 def tuned(device: Harvester, names: tuple[str, ...], z: Any) -> Harvester:
     """Make the device with the quantities that the variables say."""
     given = dict(zip(names, values(names, z), strict=True))
-    device = changed(device, {name: x for name, x in given.items() if name not in _ALIASES})
-    for name in _ALIASES:
+    device = changed(device, {name: x for name, x in given.items() if name not in ALIASES})
+    for name in ALIASES:
         if name in given:
             device = _decided(device, name, given[name])
     return device
@@ -81,20 +81,22 @@ def _decided(device: Harvester, name: str, x: Any) -> Harvester:
         "d": lambda: x * device.length_unit,
         "gamma": lambda: jnp.arcsin(x * device.A / device.g),
     }[whole(name)]()
-    return changed(device, {_ALIASES[name]: value})
+    return changed(device, {ALIASES[name]: value})
 
 
 def scattered(device: Harvester, names: tuple[str, ...], factors: Any) -> Harvester:
-    """Make the device in which some constants are off by factors; those of both walls, or of one."""
+    """Return the device in which some quantities are off by factors; those of both walls, or of one."""
     for name, factor in zip(names, factors, strict=True):
-        off = each(partial(operator.mul, factor), field_of(device, name))
-        device = changed(device, {name: off}, checked=False)
+        # Each other name is in proportion to its constant, but for k, which goes with the square.
+        own, factor = constant(name), jnp.sqrt(factor) if whole(name) == "k" else factor
+        off = each(partial(operator.mul, factor), field_of(device, own))
+        device = changed(device, {own: off}, checked=False)
     return device
 
 
 def value_of(device: Harvester, name: str) -> Any:
     """Find the quantity's value in a device."""
-    if name not in _ALIASES or whole(name) == "k":
+    if name not in ALIASES or whole(name) == "k":
         return field_of(device, name)
     return field_of(device.pair(), name)
 
@@ -131,9 +133,9 @@ def limits(names: tuple[str, ...], bounds: Mapping[str, tuple[float, float]], de
 
 
 def _checked(name: str, bounds: tuple[float, float], device: Harvester) -> tuple[float, float]:
-    low, high = checks.bounds(f"bounds of {name}", units.plain(name, bounds))
-    for bound in (low, high):
-        check(name, bound, f"bounds of {name}")
+    argument = f"bounds of {name}"
+    low, high = checks.bounds(argument, units.plain(name, bounds, argument))
+    check(name, (low, high), argument)
     steepest = float(device.g) / float(device.A)
     if name == "gamma" and max(abs(low), abs(high)) > steepest:
         raise ValueError(f"bounds of gamma must lie in [-g/A, g/A], here +-{steepest:g}; got {low, high}")

@@ -11,8 +11,9 @@ from vijax.model.choices import Walls
 from vijax.model.device import Harvester, told_device, with_constants
 from vijax.model.label import label
 from vijax.model.pair import ImpactPair, pair_of, symmetric
-from vijax.model.quantities import PARAMETERS, whole
+from vijax.model.quantities import whole
 from vijax.orbits.curve_plane import check_plane
+from vijax.orbits.parameter import MOVED
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def check_map(dataset: "xr.Dataset", dims: tuple[str, ...]) -> tuple[str, str]:
         dataset: The map, or its coordinates and attributes alone.
         dims: What its motion depends on.
     """
-    if len(dims) != 2 or not set(dims) <= set(PARAMETERS):
+    if len(dims) != 2 or not set(dims) <= set(MOVED):
         idle = [str(dim) for dim in dataset.sizes if dim not in dims]
         hint = f"; its motion does not depend on {checks.joined(idle)}" if idle else ""
         raise ValueError(f"dataset must be a map over two parameters; got one over {', '.join(dims) or 'none'}{hint}")

@@ -110,9 +110,11 @@ def bifurcation_curves(
     round_borders = checks.whole("round_borders", round_borders, 1, 10_000)
     max_points, settings = checks.whole("max_points", max_points, 2, 10**6), check_settings(settings)
     tell = checks.function("progress", progress)
+    device = None if device is None else one_device(device)
+    checks.flag("limits", limits)
     plane = labelled_plane(dataset)
-    device = device_of(dataset) if device is None else one_device(device)
-    beside = limit_borders(plane) if checks.flag("limits", limits) else borders(plane)[:0]
+    device = device_of(dataset) if device is None else device
+    beside = limit_borders(plane) if limits else borders(plane)[:0]
     search = _CurveSearch(plane, device, max_points, settings, tell)
     basins = None
     try:

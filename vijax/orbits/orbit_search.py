@@ -12,6 +12,7 @@ from jaxtyping import ArrayLike
 
 from vijax.batch.trajectory import trajectory
 from vijax.engine.forcing import with_harmonics
+from vijax.model import units
 from vijax.model.excitation import Excitation
 from vijax.model.membrane import Laws, with_law
 from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
@@ -58,9 +59,10 @@ def from_state(
     """
     period, settle = checks.whole("period", period, 1, _MOST_PERIOD), checks.whole("settle", settle, 0)
     checks.known("pair", check_pair(pair))
-    given = {"u": u, "v": v, "t": t}
+    given = {"u": ("displacement", u), "v": ("velocity", v), "t": ("phase", t)}
+    taken = (units.given(quantity, checks.known(name, x), name) for name, (quantity, x) in given.items())
     # By NumPy, as JAX would compile a program for each number of states.
-    u, v, t = (np.atleast_1d(np.asarray(checks.finite(name, x), float)) for name, x in given.items())
+    u, v, t = (np.atleast_1d(np.asarray(x, float)) for x in taken)
     shape = checks.shapes(u=u, v=v, t=t, **quantities(pair))
     check_start(pair, "u", u)
     pair = jax.tree.map(lambda x: np.broadcast_to(x, shape), pair)

@@ -14,6 +14,7 @@ import numpy as np
 
 from vijax.model import units
 from vijax.model.device import Harvester
+from vijax.model.membrane import in_units
 from vijax.model.pair import ImpactPair
 from vijax.model.quantities import SIDES, check, of_both_walls, whole
 from vijax.model.sides import Sides, each, field_of, with_own
@@ -29,6 +30,8 @@ _POWERS: dict[str, dict[str, float]] = {
     "s": {"d": 1},
     "A": {"d": -1, "gamma": -1},
 }
+# Powers with which the units of length and speed go in it; the numbers of a membrane of some law are in these.
+_UNIT_POWERS = {"omega": (-2, -1), "A": (1, 1)}
 _POWERS |= {f"{name}_{side}": {f"kappa_{side}": _POWERS[name]["kappa"]} for name in ("omega0", "k") for side in SIDES}
 _OWN = "d", "kappa", "r", "gamma", "kappa_left", "kappa_right", "r_left", "r_right"
 # What moves with each quantity that a branch can be followed along: of the pair itself alone, of the device several.
@@ -50,6 +53,9 @@ def moved(pair: ImpactPair, along: str, x: Values, start: Values, steepest: Valu
     fields: dict[str, Any] = {}
     for name, power in _POWERS[along].items():
         fields[name] = each(partial(_times, (x / start) ** power), field_of(pair, name))
+    if pair.law is not None and along in _UNIT_POWERS:
+        law: Any = pair.law
+        fields["law"] = in_units(law, *((x / start) ** power for power in _UNIT_POWERS[along]))
     return _with(pair, **fields)
 
 
@@ -108,7 +114,7 @@ def pair_at(pair: ImpactPair, along: str, value: float, device: Harvester) -> Im
 def able(orbit: Any, *along: str) -> Any:
     """Give an orbit whose pair can be moved along parameters: with walls of their own where one moves one wall."""
     pair = orbit.pair
-    if not any(map(of_both_walls, along)) or pair.unequal:
+    if not any(of_both_walls(name) for name in along if isinstance(name, str)) or pair.unequal:
         return orbit
     return replace(orbit, pair=pair.apart())
 
@@ -134,9 +140,8 @@ def check_along(pair: ImpactPair, along: str, within: tuple[float, float]) -> tu
     if not more and isinstance(both, Sides) and not np.array_equal(both.left, both.right):
         of_walls = " or ".join(f"{along}_{side}" for side in SIDES if f"{along}_{side}" not in stiff)
         raise ValueError(f"along must be {of_walls}, of one wall, where walls differ; got {along!r}")
-    bounds = checks.bounds("within", units.plain(along, within))
-    for bound in bounds:
-        check(along, bound, "within")
+    bounds = checks.bounds("within", units.plain(along, within, "within"))
+    check(along, bounds, "within")
     return bounds
 
 

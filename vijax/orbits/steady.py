@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from vijax.model import energy, flow
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, check_device
-from vijax.model.membrane import Laws, Linear, check_laws, one_of
+from vijax.model.membrane import Laws, Linear, check_laws, has_units, nondimensional, of_device, of_pair, one_of, said
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
 from vijax.model.sides import at
@@ -110,7 +110,9 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None, m
             where Newton begins. Values come from `device`, not from `orbit.pair`.
         pair: d, kappa, r, gamma to move directly; those of the device unless given. Its wall is the orbit's. What
             shakes it is what shakes the orbit, unless it has harmonics of its own.
-        membrane: Numbers of the membrane to move, of the orbit's kind; those of the orbit unless given.
+        membrane: Numbers of the membrane to move, of the orbit's kind; with `pair` in its units, else in SI. Those of
+            the orbit unless given, which are in the units of the orbit's pair: numbers with a dimension must be given
+            where `pair` is not.
 
     Returns:
         The record; NaN with a `status` where there is no attracting orbit.
@@ -119,7 +121,7 @@ def steady(device: Harvester, orbit: Orbit, *, pair: ImpactPair | None = None, m
         ValueError: Which argument, what must hold, what came.
     """
     _check(device, orbit, pair)
-    law = _law(orbit, pair, membrane)
+    law = _law(device, orbit, pair, membrane)
     if orbit.knots.dtype != np.float64:
         raise ValueError(
             f"orbit must hold 64 bits; got {orbit.knots.dtype}; take it as `vijax.orbits.periodic` found it"
@@ -152,7 +154,9 @@ Moved = tuple[Harvester, ImpactPair | None, Laws | None, Waves | None]
 
 def _pair_of(moved: Moved, kind: Walls) -> ImpactPair:
     device, pair, law, waves = moved
-    pair = device.pair(kind) if pair is None else pair
+    if pair is None:
+        pair = device.pair(kind)
+        law = None if law is None else nondimensional(law, device)
     return replace(pair, law=law, waves=waves)
 
 
@@ -198,10 +202,18 @@ def _check(device: Any, orbit: Any, pair: Any) -> None:
         raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
 
 
-def _law(orbit: Orbit, pair: ImpactPair | None, membrane: Any) -> Laws | None:
-    """Take the membrane that is given, or that of the pair or the orbit; None is the linear one."""
+def _law(device: Harvester, orbit: Orbit, pair: ImpactPair | None, membrane: Any) -> Laws | None:
+    """Return the membrane that is given, or that of the pair or the orbit; None is the linear one."""
     if membrane is None:
         own: Any = orbit.pair.law if pair is None or pair.law is None else pair.law
+        if pair is None and own is not None and has_units(own):
+            raise ValueError(
+                see(
+                    "methods",
+                    "membrane must be given, in SI units, where device moves; got none, and those of the orbit "
+                    f"are {said(own)} in units of its pair",
+                )
+            )
         return own
     known_law: Any = Linear() if orbit.pair.law is None else orbit.pair.law
     given, known = (type(one_of(law)) for law in (check_laws(membrane), known_law))
@@ -209,7 +221,9 @@ def _law(orbit: Orbit, pair: ImpactPair | None, membrane: Any) -> Laws | None:
         raise ValueError(
             see("methods", f"membrane must be of the orbit's kind, {known.__name__}; got {given.__name__}")
         )
-    return None if given is Linear else membrane
+    if given is Linear:
+        return None
+    return of_device(membrane, device) if pair is None else of_pair(membrane)
 
 
 def find(pair: ImpactPair, sequence: Sequence, guess: Knots) -> shooting.Solution:

@@ -30,6 +30,7 @@ class Parameters(TypedDict, total=False):
     gamma: Given
     omega: Given
     s: Given
+    distance: Given
     omega0: Given
     k: Given
     A: Given
@@ -138,17 +139,17 @@ def _text(path: Path) -> str:
 
 
 def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarray:
-    """Turn the values of an axis into a float64 array of at most one dimension.
+    """Return the values of an axis as a float64 array of at most one dimension.
 
     Args:
-        name: Of the argument that an error speaks of.
-        values: What came.
-        quantity: That they are of, unless it is `name`.
+        name: Name of the argument, for errors.
+        values: Values of the axis.
+        quantity: Name of the quantity, unless it is `name`.
 
     Raises:
-        ValueError: With what must hold, what came and where, if they are not allowed.
+        ValueError: Which value cannot be, and where.
     """
-    array = checks.numbers(name, units.plain(quantity or name, values))
+    array = checks.numbers(name, units.plain(quantity or name, values, name))
     if array.ndim > 1:
         raise ValueError(f"{name} must be a number or a 1-D array; got shape {array.shape}")
     if array.size > _MOST_VALUES:

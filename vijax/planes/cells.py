@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from vijax.model.choices import Walls
-from vijax.model.device import WALLS_OWN, Harvester
+from vijax.model.device import WALLS_OWN, Harvester, check_fits
 from vijax.model.pair import RIGID_ON, ImpactPair, pair_of
 from vijax.model.quantities import AXES, SIDES, START, START_REACH, of_both_walls, synonyms, whole
 from vijax.model.sides import Sides
@@ -124,10 +124,17 @@ class Cells:
         return np.ravel(full.values / full.values.flat[0])
 
 
-def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: bool = True) -> Cells:
+def cells(
+    given: Mapping[str, Any], device: Harvester, wall: str, *, restitution: bool = True, dimensional: bool = False
+) -> Cells:
     """Lay out the cells of a sweep over the given axes; a quantity that no axis gives is the device's.
 
-    Without `restitution`, of a membrane whose loss is not told by r, there is no axis r, and r is NaN.
+    Args:
+        given: The axes.
+        device: The device.
+        wall: What the walls are.
+        restitution: Whether the membrane has a restitution r. If not, there is no axis r, and r is NaN.
+        dimensional: Whether the membrane has numbers with a dimension: its motion depends on omega and A themselves.
 
     Raises:
         ValueError: If a value is not allowed, two axes give one quantity, or a start lies outside a rigid gap.
@@ -161,7 +168,7 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
     if wall != "soft":
         _check_start(quantities["d"], quantities["u0"], wall)
     stiff = [name for name in quantities if whole(name) == "kappa"]
-    energies = {"omega", "A", *(stiff if wall == "rigid" else ())}
+    energies = {*(() if dimensional else ("omega", "A")), *(stiff if wall == "rigid" else ())}
     motion = [quantity for name, quantity in quantities.items() if name not in energies]
     dynamic = tuple(dim for dim in sizes if any(dim in quantity.dims for quantity in motion))
     length = quantities["A"] * math.pi**2 / quantities["omega"] ** 2
@@ -179,7 +186,7 @@ def cells(given: Mapping[str, Any], device: Harvester, wall: str, restitution: b
 def _check_sizes(sizes: dict[str, int]) -> None:
     """Raise unless there is room for the quantities that follow from several axes, and for the indices of cells."""
     stiff = [(f"omega0_{side}", f"k_{side}", "omega") for side in SIDES]
-    for rows in (("s", "omega", "A"), ("omega0", "k", "omega"), *stiff, ("beta", "A")):
+    for rows in (("s", "distance", "omega", "A"), ("omega0", "k", "omega"), *stiff, ("beta", "A")):
         along = [name for name in rows if name in sizes]
         checks.fits(along, _BYTES * math.prod(sizes[name] for name in along), "the quantities of cells")
     if (count := math.prod(sizes.values())) > _MOST_CELLS:
@@ -196,7 +203,11 @@ def _quantities(values: "dict[str, xr.Variable]", device: Harvester, wall: str, 
         return xr.Variable((), check_axis(name, getattr(device, name)))
 
     omega, amplitude, beta = own("omega"), own("A"), own("beta")
-    d = values["d"] if "d" in values else own("s") * omega**2 / (amplitude * math.pi**2)
+    travel = None if "d" in values else own("s")
+    if "distance" in values:
+        check_fits(values["distance"].values, device.r_b)
+        travel = values["distance"] - 2 * float(device.r_b)
+    d = values["d"] if travel is None else travel * omega**2 / (amplitude * math.pi**2)
     # A level tube has gamma = 0 whatever A is: dividing would make an energy-only axis a dynamic one.
     tilt = float(device.g) * np.sin(beta)
     gamma = values["gamma"] if "gamma" in values else (tilt / amplitude if tilt.values.any() else tilt)

@@ -228,6 +228,8 @@ def rigid_from(cheapest: "xr.DataArray") -> "xr.DataArray | None":
     Returns:
         Values of the axis kappa, omega0 or k over the other axes; None if there is no such axis.
     """
+    if not checks.is_data_array(cheapest) or cheapest.attrs.get("flag_meanings") != _meanings(Model):
+        raise ValueError(f"cheapest must be what vijax.cheapest_model returned; got {checks.shown(cheapest)}")
     axis = next((dim for dim in cheapest.dims if dim in synonyms("kappa")), None)
     if axis is None:
         return None
@@ -255,6 +257,10 @@ def _flags(values: "xr.DataArray", kinds: type[enum.IntEnum], long_name: str, fo
         "units": "1",
         "long_name": long_name,
         "flag_values": [int(kind) for kind in kinds],
-        "flag_meanings": " ".join(kind.name.lower() for kind in kinds),
+        "flag_meanings": _meanings(kinds),
     }
     return values
+
+
+def _meanings(kinds: type[enum.IntEnum]) -> str:
+    return " ".join(kind.name.lower() for kind in kinds)

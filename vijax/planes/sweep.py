@@ -14,7 +14,7 @@ import numpy as np
 from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
 from vijax.model.device import Harvester, one_device, with_constants
 from vijax.model.excitation import Excitation, Record
-from vijax.model.membrane import Laws, one_of
+from vijax.model.membrane import Laws, Linear, has_units, one_of
 from vijax.planes import cluster, dispatch, estimate, store_filling, tile_size, tiled_store
 from vijax.planes import refine as refinement
 from vijax.planes.axes import Axes, check_axis
@@ -89,9 +89,9 @@ def sweep(
             paper's fixed steps without event location.
         solver: Of "ode": Tsit5 unless given; Bosh3, Dopri5, Dopri8, Kvaerno3, Kvaerno4 or Kvaerno5.
         rtol, atol: Of "ode": tolerances of position and velocity step by step, 1e-8 and 1e-10 unless given.
-        membrane: Of "ode" and "rk4": `HuntCrossley(chi)`, or a `MembraneLaw` of your own, for the linear membrane; of
-            walls with a law each `Sides` of two of one kind.
-            `HuntCrossley` takes no r: the map's `restitution` is what came out.
+        membrane: Of "ode" and "rk4": `HuntCrossley(chi)`, `Hyperelastic(prestretch)`, or a `MembraneLaw` of your own,
+            for the linear membrane; of walls with a law each `Sides` of two of one kind. Numbers with a dimension are
+            in SI. `HuntCrossley` takes no r: the map's `restitution` is what came out.
         friction: Of "ode": dry friction of ball and capsule, over the amplitude of the forcing as gamma is;
             `Harvester.friction` has that of a coefficient. The ball may stick. None unless given.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
@@ -188,8 +188,9 @@ def plan(
     method = settings.integrator(_in_units(device, given, settings))
     if starts > 1:
         _check_spread(given, settings, refine)
-    lossy = method is None or one_of(method.law).restitution
-    laid_out = cells(given, device, settings.wall, restitution=lossy)
+    law = Linear() if method is None else method.law
+    lossy = one_of(law).restitution
+    laid_out = cells(given, device, settings.wall, restitution=lossy, dimensional=has_units(law))
     if starts > 1:
         named = {name: values for name, values in laid_out.quantities.items() if name not in ("u0", "v0")}
         laid_out = replace(laid_out, quantities=named)

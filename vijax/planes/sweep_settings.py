@@ -104,13 +104,17 @@ class SweepSettings:
         """Give the method with what it is told; None for the exact one.
 
         Args:
-            device: In whose units a record is told; Tables I and II unless given.
+            device: Its units are those of a record, and its constants those of the membrane; Tables I and II unless
+                given.
         """
         from vijax.engine.method_choice import choose
         from vijax.model.device import Harvester
         from vijax.model.excitation import check_excitation
+        from vijax.model.membrane import check_laws, of_device
 
         told = {name: getattr(self, name) for name in _OPTIONS}
+        if self.membrane is not None:
+            told["membrane"] = of_device(check_laws(self.membrane), device or Harvester())
         excitation = self.excitation and self.excitation.scaled(device or Harvester())
         check_excitation(excitation, self.periods + self.transient, repeats=self.until == "attractor")
         return choose(self.method, told, wall=self.wall, dtype=self.dtype, excitation=excitation)

@@ -52,6 +52,10 @@ def curves(
     Raises:
         ValueError: A map with other axes, with other walls or constants than the curves, or without such a variable.
     """
+    checks.flag("unstable", unstable)
+    if over is not None:
+        checks.variables("over", over, ("period",) if ground == "label" else (), "vijax.sweep")
+    checks.choice("ground", ground, ["label"] if over is None else ["label", *map(str, over)])
     checks.variables("dataset", dataset, NEEDED, "vijax.curve_dataset")
     names = dataset.attrs["along"].split()
     if over is None:
@@ -78,8 +82,6 @@ def curves(
 
 def _ground(dataset: "xr.Dataset", over: "xr.Dataset", names: list[str], ground: str) -> tuple[Figure, str, str]:
     """Draw the map below curves in a plane of two parameters, and say which of them is across, which is up."""
-    checks.variables("over", over, ("period",) if ground == "label" else (), "vijax.sweep")
-    checks.choice("ground", ground, ["label", *map(str, over)])
     over = over.squeeze()
     dims = [str(dim) for dim in over["period" if ground == "label" else ground].dims]
     if set(dims) != set(names):

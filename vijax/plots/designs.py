@@ -59,6 +59,8 @@ def design(diagram: "xr.Dataset", report: dict[str, Any], plane: TolerancePlane 
             both tolerances.
     """
     checks.record("report", report, ("best",), "vijax.design.report.describe")
+    if plane is not None:
+        checks.instance("plane", plane, TolerancePlane, "vijax.design_plane")
     checks.variables("diagram", diagram, ("P", "admissible"), "orbit_diagram")
     along, best = str(diagram.attrs["along"]), report["best"]
     near = None if best is None else close_view(along, _here(best, along))

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
 from vijax.plots.style import STYLE, save_figure
+from vijax.runtime import checks
 
 P = ParamSpec("P")
 
@@ -51,6 +52,7 @@ def save(figure: Figure, path: str | Path) -> None:
         ValueError: Another ending.
         OSError: If it cannot be written; what was there stays.
     """
+    checks.instance("figure", figure, Figure, "a function of vijax.plots")
     # Fonts, hatches and dots an inch count as it is written, too.
     with mpl.rc_context(STYLE):
         save_figure(figure, path)

@@ -74,8 +74,8 @@ def energies(pair: ImpactPair, path: Trajectory, device: Harvester | None = None
     Raises:
         ValueError: As `trajectory`.
     """
-    line, onset, there = _followed(pair, path)
     device = one_device(device)
+    line, onset, there = _followed(pair, path)
     speed = float(device.speed_unit)
     side = np.asarray(path.impacts.side)[there]
     depth = np.asarray(path.impacts.depth)[there] * np.asarray(at(depth_unit(device, pair), side))

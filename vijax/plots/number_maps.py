@@ -87,6 +87,7 @@ def power_map(dataset: "xr.Dataset") -> Figure:
     Raises:
         ValueError: If the map lacks a variable, or has more dimensions or panels than a picture can hold.
     """
+    checks.variables("dataset", dataset, (), "sweep")
     return _picture(dataset, _EXPECTED if "starts" in dataset.attrs else POWER)
 
 

@@ -8,6 +8,7 @@ OSError to files. Which values a quantity of the device may have is known to `mo
 import math
 import os
 import reprlib
+import sys
 from collections.abc import Callable, Collection, Iterable
 from functools import cache
 from pathlib import Path
@@ -15,6 +16,8 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+
+from vijax.runtime.pages import see
 
 T = TypeVar("T")
 
@@ -34,11 +37,57 @@ def shown(value: Any) -> str:
     return " ".join(text.split())
 
 
-def _array(value: Any) -> np.ndarray:
-    """Make the value an array, of objects where it is none of numbers."""
+def _instance_of(module: str, kind: str, value: Any) -> bool:
+    """Return whether the value is of a class of a heavy package; nothing is while that is not imported."""
+    # While another thread is still importing the module, the class is not there yet.
+    found = getattr(sys.modules.get(module), kind, None)
+    return found is not None and isinstance(value, found)
+
+
+def has_unit(value: Any) -> bool:
+    """Return whether the value is a quantity of pint."""
+    return _instance_of("pint", "Quantity", value)
+
+
+def is_data_array(value: Any) -> bool:
+    """Return whether the value is an `xarray.DataArray`."""
+    return _instance_of("xarray", "DataArray", value)
+
+
+def pure(name: str, value: Any, advice: str = "") -> Any:
+    """Return a number without a unit; a quantity of pint that has none, as 3 mm/m, becomes its number.
+
+    Args:
+        name: Name of the argument.
+        value: A number, an array, a list, or such a quantity; anything else is returned as it is.
+        advice: Added to the error.
+
+    Raises:
+        ValueError: If the value, or one in the list, has a unit.
+    """
+    if isinstance(value, list | tuple):
+        return [pure(name, one, advice) for one in value] if "pint" in sys.modules else value
+    if is_data_array(value):
+        value = value.data
+    if not has_unit(value):
+        return value
+    base = value.to_base_units()
+    if not base.unitless:
+        raise ValueError(see("maps", f"{name} must be a number without a unit; got one in {value.units}{advice}"))
+    return base.magnitude
+
+
+def _array(name: str, value: Any) -> np.ndarray:
+    """Return the value as an array; an array of objects if it is no array of numbers."""
+    value = pure(name, value)
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise ValueError(
+            f"{name} must have no masked values; got {np.ma.count_masked(value)} of {value.size} masked; "
+            "leave them out by compressed()"
+        )
     try:
         return np.asarray(value)
-    except ValueError:  # a list of lists of several lengths
+    except (TypeError, ValueError):  # a list of lists of several lengths; a dataset
         return np.asarray(None)
 
 
@@ -88,7 +137,7 @@ def real(name: str, value: Any, must: str, holds: Callable[[float], bool]) -> fl
         holds: The same in code; never asked about NaN.
     """
     known(name, value)
-    number = _array(value)
+    number = _array(name, value)
     if number.ndim or number.dtype.kind not in "iuf" or np.isnan(number) or not holds(float(number)):
         raise ValueError(f"{name} must be {must}; got {shown(value)}")
     return float(number)
@@ -102,7 +151,7 @@ def positive(name: str, value: Any) -> float:
 def numbers(name: str, value: Any, advice: str = "", *, some: bool = True) -> np.ndarray:
     """Take the value as an array of real numbers, NaN and infinity too; of at least one unless not `some`."""
     known(name, value)
-    array = _array(value)
+    array = _array(name, value)
     hint = advice and f"; {advice}"
     if some and array.size == 0:
         raise ValueError(f"{name} must hold at least one number; got shape {array.shape}{hint}")
@@ -172,9 +221,12 @@ def words(name: str, value: Any, allowed: Collection[str]) -> tuple[str, ...]:
 
 def sequence(name: str, value: Any, kind: type[T], what: str) -> list[T]:
     """Take the value as a list of records of a kind; `what` they are, in words."""
-    if isinstance(value, str) or not isinstance(value, Iterable):
+    try:
+        listed = None if isinstance(value, str) else list(value)
+    except TypeError:  # numbers of NumPy, JAX and pint have an `__iter__` that raises
+        listed = None
+    if listed is None:
         raise ValueError(f"{name} must be a list of {what}; got {shown(value)}")
-    listed = list(value)
     for one in listed:
         if not isinstance(one, kind):
             raise ValueError(f"{name} must be a list of {what}; got {shown(one)} in it")
