@@ -18,7 +18,7 @@ from vijax.runtime import checks
 from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
-    pass
+    import xarray as xr
 
 
 class Parameters(TypedDict, total=False):
@@ -136,6 +136,27 @@ def _text(path: Path) -> str:
     if path.stat().st_size > _MOST_TEXT:
         raise OSError(errno.EFBIG, f"more than {checks.gigabytes(_MOST_TEXT)}")
     return path.read_text(encoding="utf-8")
+
+
+def dimension(name: str, values: Any) -> "tuple[str, xr.Variable | None]":
+    """Return the dimension of an axis and the labels along it; a plain array has a dimension named as the axis.
+
+    Args:
+        name: Name of the axis.
+        values: Values of the axis; an `xarray.DataArray` names a dimension, which several axes may share.
+
+    Raises:
+        ValueError: If the dimension has the name of another axis, or labels that no dataset can hold.
+    """
+    if not checks.is_data_array(values) or values.ndim != 1:
+        return name, None
+    (dim,) = values.dims
+    labels = values.coords[dim].variable.to_base_variable() if dim in values.coords else None
+    if not isinstance(dim, str) or not dim:
+        raise ValueError(f"{name} must have a dimension named by text; got {checks.shown(dim)}")
+    if labels is not None and labels.dtype.kind not in "iufU":
+        raise ValueError(f"{name} must have numbers or texts along {dim}; got labels of {labels.dtype}")
+    return dim, None if dim == name else labels
 
 
 def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarray:

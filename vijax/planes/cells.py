@@ -12,7 +12,7 @@ from vijax.model.device import WALLS_OWN, Harvester, check_fits
 from vijax.model.pair import RIGID_ON, ImpactPair, pair_of
 from vijax.model.quantities import AXES, SIDES, START, START_REACH, of_both_walls, synonyms, whole
 from vijax.model.sides import Sides
-from vijax.planes.axes import check_axis
+from vijax.planes.axes import check_axis, dimension
 from vijax.runtime import checks
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ class Cells:
     """The cells of a sweep: which dimensions the dynamics see, and what each cell and each variant of it is.
 
     Attributes:
-        given: The axes as they were given.
+        given: The axes as they were given, over their dimensions; several axes may share one.
+        labels: Coordinates of dimensions that are no axes; numbers from 0 unless given.
         sizes: Length of every dimension, in the order given.
         dynamic: Dimensions that the dynamics depend on: one simulation for each of their points.
         variant: The other dimensions, which enter the energies alone.
@@ -51,6 +52,7 @@ class Cells:
     """
 
     given: "dict[str, xr.Variable]"
+    labels: "dict[str, xr.Variable]"
     sizes: dict[str, int]
     dynamic: tuple[str, ...]
     variant: tuple[str, ...]
@@ -111,6 +113,7 @@ class Cells:
         return replace(
             self,
             given={name: within(values) for name, values in self.given.items()},
+            labels={name: within(values) for name, values in self.labels.items()},
             sizes={dim: len(range(size)[block.get(dim, slice(None))]) for dim, size in self.sizes.items()},
             quantities={name: within(values) for name, values in self.quantities.items()},
             length=within(self.length),
@@ -158,10 +161,8 @@ def cells(
             raise ValueError(
                 f"{name} must be left out with a membrane that has no restitution; got {checks.shown(given[name])}"
             )
-    arrays = {name: check_axis(name, values) for name, values in given.items()}
-    values = {name: xr.Variable((name,) * array.ndim, array) for name, array in arrays.items()}
-    sizes = {name: array.size for name, array in arrays.items() if array.ndim}
-    _check_sizes(sizes)
+    values, labels, sizes = _laid_out(given)
+    _check_sizes(values, sizes)
     quantities = _quantities(values, device, wall, xr)
     if not restitution:
         quantities |= {name: xr.Variable((), np.nan) for name in quantities if whole(name) == "r"}
@@ -174,6 +175,7 @@ def cells(
     length = quantities["A"] * math.pi**2 / quantities["omega"] ** 2
     return Cells(
         given=values,
+        labels=labels,
         sizes=sizes,
         dynamic=dynamic,
         variant=tuple(dim for dim in sizes if dim not in dynamic),
@@ -183,12 +185,53 @@ def cells(
     )
 
 
-def _check_sizes(sizes: dict[str, int]) -> None:
+def _laid_out(
+    given: Mapping[str, Any],
+) -> "tuple[dict[str, xr.Variable], dict[str, xr.Variable], dict[str, int]]":
+    """Lay the axes along their dimensions: the axes, labels of dimensions that are no axes, lengths of dimensions.
+
+    An array has a dimension of its own, named as its axis. Axes that are `xarray.DataArray`s with the same dimension
+    share it: their values belong together one by one.
+
+    Raises:
+        ValueError: If a value is not allowed, or axes that share a dimension do not agree about it.
+    """
+    import xarray as xr
+
+    values: dict[str, xr.Variable] = {}
+    labels: dict[str, xr.Variable] = {}
+    sizes: dict[str, int] = {}
+    first: dict[str, str] = {}
+    for name, axis in given.items():
+        array, (dim, label) = check_axis(name, axis), dimension(name, axis)
+        values[name] = xr.Variable((dim,) * array.ndim, array)
+        if not array.ndim:
+            continue
+        other = first.setdefault(dim, name)
+        if sizes.setdefault(dim, array.size) != array.size:
+            raise ValueError(
+                f"{other} and {name} must be of one length, as both have the dimension {dim}; "
+                f"got {sizes[dim]} and {array.size}"
+            )
+        if dim in AXES and dim not in given:
+            raise ValueError(f"{name} must not have the dimension {dim}, an axis that is not given; rename it")
+        if label is not None and not labels.setdefault(dim, label).equals(label):
+            raise ValueError(f"{other} and {name} must have the same coordinates along {dim}; got others; align them")
+    for dim in [dim for dim in labels if dim in values]:
+        if not np.array_equal(values[dim].values, labels.pop(dim).values):
+            raise ValueError(f"{first[dim]} must have the values of {dim} along it; got other coordinates; align them")
+    for dim in [dim for dim in sizes if dim not in values]:
+        labels.setdefault(dim, xr.Variable(dim, np.arange(sizes[dim]), {"long_name": "number along the dimension"}))
+    return values, labels, sizes
+
+
+def _check_sizes(values: "dict[str, xr.Variable]", sizes: dict[str, int]) -> None:
     """Raise unless there is room for the quantities that follow from several axes, and for the indices of cells."""
     stiff = [(f"omega0_{side}", f"k_{side}", "omega") for side in SIDES]
     for rows in (("s", "distance", "omega", "A"), ("omega0", "k", "omega"), *stiff, ("beta", "A")):
-        along = [name for name in rows if name in sizes]
-        checks.fits(along, _BYTES * math.prod(sizes[name] for name in along), "the quantities of cells")
+        along = [name for name in rows if name in values and values[name].dims]
+        dims = {dim for name in along for dim in values[name].dims}
+        checks.fits(along, _BYTES * math.prod(sizes[str(dim)] for dim in dims), "the quantities of cells")
     if (count := math.prod(sizes.values())) > _MOST_CELLS:
         names = checks.joined(name for name, size in sizes.items() if size > 1)
         raise ValueError(

@@ -172,7 +172,7 @@ def coordinates(of: Cells) -> "dict[str, xr.Variable]":
     for name, values in {**of.given, **of.quantities}.items():
         found[name] = values.transpose(*(dim for dim in of.sizes if dim in values.dims))
         found[name].attrs = AXES[name].attributes
-    return found
+    return found | of.labels
 
 
 def provenance(planned: SweepPlan, **further: Any) -> dict[str, Any]:

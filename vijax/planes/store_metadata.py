@@ -33,7 +33,10 @@ def write(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path) -
         path: Folder to make.
     """
     sizes, axes = planned.cells.sizes, coordinates(planned.cells)
-    arrays = {name: store.array(axis, axis.shape, axis.shape, np.nan) for name, axis in axes.items()}
+    arrays = {
+        name: store.array(axis, axis.shape, axis.shape, np.nan if axis.dtype.kind == "f" else 0)
+        for name, axis in axes.items()
+    }
     for name, variable in specimen(planned).data_vars.items():
         shape = tuple(sizes[str(dim)] for dim in variable.dims)
         chunks = tuple({**sizes, **tile}[str(dim)] for dim in variable.dims)

@@ -69,6 +69,10 @@ def sweep(
         sweep(d=np.linspace(0.05, 0.3, 128), kappa=np.geomspace(3, 400, 128), r=0.5)  # the (d, kappa) plane
         sweep(omega=np.pi * np.linspace(1, 12, 64), omega0=np.linspace(20, 400, 64))  # one device, other frequencies
         sweep(d=0.2, kappa=np.geomspace(3, 400, 64), A=[1, 2, 5])                     # here A enters energies alone
+        sweep(s=DataArray([0.01, 0.02], dims="device"), omega0=DataArray([90, 120], dims="device"))  # a list of devices
+
+    Axes that are `xarray.DataArray`s with one dimension share it: their values belong together, one by one. The
+    dimension keeps its labels.
 
     Dimensionless axes are d, kappa, r, gamma and the start u0, v0; physical ones omega [rad/s], s [m], omega0 [rad/s]
     or k [N/m], A [m/s^2], beta [rad]. d and s are one quantity, so are kappa, omega0 and k, gamma and beta: give one
@@ -191,6 +195,9 @@ def plan(
     law = Linear() if method is None else method.law
     lossy = one_of(law).restitution
     laid_out = cells(given, device, settings.wall, restitution=lossy, dimensional=has_units(law))
+    for dim in laid_out.sizes:
+        if dim in {*table(1), *table(2), "computed", "start"}:
+            raise ValueError(f"the dimension {dim} must not have the name of a variable of the map; rename it")
     if starts > 1:
         named = {name: values for name, values in laid_out.quantities.items() if name not in ("u0", "v0")}
         laid_out = replace(laid_out, quantities=named)
@@ -236,6 +243,8 @@ def _check_spread(given: Mapping[str, Any], settings: SweepSettings, refine: int
 
 def _levels(refine: Any, of: Cells, until: str) -> int:
     levels = checks.whole("refine", refine, 1)
+    if shared := [dim for dim in of.sizes if dim not in of.given]:
+        raise ValueError(f"refine must be left out where axes share a dimension, here {shared[0]}; got {levels}")
     if until != "attractor":
         raise ValueError(
             see("maps", f"refine must be left out with until={until!r}, whose cells have no label; got {levels}")
@@ -306,6 +315,9 @@ def check(planned: SweepPlan, out: str | Path, overwrite: bool = False) -> None:
         ValueError, OSError: As `tiled_store.check`; of a refined map as `store.check_store`, or it does not fit
             in memory.
     """
+    for name, labels in planned.cells.labels.items():
+        if labels.dtype.kind == "U":
+            raise ValueError(f"out must be left out where {name} has texts along it; got {out}; give it numbers")
     if planned.refine:
         check_store("out", out, overwrite)
         check_room(planned)

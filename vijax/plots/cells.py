@@ -49,6 +49,12 @@ def panels(dataset: "xr.Dataset", dims: list[str]) -> "tuple[Figure, list[tuple[
     return figure, filled
 
 
+def numbered(dataset: "xr.Dataset") -> "xr.Dataset":
+    """Return the dataset with numbers from 0 for the texts along a dimension, as an axis of a picture has numbers."""
+    texts = [dim for dim in dataset.dims if dim in dataset.coords and dataset[dim].dtype.kind not in "iuf"]
+    return dataset.assign_coords({dim: np.arange(dataset.sizes[dim]) for dim in texts})
+
+
 def edges(values: np.ndarray) -> tuple[np.ndarray, str]:
     """Find the edges of the cells around ascending values, and the scale on which these are evenly spaced."""
     log = values.size > 2 and values[0] > 0 and np.ptp(np.diff(np.log(values))) < _EVEN * np.log(values[-1] / values[0])

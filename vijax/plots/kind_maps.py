@@ -13,7 +13,7 @@ from matplotlib.ticker import EngFormatter
 
 from vijax.model.label import label
 from vijax.model.pair import symmetric
-from vijax.plots.cells import edges, panels
+from vijax.plots.cells import edges, numbered, panels
 from vijax.plots.figure import styled
 from vijax.plots.style import LABEL_NEEDS, layout_of_kinds, title
 from vijax.runtime import checks
@@ -145,7 +145,7 @@ def coded(dataset: "xr.Dataset", categories: list[Category] | None) -> Figure:
     Where it is `aperiodic`, the Lyapunov exponent shades it.
     """
     layout_of_kinds({str(dim): size for dim, size in dataset["code"].sizes.items()})
-    dataset = dataset.squeeze([dim for dim, size in dataset["code"].sizes.items() if size == 1])
+    dataset = numbered(dataset).squeeze([dim for dim, size in dataset["code"].sizes.items() if size == 1])
     dims = [str(dim) for dim in dataset["code"].dims]
     figure, filled = panels(dataset, dims)
     figure.set_figwidth(figure.get_figwidth() + 1.5)

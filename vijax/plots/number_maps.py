@@ -16,7 +16,7 @@ from matplotlib.ticker import EngFormatter
 
 from vijax.planes.compare import Label, Model
 from vijax.planes.dataset import best
-from vijax.plots.cells import BARE, VEIL, borders, edges, marked_places, panels, runs, veil
+from vijax.plots.cells import BARE, VEIL, borders, edges, marked_places, numbered, panels, runs, veil
 from vijax.plots.figure import label_logs, styled
 from vijax.plots.kind_maps import coded, of_flags
 from vijax.plots.style import EXPECTED_NEEDS, NEEDS, QUANTITIES, axis_label, is_kind, layout, title, units
@@ -153,7 +153,7 @@ def _picture(dataset: "xr.Dataset", kind: MapKind) -> Figure:
     names = list(dict.fromkeys([*kind.needs, *(name for name in kind.optional if name in dataset)]))
     # A variable lacks the dimensions that it does not depend on; the picture wants them all.
     full = {name: dataset[name].broadcast_like(whole).transpose(*whole.dims) for name in names}
-    dataset = dataset.assign(full)[names].squeeze()
+    dataset = numbered(dataset.assign(full)[names]).squeeze()
     dims = [str(dim) for dim in dataset[kind.coloured].dims]
     figure = _curve(dataset, kind) if len(dims) == 1 else _maps(dataset, kind, dims)
     return figure
