@@ -8,9 +8,14 @@ import pytest
 
 import vijax
 from benchmarks.derivatives import derivatives, differences, events, relative
+from vijax import Sides
 from vijax.batch import exact_run
+from vijax.batch.trajectory import complete_trajectory
 from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import Status
+
+OTHER = vijax.Harmonics([1.0, 0.3])
+STIFF, SOFT = 40.0, 4.0
 
 
 @pytest.fixture(scope="module", params=["soft", "rigid"])
@@ -106,6 +111,89 @@ def test_too_few_impacts_are_said():
     assert int(short.status) == Status.EVENT_BUDGET
     assert int(short.filled) == 2
     assert np.isnan(np.asarray(short.states.u))[-1]
+
+
+def test_all_impacts_of_a_chatter_are_recorded_where_all_are_wanted():
+    pair = impact_pair(0.117, None, 0.676, 0.952)
+    for excitation in (None, OTHER):
+        assert int(vijax.trajectory(pair, 0.0, 0.3, 8, excitation=excitation).status) == Status.EVENT_BUDGET
+        run = complete_trajectory(pair, 0.0, 0.3, 8, excitation=excitation)
+        known = vijax.trajectory(pair, 0.0, 0.3, 8, max_impacts=2000, excitation=excitation)
+        assert int(run.status) == int(known.status) == Status.OK
+        assert int(run.filled) == int(known.filled) > 16 * 8 + 16
+
+
+@pytest.mark.parametrize("excitation", [None, OTHER], ids=["sine", "harmonics"])
+@pytest.mark.parametrize(
+    ("kappa", "u0", "v0"),
+    [
+        (None, 0.0, 0.9),
+        (None, 0.05, 0.0),  # at rest on the wall
+        (STIFF, 0.0, 0.9),
+        (STIFF, 0.06, 0.1),  # in contact
+        (SOFT, 0.0, 0.9),  # the last contact outlasts the run
+    ],
+)
+def test_an_impact_that_is_not_recorded_is_in_the_status(kappa, u0, v0, excitation):
+    """For every number of recorded impacts, the ball in flight or in contact at the start."""
+
+    def run(most):
+        return vijax.trajectory(impact_pair(0.1, kappa, 0.7), u0, v0, 2, max_impacts=most, excitation=excitation)
+
+    whole = run(60)
+    count = int(whole.filled)
+    assert int(whole.status) == Status.OK
+    for most in range(1, count + 2):
+        cut = run(most)
+        assert int(cut.filled) == min(most, count)
+        assert int(cut.status) == (Status.EVENT_BUDGET if most < count else Status.OK)
+        np.testing.assert_array_equal(cut.impacts.t[: int(cut.filled)], whole.impacts.t[: int(cut.filled)])
+
+
+def test_a_ball_that_stays_in_contact_from_the_start_has_met_a_wall():
+    kappa, r = Sides(0.75266, 0.72614), Sides(0.0298176, 0.9945921)
+    u0, v0, t0, gamma = 0.00223157, 0.72340384, 1.66827912, -1.245353
+    pair = impact_pair(0.004022929988, kappa, r, gamma)
+    image = impact_pair(0.004022929988, Sides(kappa.right, kappa.left), Sides(r.right, r.left), -gamma)
+    for excitation in (None, vijax.Harmonics([1.0, 0.0])):
+        # It leaves after 4.3 periods.
+        for periods in (1, 4):
+            for run in (
+                vijax.trajectory(pair, u0, v0, periods, t0, excitation=excitation),
+                vijax.trajectory(image, -u0, -v0, periods, t0 - 1, excitation=excitation),
+            ):
+                assert int(run.filled) == 0
+                assert int(run.status) == Status.OK
+
+
+def test_no_impact_is_that_of_balls_in_flight_however_they_are_pressed():
+    """Unequal walls, a push beyond the forcing, starts in either wall: of each case its mirror image, too."""
+    draw, count, periods = np.random.default_rng(3), 64, 2
+    d = np.exp(draw.uniform(np.log(0.003), np.log(3.0), count))
+    gamma = draw.uniform(1.0, 1.5, count) * draw.choice([-1, 1], count)
+    left, right = (
+        (np.exp(draw.uniform(np.log(0.2), np.log(10.0), count)), draw.uniform(0.02, 0.995, count)) for _ in range(2)
+    )
+    u0, v0 = draw.choice([-1, 0, 1], count) * (0.5 * d + draw.uniform(0, 0.01, count)), draw.uniform(-1, 1, count)
+    pairs = [
+        impact_pair(d, Sides(one[0], other[0]), Sides(one[1], other[1]), sign * gamma)
+        for sign, one, other in ((1, left, right), (-1, right, left))
+    ]
+    for excitation in (None, vijax.Harmonics([1.0, 0.0])):
+        runs = [
+            vijax.trajectory(pair, sign * u0, sign * v0, periods, t0, excitation=excitation)
+            for sign, t0, pair in zip((1, -1), (0.25, 1.25), pairs, strict=True)
+        ]
+        for run in runs:
+            silent = (np.asarray(run.filled) == 0) & (np.asarray(run.states.mode)[:, -1] == 0)
+            assert np.array_equal(np.asarray(run.status) == Status.NO_IMPACT, silent)
+            held = (np.asarray(run.filled) == 0) & (np.asarray(run.states.mode)[:, -1] != 0)
+            assert (np.asarray(run.status)[held] == Status.OK).any()
+        # The mirror image begins half a period later, so that its last period ends half a period sooner.
+        same = [np.asarray(run.impacts.v_in)[:, 0] for run in runs]
+        both = np.isfinite(same).all(axis=0)
+        assert both.sum() > count / 4
+        np.testing.assert_allclose(same[1][both], -same[0][both], rtol=1e-9)
 
 
 def test_a_ball_that_touches_nothing():

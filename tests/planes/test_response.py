@@ -119,7 +119,7 @@ def test_a_realisation_that_fails_counts_nowhere(monkeypatch):
         path = trajectory(*args, **kwargs)
         return eqx.tree_at(lambda p: p.status, path, path.status.at[2].set(Status.EVENT_BUDGET))
 
-    monkeypatch.setattr("vijax.planes.response.trajectory", cramped)
+    monkeypatch.setattr("vijax.planes.response.complete_trajectory", cramped)
     less = response(DEVICE, NOISY, **told)
     others = np.delete(whole["P_realisation"].values, 2)
     assert float(less["P"]) == pytest.approx(others.mean())

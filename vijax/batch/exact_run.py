@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from vijax.batch.run_records import Asked, Room, Trajectory, start_of
+from vijax.batch.run_records import Asked, Room, Trajectory, no_impact, start_of
 from vijax.engine import exact
 from vijax.model import flow
 from vijax.model.pair import ImpactPair
@@ -24,6 +24,14 @@ from vijax.runtime.xla import each, loop_body, once
 _STRETCH = 64
 # Balls at phase 0 are found together in calls of few sizes.
 _STROBES = (64, 4096)
+
+
+def _steps_of(impacts: Any) -> Any:
+    """Return the number of steps of a run with so many recorded impacts.
+
+    One step more is a contact in which the ball starts, one more the flight or contact in which the last period ends.
+    """
+    return impacts + 2
 
 
 def _time(state: State) -> Float[AnyArray, "..."]:
@@ -81,7 +89,7 @@ def _onward(asked: Asked, pair: ImpactPair, reached: _Reached, first: Int[AnyArr
 
     def advance(reached: _Reached, index):
         state, over = reached
-        idle = over | (index > asked.max_impacts)
+        idle = over | (index >= _steps_of(asked.max_impacts))
         horizon = jnp.where(idle, 0.0, 2.0 * (asked.periods - state.n).astype(state.t.dtype) - state.t)
 
         @once
@@ -118,8 +126,7 @@ def _stretch(asked: Asked, pair: ImpactPair, starts: tuple, reached: _Reached, f
 
 def _fly(asked: Asked, room: Room, pair: ImpactPair, starts: tuple) -> tuple[_Reached, _Flown]:
     """Take all steps of rows of starts: as many as there is room for where traced, else until all runs are over."""
-    # One step more than impacts: the flight or contact in which the last period ends.
-    steps = room.impacts + 1
+    steps = _steps_of(room.impacts)
     if tiles.library((pair, starts)) is jnp:
         return _onward(asked, pair, _set_out(pair, *starts), jnp.int32(0), steps)
     # Stretches of one length need one program, where every number of periods would need its own: 4 s and 800 mappings.
@@ -140,9 +147,10 @@ def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Traj
     reached, flown = _fly(asked, room, pair, (u0, v0, t0))
     own = tiles.library((pair, flown))
     out, idle = flown.out, flown.idle
-    real = ~idle & (out.impact.side != 0)
-    counted = own.cumsum(real, axis=1, dtype=own.int32)
-    real = real & (counted <= asked.max_impacts) & (out.impact.n < asked.periods)
+    real = ~idle & (out.impact.side != 0) & (out.impact.n < asked.periods)
+    recorded = own.cumsum(real, axis=1, dtype=own.int32) <= asked.max_impacts
+    lost = (real & ~recorded).any(axis=1)
+    real = real & recorded
     filled = real.sum(axis=1, dtype=own.int32)
     there = own.arange(room.impacts, dtype=own.int32) < filled[:, None]
     order = own.argsort(~real, axis=1, stable=True)[:, : room.impacts]
@@ -155,8 +163,9 @@ def exact_run(asked: Asked, pair: ImpactPair, u0, v0, t0, *, room: Room) -> Traj
     states = _strobes(pair, flown, room.periods)
     permanent = (out.permanent & ~idle).any(axis=1)
     short = ~reached.over & (_time(reached.state) < 2.0 * asked.periods.astype(reached.state.t.dtype))
-    status = own.where(permanent, Status.PERMANENT_CONTACT, own.where(filled == 0, Status.NO_IMPACT, Status.OK))
-    status = own.where(short, Status.EVENT_BUDGET, status).astype(own.int32)
+    status = own.where(no_impact(filled, states, asked.periods), Status.NO_IMPACT, Status.OK)
+    status = own.where(permanent, Status.PERMANENT_CONTACT, status)
+    status = own.where(short | lost, Status.EVENT_BUDGET, status).astype(own.int32)
     return Trajectory(jax.tree.map(keep, out.impact), filled, states, status)
 
 

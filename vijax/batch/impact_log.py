@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 
 from vijax.batch.exact_run import balls_at
-from vijax.batch.trajectory import trajectory
+from vijax.batch.trajectory import complete_trajectory
 from vijax.engine import exact, quick, quick_wall
 from vijax.engine.ground import Ground, ground_of
 from vijax.engine.impact import Ball
@@ -99,7 +99,7 @@ def record_stepped(method: Method, pair: ImpactPair, starts: State, periods: int
     path = None
     if wanted.any():
         t = 2.0 * (starts.n[wanted] + early) + starts.t[wanted]
-        flown = trajectory(some, starts.u[wanted], starts.v[wanted], periods + early, t, method=method)
+        flown = complete_trajectory(some, starts.u[wanted], starts.v[wanted], periods + early, t, method=method)
         path = jax.tree.map(np.asarray, flown)
     table = {name: np.full((count, 0), np.nan) for name in _KEPT}
     filled, u, v = np.zeros(count, int), *(np.full((count, periods), np.nan) for _ in range(2))

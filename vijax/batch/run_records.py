@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from vijax.engine import exact
 from vijax.model import flow
@@ -22,7 +22,8 @@ class Trajectory(WithStatus):
         impacts: `Impact` records along the last axis, in order; NaN (side 0) beyond `filled`.
         filled: How many impacts there are.
         states: The ball at phase 0 of periods 1 ... periods, along the last axis; NaN where `impacts` was too short.
-        status: OK, NO_IMPACT, PERMANENT_CONTACT, or EVENT_BUDGET where `max_impacts` came before the last period.
+        status: OK; NO_IMPACT if no impact began and the ball is in flight at the end of the last period;
+            PERMANENT_CONTACT; EVENT_BUDGET if an impact of these periods is not recorded, as `max_impacts` were before.
     """
 
     impacts: Impact
@@ -56,3 +57,11 @@ def start_of(pair: ImpactPair, u0, v0, t0) -> State:
     """Make the start a state, in contact or in flight."""
     t, n = flow.wrap_phase(t0)
     return State(u0, v0, t, n.astype(jnp.int32), exact.start_mode(pair, u0, v0, t).astype(jnp.int32))
+
+
+def no_impact(filled: Int[AnyArray, "row"], states: State, periods: Int[AnyArray, ""]) -> Bool[AnyArray, "row"]:
+    """Return True for runs without an impact, unless the ball is in contact at the end of the last period.
+
+    A contact that began before the run is no impact, but a ball that stays in it has met a wall.
+    """
+    return (filled == 0) & (states.mode[:, periods - 1] == 0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory, start_of
+from vijax.batch.run_records import CHUNK, Asked, Room, Trajectory, no_impact, start_of
 from vijax.engine.method import HELD, Method, repeated
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Impact, State, Status
@@ -18,13 +18,21 @@ from vijax.runtime.programs import jitted
 
 
 class _Recording(eqx.Module):
-    """The loop's state of stepped runs: carries, what was found so far, and whether something broke."""
+    """State of the loop of stepped runs.
+
+    Attributes:
+        carry: That of the method.
+        impacts, filled, states: As in `Trajectory`.
+        broken: True if an impact is not finite.
+        lost: True if an impact came after `max_impacts` were recorded.
+    """
 
     carry: Any
     impacts: Impact
     filled: Int[AnyArray, "lane"]
     states: State
     broken: Array
+    lost: Array
 
 
 def _recording(room: Room, carry: Any, like: Float[AnyArray, "lane"]) -> _Recording:
@@ -39,7 +47,8 @@ def _recording(room: Room, carry: Any, like: Float[AnyArray, "lane"]) -> _Record
     impacts = Impact(n=n, t=x, side=n, v_in=x, v_out=x, depth=x, duration=x, work=x)
     x, n = blank(room.periods)
     k = jnp.broadcast_to(jnp.arange(1, room.periods + 1, dtype=jnp.int32), n.shape)
-    return _Recording(carry, impacts, whole, State(x, x, x, k, n), jnp.zeros(lanes, bool))
+    no = jnp.zeros(lanes, bool)
+    return _Recording(carry, impacts, whole, State(x, x, x, k, n), no, no)
 
 
 def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) -> Any:
@@ -64,22 +73,23 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, r
     def runs(r: _Recording):
         m = r.carry
         inside = (m.mode != 0) & (m.onset_n < periods)
-        full = (r.filled >= max_impacts) & (m.mode != 0)
-        return ~r.broken & ~full & ((m.n < periods) | (inside & (m.n < periods + HELD)))
+        return ~r.broken & ~r.lost & ((m.n < periods) | (inside & (m.n < periods + HELD)))
 
     def advance(r: _Recording) -> _Recording:
         going = runs(r)
         carry, outcome, ended = jax.vmap(partial(method.step, recorded=True))(pair, wall, r.carry)
         impact = outcome.impact
         real = going & ended & (impact.n < periods)
+        recorded = real & (r.filled < max_impacts)
         strobe = going & (carry.n > r.carry.n) & (carry.n <= periods)
         ball = jax.vmap(method.ball)(pair, carry)
         return _Recording(
             carry=choose(going, carry, r.carry),
-            impacts=_write(r.impacts, impact, r.filled, real),
-            filled=r.filled + real.astype(jnp.int32),
+            impacts=_write(r.impacts, impact, r.filled, recorded),
+            filled=r.filled + recorded.astype(jnp.int32),
             states=_write(r.states, ball, carry.n - 1, strobe),
             broken=r.broken | (real & ~jnp.isfinite(impact.v_out)),
+            lost=r.lost | (real & ~recorded),
         )
 
     def chunk(r: _Recording) -> _Recording:
@@ -97,7 +107,8 @@ def stepped_run(asked: Asked, method: Method, pair: ImpactPair, u0, v0, t0, *, r
         end, _ = lax.scan(if_needed, start, jnp.arange(room.chunks, dtype=jnp.int32))
     m = end.carry
     held = (m.mode != 0) & (m.n >= periods) & (m.onset_n < periods)
-    short = runs(end) | ((end.filled >= max_impacts) & (m.n < periods))
-    status = jnp.where(held, Status.PERMANENT_CONTACT, jnp.where(end.filled == 0, Status.NO_IMPACT, Status.OK))
-    status = jnp.where(end.broken, Status.NONFINITE, jnp.where(short, Status.EVENT_BUDGET, status))
+    status = jnp.where(no_impact(end.filled, end.states, periods), Status.NO_IMPACT, Status.OK)
+    status = jnp.where(held, Status.PERMANENT_CONTACT, status)
+    status = jnp.where(runs(end) | end.lost, Status.EVENT_BUDGET, status)
+    status = jnp.where(end.broken, Status.NONFINITE, status)
     return Trajectory(end.impacts, end.filled, end.states, status.astype(jnp.int32))

@@ -20,6 +20,7 @@ from vijax.model.choices import MethodName, SolverName
 from vijax.model.excitation import Excitation, check_excitation
 from vijax.model.membrane import Laws, Linear, check_restitution, of_pair
 from vijax.model.pair import ImpactPair, check_pair, check_start
+from vijax.model.records import Status
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.derivatives import differentiable_rows
@@ -30,6 +31,9 @@ _IMPACT, _STATE = 56, 32  # bytes of a record: what a run asks of memory is told
 _TILES = (1, 8, 64, 512, 4096)
 # The records of so few starts have room for so many periods at least: one program serves all shorter runs.
 _FEW, _ROOMS = 64, (64, 512)
+# Impacts a period that `complete_trajectory` records at most. A ball that chatters on a rigid wall has about 40 of
+# them; more room costs 56 bytes an impact.
+_MOST_IMPACTS = 256
 
 _exact_traced = differentiable_rows(exact_run, tuple(size for size in _TILES if size <= _FEW))
 
@@ -110,6 +114,32 @@ def trajectory(
     checks.fits(("periods", "max_impacts"), count * (room * _IMPACT + periods * _STATE), "impacts and states")
     found, shape = _followed(told, pair, (u0, v0, t0), periods, max_impacts)
     return _cut(found, shape, periods, room)
+
+
+def complete_trajectory(
+    pair: ImpactPair,
+    u0: ArrayLike,
+    v0: ArrayLike,
+    periods: int,
+    t0: ArrayLike = 0.0,
+    *,
+    method: MethodName | Method = "exact",
+    excitation: Excitation | None = None,
+) -> Trajectory:
+    """Follow starts as `trajectory` does, and again with more room until every impact is recorded.
+
+    Args:
+        pair, u0, v0, periods, t0, method, excitation: As in `trajectory`; numbers, not traced.
+
+    Returns:
+        The `Trajectory`; status EVENT_BUDGET only beyond `_MOST_IMPACTS` impacts a period.
+    """
+    run = trajectory(pair, u0, v0, periods, t0, method=method, excitation=excitation)
+    room = _most(periods)
+    while room < _MOST_IMPACTS * periods and (np.asarray(run.status) == Status.EVENT_BUDGET).any():
+        room = min(4 * room, _MOST_IMPACTS * periods)
+        run = trajectory(pair, u0, v0, periods, t0, max_impacts=room, method=method, excitation=excitation)
+    return run
 
 
 def _followed(

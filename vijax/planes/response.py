@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from vijax.batch.trajectory import trajectory
+from vijax.batch.trajectory import complete_trajectory
 from vijax.model import energy
 from vijax.model.choices import Walls
 from vijax.model.device import Harvester, depth_unit, one_device
@@ -156,7 +156,7 @@ def _fly(asked: _Asked) -> _Hits:
     pair, device = asked.device.pair(asked.wall), asked.device
     across, fast = start_places(asked.realisations)
     start = across * float(pair.d), 2 * SPEED * fast
-    run = trajectory(pair, *start, asked.transient + asked.periods, excitation=asked.excitation)
+    run = complete_trajectory(pair, *start, asked.transient + asked.periods, excitation=asked.excitation)
     impacts, states, status = (jax.tree.map(np.asarray, part) for part in (run.impacts, run.states, run.status))
     # Of a realisation that came to no end what it saw until then says nothing.
     real = (np.arange(impacts.n.shape[1]) < np.asarray(run.filled)[:, None]) & ~np.isin(status, _FAILED)[:, None]
