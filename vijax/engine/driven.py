@@ -20,7 +20,7 @@ from vijax.engine.driven_events import NONE, Ahead, Decision, DrivenCarry, StepE
 from vijax.engine.driven_rigid import DrivenWall, Rebound, hit, kept, rebound, walls_of, watched
 from vijax.engine.forcing import REACHED, Draws, Forcing
 from vijax.engine.method import HELD, ImpactOutcome, Method, decided, finished
-from vijax.engine.taylor import Oscillator, Push, Rates
+from vijax.engine.taylor import Oscillator, Push
 from vijax.model.pair import ImpactPair
 from vijax.model.records import State
 from vijax.model.sides import Sides, at, named
@@ -157,8 +157,8 @@ class Driven(Method[DrivenCarry]):
         clock = share(self._clock(m, landing.length, to_knot, to_period, choice.goes))
         work, tangent = m.work, m.tangent
         if work is not None:
-            done = _worked(push.derivatives(), later.derivatives(), now, end, s, landing.delay)
-            work = work + jnp.where(choice.goes & sprung, done, 0.0)
+            square = taylor.squared_rate(spring, (push, later), (now, end), s, landing.delay)
+            work = work + jnp.where(choice.goes & sprung, spring.mu * square, 0.0)
         if tangent is not None:
             carried = _spread(spring, push, later, m, s, landing.delay, _kick(walls, side, landing))
             tangent = tuple(jnp.where(choice.goes, new, old) for new, old in zip(carried, tangent, strict=True))
@@ -168,7 +168,7 @@ class Driven(Method[DrivenCarry]):
             m = hit(m, met, landing, (clock.t, clock.n), present(rests))
             side, ended = jnp.where(met.bounces, landing.toward, side), ended | met.bounces
         after = State(side * half, landing.z, clock.t, clock.n, jnp.zeros_like(m.mode))
-        outcome = finished(m, side, after, _given(m, after.v, m.work), m.tangent)
+        outcome = finished(m, side, after, jnp.zeros_like(half) if m.work is None else m.work, m.tangent)
         return _gone_on(m, choice, landing, clock, met), outcome, ended
 
     def ball(self, pair: ImpactPair, m: DrivenCarry) -> State:
@@ -252,31 +252,6 @@ def _kick(walls: DrivenWall | Sides, side: Scalar, landing: StepEnd) -> Scalar:
     return jnp.where(landing.crossed, -onset, jnp.where(landing.exits, leaving, 0.0))
 
 
-def _worked(
-    push: tuple[Scalar, ...], later: tuple[Scalar, ...], now: Rates, end: Rates, s: Scalar, delay: Scalar
-) -> Scalar:
-    """Integrate the push times the velocity over a step and the delay after it.
-
-    By the two-point formula that takes three derivatives at both ends, off by 4e-8 of the integrand within `REACH`.
-    """
-    begins, ends = _power(push, now), _power(later, end)
-    even = s / 2 * (begins[0] + ends[0]) + s**3 / 84 * (begins[2] + ends[2])
-    odd = 3 * s**2 / 28 * (begins[1] - ends[1]) + s**4 / 1680 * (begins[3] - ends[3])
-    rest = delay * (ends[0] + delay * (ends[1] / 2 + delay * (ends[2] / 6 + delay * ends[3] / 24)))
-    return even + odd + rest
-
-
-def _power(push: tuple[Scalar, ...], of: Rates) -> tuple[Scalar, ...]:
-    """Compute the push times the velocity and its three derivatives."""
-    f0, f1, f2, f3 = push
-    return (
-        f0 * of.z,
-        f1 * of.z + f0 * of.a,
-        f2 * of.z + 2 * f1 * of.a + f0 * of.j,
-        f3 * of.z + 3 * (f2 * of.a + f1 * of.j) + f0 * of.snap,
-    )
-
-
 def _spread(
     spring: Oscillator, push: Push, later: Push, m: DrivenCarry, s: Scalar, delay: Scalar, kick: Scalar
 ) -> tuple[Scalar, ...]:
@@ -289,8 +264,3 @@ def _spread(
     a, b, c, d = present(m.tangent)
     (_, (p, r)), (_, (q, t)) = (jax.jvp(carried, (m.x, m.z), column) for column in ((a, c), (b, d)))
     return p, q, r + kick * p, t + kick * q
-
-
-def _given(m: DrivenCarry, v_out: Scalar, work: Scalar | None) -> Scalar:
-    """Compute what the membrane got: what the ball lost, and what the push gave meanwhile."""
-    return jnp.zeros_like(v_out) if work is None else 0.5 * (m.v_in * m.v_in - v_out * v_out) + work

@@ -81,12 +81,14 @@ class Rebound(NamedTuple):
         bounces: It is thrown back at once.
         sticks: It stays, as what is left of its bounces lasts no time.
         depth: How deep a membrane that it is lent would be pressed.
+        work: Energy that the wall takes.
         tangent: Tangent map of the impact, row by row; 0 where it sticks, as the ball forgets how it came.
     """
 
     bounces: Flag
     sticks: Flag
     depth: Scalar
+    work: Scalar
     tangent: tuple[Scalar, ...]
 
 
@@ -122,7 +124,8 @@ def rebound(
     x = jnp.where(bounces, toward * 0.5 * pair.d, landing.x)
     z = jnp.where(bounces, -toward * out, jnp.where(sticks, 0.0, landing.z))
     landing = landing._replace(x=x, z=z, crossed=landing.crossed & ~bounces)
-    return Rebound(bounces, sticks, deep, tangent), landing
+    work = energy.membrane_work_rigid(v_in, r)
+    return Rebound(bounces, sticks, deep, work, tangent), landing
 
 
 def kept(landing: StepEnd, choice: Decision, rests: Flag) -> StepEnd:
@@ -154,5 +157,5 @@ def hit(m: DrivenCarry, met: Rebound, landing: StepEnd, when: tuple[Scalar, Any]
         onset_n=jnp.where(meets, n, m.onset_n),
         v_in=jnp.where(meets, landing.there.z, m.v_in),
         depth=jnp.where(meets, met.depth, m.depth),
-        work=None if m.work is None else jnp.where(meets, 0.0, m.work),
+        work=None if m.work is None else jnp.where(meets, met.work, m.work),
     )
