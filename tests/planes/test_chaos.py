@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from vijax.batch.trajectory import trajectory
+from vijax.model.pair import impact_pair
 from vijax.planes import sweep
+from vijax.planes.basins import spread
 from vijax.planes.chaos import lyapunov, survival
+from vijax.planes.sweep_settings import SPEED
 
 
 @pytest.mark.parametrize(
@@ -78,3 +82,28 @@ def test_an_attractor_survives():
     found = survival(d=0.12, kappa=400.0, r=0.5, wall="rigid", starts=20, periods=80)
     assert np.all(found.survival == 1)
     assert np.isinf(found.lifetime)
+
+
+# Wide gaps: the ball often drifts for hundreds of periods without an impact, and chaos resumes.
+INTERMITTENT = [(3.55, 11.1, 0.32), (9.063, 29.9, 0.5), (5.318, 11.2, 0.29), (0.893, 6.7, 0.43)]
+
+
+@pytest.mark.parametrize(("d", "kappa", "r"), INTERMITTENT)
+def test_the_share_of_survivors_never_rises(d, kappa, r):
+    found = survival(d=d, kappa=kappa, r=r, starts=128, periods=1600)
+    assert (np.diff(found.survival) <= 0).all()
+    assert found.survival[0] > 0.9
+
+
+def test_survivors_are_those_of_trajectories():
+    """Chaos that ends on an orbit of period 3, after some 2000 periods; a motion is seen to be chaotic for 200 more."""
+    d, kappa, r, starts, periods, ahead = 7.129, 23.5, 0.93, 160, 2000, 300
+    found = survival(d=d, kappa=kappa, r=r, starts=starts, periods=periods)
+    across, fast = (x.values for x in spread(starts, None))
+    run = trajectory(impact_pair(d, kappa, r), across * d, 2 * SPEED * fast, periods + ahead, max_impacts=periods)
+    u, v = np.asarray(run.states.u), np.asarray(run.states.v)
+    away = np.abs(u[:, 6:] - u[:, :-6]) + np.abs(v[:, 6:] - v[:, :-6]) > 0.1
+    ends = away.shape[1] - away[:, ::-1].argmax(axis=1)
+    noise = 3 * np.sqrt(0.5 / starts)  # two samples: chaos parts the engines
+    for after, share in zip(found.after.values, found.survival.values, strict=True):
+        assert (ends > after + 200).mean() - noise < share < (ends > after).mean() + noise

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import accumulate
+from operator import or_
 from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
@@ -11,6 +13,7 @@ from vijax.model.device import Harvester
 from vijax.planes import sweep
 from vijax.planes.axes import Axes, Parameters
 from vijax.planes.basins import check_starts, described, plan_fractions, spread, started
+from vijax.planes.dataset import SweepPlan
 from vijax.planes.sweep_settings import MOST_STARTS, SPEED, STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -23,14 +26,19 @@ __all__ = ["lyapunov", "survival"]
 # Forcing periods in which the tangent map turns from the identity to the most unstable direction. What it grows by
 # meanwhile is no stretching along the motion: only what it grows by in a longer window beyond that is.
 _WARM_UP = 100
-# Survival looks at eight instants: fewer tell less of the exponential law, more cost a run each.
+# Survival is measured at eight instants. Fewer resolve the exponential law less well, more cost a run each.
 _INSTANTS = 8
-# There every motion is watched for so many forcing periods, and is chaotic if its tangent map grows by so many powers
-# of e meanwhile: chaos of an exponent below 7/200 = 0.035 is not counted.
-_WATCHED, _GROWN = 200, 7.0
-# With fewer impacts a forcing period than this the ball creeps towards motions that touch no wall, which is no chaos.
-_RARE = 0.1
-_SURVIVAL = ("part of all starts still chaotic", "mean lifetime of chaos, forcing periods", "its standard error")
+# At an instant a motion is chaotic if its tangent map grows by this power of e in a window of so many forcing periods.
+# Chaos of an exponent below 7/200 = 0.035 is not counted.
+_WINDOW, _GROWTH = 200, 7.0
+# A ball creeps towards motions without impacts, which is not chaos, if both its impacts per forcing period and their
+# product with d, the distance that it travels in a period, are below these. In a wide gap chaos has few impacts too.
+_RARE, _SLOW = 0.1, 0.025
+_SURVIVAL = (
+    "share of all starts whose chaos has not ended",
+    "mean lifetime of chaos, forcing periods",
+    "its standard error",
+)
 _SPREADS = ("its standard error", "the lowest of the ensemble", "the highest of the ensemble")
 # Spread of an ensemble around its start, in parts of the start's displacement and of the unit of velocity. A wider one
 # reaches more easily into another basin.
@@ -118,18 +126,21 @@ def survival(
 ) -> "xr.Dataset":
     """Measure how long chaos lasts: chaos that ends is a transient, however much it looked like an attractor.
 
-    At eight instants up to `periods` every motion is watched for 200 periods: it is chaotic still if its tangent map
-    grows by e^7 and it meets a wall in one period of ten. What creeps towards motions that touch no wall meets ever
-    fewer, without an end; chaos of an exponent below 0.035 is not counted. Of those chaotic at one instant, the part
-    that are so at the next gives the mean lifetime by an exponential law.
+    The chaos of a motion has ended at an instant if the motion is chaotic at no later one: intermittent chaos pauses
+    and resumes. So the share of survivors never rises. There are eight instants up to `periods`, and one longer window
+    after the last of them. A motion is chaotic at an instant if, in the 200 periods that follow, its tangent map grows
+    by e^7 and the ball does not creep. A ball creeps, towards motions without impacts, if it has less than one impact
+    in ten periods and travels less than 0.025 units of length in a period. Chaos of an exponent below 0.035 is not
+    counted. The share of the motions that survive from one instant to the next gives the mean lifetime, by an
+    exponential law.
 
     Args:
         starts, speed, seed, axes: As in `basin_fractions`.
-        periods: Forcing periods to look, at least 8.
+        periods: The last instant, in forcing periods, at least 8.
         wall, device, progress: As in `sweep`.
 
     Returns:
-        Over the axes, `survival` over `after` [forcing periods], the part of all starts that are still chaotic;
+        Over the axes, `survival` over `after` [forcing periods], the share of all starts whose chaos has not ended;
         `lifetime` [forcing periods] and `lifetime_stderr`, infinite where no chaos ended, NaN where there was none.
 
     Raises:
@@ -141,27 +152,39 @@ def survival(
 
     step = checks.whole("periods", periods, _INSTANTS) // _INSTANTS
     after = step * np.arange(1, _INSTANTS + 1)
-    settings = SweepSettings(periods=_WATCHED, wall=wall)
-    planned = plan_fractions(axes, device, settings, starts=starts, speed=speed, seed=seed)
-    alive = []
-    for done, instant in enumerate(after):
-        then = replace(settings, until="window", transient=int(instant))
-        watched = replace(planned, settings=then, outputs=("impacts_per_period", "lyapunov", "status"))
-        found = sweep.run(watched, _share_of(progress, done, _INSTANTS))
-        alive.append((found["lyapunov"] * _WATCHED > _GROWN) & (found["impacts_per_period"] > _RARE))
-    chaotic = xr.concat(alive, xr.Variable("after", after, described("forcing periods")))
-    before, still = chaotic.isel(after=slice(None, -1)).values, chaotic.isel(after=slice(1, None)).values
-    result = _lifetime(before.sum((0, -1)), (before & still).sum((0, -1)), step)
-    cells = [dim for dim in chaotic.dims if dim not in ("after", "start")]
-    variables = {"survival": chaotic.mean("start").transpose(..., "after")}
+    planned = plan_fractions(
+        axes, device, SweepSettings(periods=_WINDOW, wall=wall), starts=starts, speed=speed, seed=seed
+    )
+    # The window after the last instant is longer: a motion whose chaos pauses there has time to resume it.
+    lengths = [_WINDOW] * _INSTANTS + [max(step, _WINDOW)]
+    instants = [*after.tolist(), int(after[-1])]
+    chaotic = []
+    for done, (instant, length) in enumerate(zip(instants, lengths, strict=True)):
+        settings = replace(planned.settings, until="window", transient=instant, periods=length)
+        watched = replace(planned, settings=settings, outputs=("impacts_per_period", "lyapunov", "status"))
+        found = sweep.run(watched, _share_of(progress, done, len(instants)))
+        chaotic.append((found["lyapunov"] * length > _GROWTH) & ~_creeps(found, planned))
+    # Chaotic at an instant or at any later one.
+    latest = list(accumulate(reversed(chaotic), or_))[:0:-1]
+    alive = xr.concat(latest, xr.Variable("after", after, described("forcing periods")))
+    before, still = alive.isel(after=slice(None, -1)).values, alive.isel(after=slice(1, None)).values
+    result = _lifetime(before.sum((0, -1)), still.sum((0, -1)), step)
+    cells = [dim for dim in alive.dims if dim not in ("after", "start")]
+    variables = {"survival": alive.mean("start").transpose(..., "after")}
     variables |= {name: xr.DataArray(values, dims=cells) for name, values in result.items()}
     for values, text in zip(variables.values(), _SURVIVAL, strict=True):
         values.attrs = described(text)
     return xr.Dataset(variables, attrs=found.attrs | {"title": "Survival of chaos"})
 
 
+def _creeps(found: "xr.Dataset", planned: SweepPlan) -> "xr.DataArray":
+    """Return where a ball creeps towards motions without impacts."""
+    rate = found["impacts_per_period"]
+    return (rate <= _RARE) & (rate * planned.cells.quantities["d"] <= _SLOW)
+
+
 def _lifetime(before: np.ndarray, still: np.ndarray, step: int) -> dict[str, np.ndarray]:
-    """Estimate the mean lifetime and its standard error from how many of the chaotic motions are so a step later."""
+    """Estimate the mean lifetime and its standard error from the numbers of survivors before and after a step."""
     with np.errstate(divide="ignore", invalid="ignore"):
         part = still / before
         rate = abs(np.log(part)) / step
