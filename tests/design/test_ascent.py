@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vijax.design.ascent import Box, Climb, Look, ascend
+from vijax.design.ascent import Box, Climb, Look, ascend, converged
 
 LOOKS = 60
 BOX = Box(jnp.full((1, 2), -2.0), jnp.full((1, 2), 2.0), 0.3)
@@ -89,3 +89,10 @@ def test_an_edge_towards_which_only_the_barrier_pushes_is_left_again():
     end = climb(lambda z: -z[0] - z[1] ** 2, lambda z: z[:1], starts, exists=lambda z: z[0] < 0.02)
     np.testing.assert_allclose(end.z, np.zeros((2, 2)), atol=1e-6)
     assert (end.z[:, 0] > 0).all()
+
+
+def test_a_maximum_of_the_barrier_that_rounding_hides_does_not_end_the_ascent():
+    # Values are right to 1.5e-8: near the maximum of a barrier no trial is seen to be higher.
+    end = climb(lambda z: 1e8 - 3 * z[0] - z[1] ** 2, lambda z: z[:1], [[0.01, 0.01], [0.9, -0.3], [1.7, 0.2]])
+    np.testing.assert_allclose(end.z[:, 0], np.zeros(3), atol=1e-7)
+    assert bool(converged(end).all())

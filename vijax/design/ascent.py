@@ -22,6 +22,7 @@ from vijax.runtime.xla import once
 _CONVERGED = 1e-6  # At this weight of the barrier a maximum is right to six digits.
 _ARRIVED = 1e-8  # A step this short is the last.
 _STUCK = 1e-9  # So is a trial that is refused this near.
+_ROUNDED = 1e-3  # A step that gains so small a part of the barrier's weight, and is refused all the same, meets rounding.
 
 
 class Look(NamedTuple):
@@ -145,7 +146,7 @@ def _advance(task: _Task, c: Climb) -> Climb:
     trial = c.z + jnp.where(c.going, c.pace, 0.0)[:, None] * c.step
     seen = _view(task, trial, c.z, c.seen.memory)
     better = c.going & seen.there & (_higher(c, seen) | (c.iteration == 0))
-    turns = _turns(task, c, seen)
+    turns = _turns(task, c, seen, better)
     falls = turns | (better & (c.pace == 1) & _little(c))
     weight = jnp.where(falls, _lighter(task.settings, c.weight), c.weight)
     # Curvature compares gradients of one function: that before, under the new weight; none across the border, nor where
@@ -193,17 +194,24 @@ def _view(task: _Task, z, near, memory) -> Look:
 
 
 def _little(c: Climb) -> Bool[Array, "start"]:
-    """Say which have converged for the weight of their barrier: the step promises less than the barrier weighs."""
-    promised = c.pace * (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
-    return c.going & _inside(c.seen) & (promised < c.weight)
+    """Return which starts have converged for the weight of their barrier: the step promises less than it weighs."""
+    return c.going & _inside(c.seen) & (c.pace * _promised(c) < c.weight)
 
 
-def _turns(task: _Task, c: Climb, trial: Look) -> Bool[Array, "start"]:
-    """Say which may have to turn back: converged at an edge beyond which there is no point.
+def _promised(c: Climb) -> Float[Array, "start"]:
+    """Compute what the whole step gains by the slope."""
+    return (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
 
-    The barrier may have pushed them there; with less of it the way may lead elsewhere.
+
+def _turns(task: _Task, c: Climb, trial: Look, better: Bool[Array, "start"]) -> Bool[Array, "start"]:
+    """Return which starts have converged for the weight of their barrier although their trial is refused.
+
+    There are two cases. Beyond an edge there is no point: the barrier may have pushed the start there, and with less of
+    it the way may lead elsewhere. Or even the whole step gains next to nothing: rounding decides whether the trial is
+    higher, and halving the step would end the ascent at the maximum of this barrier.
     """
-    return _little(c) & ~trial.there & (c.weight > task.settings.last_barrier)
+    rounded = _promised(c) < _ROUNDED * c.weight
+    return ~better & _little(c) & (~trial.there | rounded) & (c.weight > task.settings.last_barrier)
 
 
 def _forgotten(task: _Task, z) -> Any:
