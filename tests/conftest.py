@@ -6,31 +6,33 @@ import math
 import os
 from pathlib import Path
 
-# Before JAX starts, here and in the scripts that tests start: most of the time is spent on compiling, and so compiled a
-# program takes a third of it. What XLA_FLAGS says comes last and wins.
-os.environ["XLA_FLAGS"] = " ".join(
-    (
-        "--xla_backend_optimization_level=0",
-        "--xla_cpu_use_fusion_emitters=false",
-        # Workers keep the cores busy already; cutting a program into parts to compile them side by side costs a tenth.
-        "--xla_cpu_parallel_codegen_split_count=1",
-        # The first as always (`runtime.xla`); the others walk a program again and again, to check it or to look for
-        # what ours do not contain, and no test waits for what they find. Not reshape-mover, too: without it and algsimp
-        # a loop that draws by `jax.random` writes where it should not.
-        "--xla_disable_hlo_passes=cpu-parallel-task-assigner,hlo-verifier,algsimp,simplify-while-loops,"
-        "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-conditional,"
-        "tree_reduction_rewriter,zero_sized_hlo_elimination",
-        os.environ.get("XLA_FLAGS", ""),
-    )
-)
-
 import jax
 import pytest
 from hypothesis import settings
 
 import vijax  # noqa: F401  switches x64 on before a test makes its first array
 from tests import seconds
+from tests.xla_flags import known_flags
 from vijax.runtime.garbage import SELDOM
+
+# XLA reads its flags when JAX first computes, here and in the scripts that tests start. Tests mostly compile, and with
+# these flags a program compiles in a third of the time. Flags that XLA_FLAGS holds already come last and win.
+_FLAGS = (
+    "--xla_backend_optimization_level=0",
+    "--xla_cpu_use_fusion_emitters=false",
+    # Workers keep the cores busy already; cutting a program into parts to compile them side by side costs a tenth.
+    "--xla_cpu_parallel_codegen_split_count=1",
+    # The first as always (`runtime.xla`); the others walk a program again and again, to check it or to look for
+    # what ours do not contain, and no test waits for what they find. Not reshape-mover, too: without it and algsimp
+    # a loop that draws by `jax.random` writes where it should not.
+    "--xla_disable_hlo_passes=cpu-parallel-task-assigner,hlo-verifier,algsimp,simplify-while-loops,"
+    "while-loop-invariant-code-motion,while-loop-constant-sinking,simplify-conditional,"
+    "tree_reduction_rewriter,zero_sized_hlo_elimination",
+)
+# A process that starts another with these flags has tried them: the workers of pytest-xdist inherit both variables.
+if "VIJAX_TEST_FLAGS_TRIED" not in os.environ:
+    os.environ["XLA_FLAGS"] = " ".join((*known_flags(_FLAGS), os.environ.get("XLA_FLAGS", "")))
+    os.environ["VIJAX_TEST_FLAGS_TRIED"] = "1"
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 gc.set_threshold(*SELDOM)  # tests trace outside of public functions, too
