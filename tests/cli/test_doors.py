@@ -1,5 +1,6 @@
 """Doors: a sample of the malformed calls and command lines that `benchmarks/doors.py` tries, and what runs may cost."""
 
+import os
 import sys
 from contextlib import nullcontext
 from functools import partial
@@ -168,8 +169,9 @@ def test_a_run_is_not_lost_with_its_pace(kept, watched):
     assert (kept / "closed").is_file()
 
 
-def test_a_pace_that_cannot_be_read_is_none(kept):
-    (kept / "paces.json").write_text("{")
+@pytest.mark.parametrize("spoil", [lambda path: path.write_text("{"), os.mkfifo])
+def test_a_pace_that_cannot_be_read_is_none(kept, spoil):
+    spoil(kept / "paces.json")
     assert estimate.of(planned(100)).seconds == pytest.approx(2e-7 * 400 * 10**4)
 
 

@@ -1,9 +1,12 @@
 """A program is traced once: kept with what it depends on, read back bit for bit, traced anew where that fails."""
 
 import ast
+import hashlib
+import os
 import pickle
 import re
 import shutil
+import stat
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -197,6 +200,80 @@ def test_a_damaged_file_is_written_anew(folder, damage):
     assert called()[1] == 1
     assert called()[1] == 0
     assert [one.name for one in folder.iterdir()] == [path.name]
+
+
+class Payload:
+    """An object that notes that it was unpickled."""
+
+    def __reduce__(self):
+        return RAN.append, (1,)
+
+
+RAN: list[int] = []
+
+
+def sign(path, body):
+    """The digest that a reader expects before the content of a file."""
+    return export_cache._signed(path, body)
+
+
+def pickled(path, _):
+    content = pickle.dumps(Payload())
+    return [hashlib.sha256(content).digest() + content, sign(path, content) + content]
+
+
+def malformed(path, whole):
+    """Files with the right digest whose program or structure cannot be rebuilt."""
+    body, size = whole[32:], export_cache._LENGTH
+    program = body[size + int.from_bytes(body[:size], "little") :]
+    structures = (
+        b'["os:system"]',
+        b'["vijax.runtime.files:os"]',
+        b'["vijax.nowhere:State"]',
+        b'"leaf',
+        b"[[]]",
+        b"\xff",
+    )
+    bodies = [len(text).to_bytes(size, "little") + text + program for text in structures]
+    return [sign(path, one) + one for one in (*bodies, body[:99], bytes(99), b"")]
+
+
+@pytest.mark.parametrize("contents", [pickled, malformed])
+def test_a_file_that_is_no_program_is_written_anew_and_runs_nothing(folder, contents):
+    called()
+    (path,) = folder.iterdir()
+    whole = path.read_bytes()
+    for content in contents(path, whole):
+        path.write_bytes(content)
+        assert called()[1] == 1
+        assert called()[1] == 0
+    assert not RAN
+
+
+def test_the_file_of_another_program_is_written_anew(folder):
+    called()
+    (wave,) = folder.iterdir()
+    export_cache.TracedProgram(lambda x: (x, x + 1), "pair")(X)
+    (pair,) = set(folder.iterdir()) - {wave}
+    pair.write_bytes(wave.read_bytes())
+    kept, after = export_cache.TracedProgram(lambda x: (x, x + 1), "pair")(X)
+    np.testing.assert_array_equal(after, X + 1)
+    np.testing.assert_array_equal(kept, X)
+
+
+def test_a_pipe_in_place_of_a_file_does_not_block(folder):
+    called()
+    (path,) = folder.iterdir()
+    path.unlink()
+    os.mkfifo(path)
+    assert called()[1] == 1
+    assert called()[1] == 0
+
+
+def test_a_file_is_for_this_user_alone(folder):
+    called()
+    (path,) = folder.iterdir()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
 def test_where_nothing_can_be_kept_it_is_traced_every_time(tmp_path, monkeypatch):

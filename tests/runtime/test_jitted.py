@@ -33,7 +33,9 @@ def wave(x, *, factor=1.0):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_folder, "kept", lambda: tmp_path)
-    monkeypatch.setattr(wave, "__module__", "vijax.runtime.programs")
+    for one in (wave, Wave):  # as if both were of the package: programs of no others are kept
+        monkeypatch.setattr(one, "__module__", "vijax.runtime.programs")
+        monkeypatch.setattr(programs, one.__qualname__, one, raising=False)
     traced.clear()
     return tmp_path
 

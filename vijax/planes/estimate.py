@@ -128,11 +128,12 @@ def _file() -> Path | None:
 
 
 def _paces() -> dict[str, float]:
-    """Read what was kept; nothing of a file that is missing or broken."""
+    """Return the paces that were kept; none if the file is missing, not trusted or broken."""
     file = _file()
+    content = None if file is None else cache_folder.read(file)
     try:
-        kept = {} if file is None else json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        kept = {} if content is None else json.loads(content)
+    except ValueError:
         return {}
     numbers = kept.items() if isinstance(kept, dict) else ()
     return {kind: pace for kind, pace in numbers if isinstance(pace, float) and 0 < pace < math.inf}

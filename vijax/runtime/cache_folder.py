@@ -1,33 +1,56 @@
-"""Where traced and compiled programs are kept between processes: a folder of the user's cache, bounded in size.
+"""The folder in which traced and compiled programs are kept between processes, and what makes it trusted.
 
-JAX's own settings win: a folder named by `jax_compilation_cache_dir` (or JAX_COMPILATION_CACHE_DIR) is used as it is,
-and with `jax_enable_compilation_cache` off nothing is kept.
+Settings of JAX win: a folder given by `jax_compilation_cache_dir` (or JAX_COMPILATION_CACHE_DIR) replaces the folder in
+the user's cache, and with `jax_enable_compilation_cache` off nothing is kept.
+
+A program that is read is run. A folder or a file is therefore trusted only if this user or root owns it and nobody else
+can write to it.
 """
 
+import logging
 import os
+import re
+import stat
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+_LOG = logging.getLogger(__name__)
+
 MOST_BYTES = 2 * 1024**3  # a plane's program takes some two megabytes, with its traced form
+TRACED = "traced-"
+# Files of JAX are MODULE-DIGEST-cache and MODULE-DIGEST-atime; a traced program is traced-DIGEST, with a dot and more
+# while it is written.
+_PROGRAM = re.compile(rf".+-[0-9a-f]{{64}}-(cache|atime)|\.?{TRACED}[0-9a-f]{{64}}(\..+)?")
 _OTHERS_WRITE = 0o022
+_OTHERS_ENTER = 0o011
 
 
 @cache
 def keep_programs() -> None:
-    """Keep programs in the user's folder from now on, unless JAX was told of another, or to keep none.
+    """Keep programs in the user's folder from now on, unless a setting of JAX names a folder, or keeps none.
 
-    JAX knows one folder: other programs of this process are kept there too. Where the folder cannot be made, or where
-    somebody else could put programs into it, none are kept. The folder is cut to `MOST_BYTES` here, once a process.
+    JAX knows one folder: other programs of this process are kept there too. None are kept if the folder cannot be made
+    or is not trusted. The folder is cut to `MOST_BYTES` here, once a process.
     """
-    asked = jax.config.values
-    if asked["jax_compilation_cache_dir"] or not asked["jax_enable_compilation_cache"]:
+    settings = jax.config.values
+    if settings["jax_compilation_cache_dir"] or not settings["jax_enable_compilation_cache"]:
         return
     folder = _folder()
-    if folder is None or not _private(folder):
+    if folder is None or not is_trusted(folder):
+        return
+    programs = _programs(folder)
+    distrusted = next((path for path, about in programs if not _is_trusted_file(about, folder)), None)
+    if distrusted is not None:
+        _LOG.warning(
+            "%s must hold regular files that this user owns and nobody else can write; got %s; no programs are kept: "
+            "remove it",
+            folder,
+            distrusted.name,
+        )
         return
     trim(folder, MOST_BYTES)
     jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -39,44 +62,109 @@ def keep_programs() -> None:
 
 
 def kept() -> Path | None:
-    """Name the folder in which JAX keeps compiled programs, if it does, on a disk."""
-    asked = jax.config.values
-    folder = asked["jax_compilation_cache_dir"] if asked["jax_enable_compilation_cache"] else None
-    return Path(folder) if folder and "://" not in folder else None
+    """Return the folder in which JAX keeps compiled programs; None if it keeps none, not on a disk, or not trusted."""
+    settings = jax.config.values
+    folder = settings["jax_compilation_cache_dir"] if settings["jax_enable_compilation_cache"] else None
+    return Path(folder) if folder and "://" not in folder and _is_usable(folder) else None
+
+
+@lru_cache(maxsize=32)
+def _is_usable(folder: str) -> bool:
+    """Return True if a folder is trusted; warn once if it is there and is not."""
+    path = Path(folder)
+    trusted = is_trusted(path)
+    if not trusted and path.is_dir():
+        _LOG.warning(
+            "%s must be a folder that this user owns and nobody else can write, so vijax neither reads nor keeps "
+            "traced programs there, and JAX still runs compiled programs from there; chmod go-w it, or set "
+            "JAX_COMPILATION_CACHE_DIR to another",
+            path,
+        )
+    return trusted
+
+
+def is_trusted(folder: Path) -> bool:
+    """Make a folder if it is missing, for this user alone, and return True if nobody else can put files there."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        link, target = folder.lstat(), folder.stat()
+    except OSError:
+        return False
+    return _is_ours(link) and _is_ours(target) and not target.st_mode & _OTHERS_WRITE
+
+
+def read(path: Path) -> bytes | None:
+    """Return the content of a file of the folder; None if it cannot be read or is not trusted.
+
+    A link is not followed, and a pipe does not block.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb") as file:
+            return file.read() if _is_trusted_file(os.fstat(descriptor), path.parent) else None
+    except OSError:
+        return None
 
 
 def trim(folder: Path, most: int) -> None:
-    """Delete the files of a folder that were used longest ago, until so many bytes are left at most."""
-    used = []
-    for path in folder.iterdir():
-        try:
-            about = path.stat()
-        except OSError:  # another process has deleted it
-            continue
-        # Some disks do not note when a file was read.
-        used.append((max(about.st_atime, about.st_mtime), about.st_size, path))
+    """Delete the programs of a folder that were used longest ago, until so many bytes are left at most.
+
+    Other files are neither counted nor deleted. If the folder is a link, nothing is deleted: the folder that it points
+    to may have another purpose.
+    """
+    if folder.is_symlink():
+        return
+    # Some disks do not note when a file was read.
+    used = [
+        (max(about.st_atime, about.st_mtime), about.st_size, path)
+        for path, about in _programs(folder)
+        if stat.S_ISREG(about.st_mode)
+    ]
     left = sum(size for _, size, _ in used)
     for _, size, path in sorted(used):
         if left <= most:
             return
-        with suppress(OSError):  # it is gone, or may not go
+        with suppress(OSError):  # another process has deleted it, or it may not be deleted
             path.unlink()
         left -= size
 
 
+def _programs(folder: Path) -> list[tuple[Path, os.stat_result]]:
+    """List the entries of a folder that have names of programs, with what the disk says of each, links as links."""
+    found = []
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if _PROGRAM.fullmatch(entry.name):
+                with suppress(OSError):  # another process has deleted it
+                    found.append((Path(entry.path), entry.stat(follow_symlinks=False)))
+    return found
+
+
+def _is_ours(about: os.stat_result) -> bool:
+    return about.st_uid in (os.getuid(), 0)
+
+
+def _is_trusted_file(about: os.stat_result, folder: Path) -> bool:
+    """Return True if a file is regular, this user or root owns it, and nobody else can write to it.
+
+    JAX makes files that a group may write if the user's mask allows it; where only the user can enter the folder, no
+    other member of the group reaches them.
+    """
+    if not stat.S_ISREG(about.st_mode) or not _is_ours(about):
+        return False
+    return not about.st_mode & _OTHERS_WRITE or not _others_enter(folder)
+
+
+def _others_enter(folder: Path) -> bool:
+    try:
+        return bool(folder.stat().st_mode & _OTHERS_ENTER)
+    except OSError:
+        return True
+
+
 def _folder() -> Path | None:
-    """Name the folder for this user; None where the user has no home."""
+    """Return the folder of this user; None if the user has no home."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vijax"
     except RuntimeError:
         return None
-
-
-def _private(folder: Path) -> bool:
-    """Make the folder at need, and say whether its files can be trusted: programs that are read there are run."""
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        about = folder.stat()
-    except OSError:
-        return False
-    return about.st_uid == os.getuid() and not about.st_mode & _OTHERS_WRITE

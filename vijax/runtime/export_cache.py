@@ -7,7 +7,7 @@ are wanted (`xla.KERNELS`), alone.
 """
 
 import hashlib
-import pickle
+import os
 from collections.abc import Callable
 from functools import lru_cache
 from importlib.metadata import version
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 from jax import export
 
-from vijax.runtime import cache_folder, xla
+from vijax.runtime import cache_folder, structures, xla
 from vijax.runtime.files import replacing
 
 # Distributions whose code a trace goes through, down to those that jax and diffrax stand on.
@@ -36,12 +36,13 @@ TRACED_BY = (
 )
 _PACKAGE = Path(__file__).parents[1]
 _DIGEST = hashlib.sha256
+_LENGTH = 4  # bytes that hold how long the text of a structure is
 # Kernels of `registers` may be kept, though no other JAX is sure to read them: a program is kept for one alone.
 KERNEL = export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
 
 
 class _Traced(NamedTuple):
-    """A traced program of lists of arrays, and the pytree of its results, each told by its place in the list."""
+    """A traced program of lists of arrays, and a pytree of the structure of its results."""
 
     program: export.Exported
     results: Any
@@ -86,7 +87,7 @@ class TracedProgram:
             return jax.jit(flat, compiler_options=options)
         shapes = tuple((x.shape, str(x.dtype)) for x in leaves)
         name = f"{self._name} {(platform, tree, shapes)} {xla.platform()} {xla.KERNELS} {source_digest()}"
-        path = folder / f"traced-{_DIGEST(name.encode()).hexdigest()}"
+        path = folder / f"{cache_folder.TRACED}{_DIGEST(name.encode()).hexdigest()}"
         known = _read(path)
         if known is None:
             known = _trace(flat, platform, leaves)
@@ -134,25 +135,38 @@ def source_digest(package: Path = _PACKAGE) -> str:
 
 
 def _read(path: Path) -> _Traced | None:
-    """Read the program there, if it is there and whole."""
+    """Read the program there; None if it is missing, not trusted, damaged, or the program of another key."""
+    content = cache_folder.read(path)
+    if content is None:
+        return None
+    digest, body = content[: _DIGEST().digest_size], content[_DIGEST().digest_size :]
+    if _signed(path, body) != digest:
+        return None
+    length = int.from_bytes(body[:_LENGTH], "little")
+    structure, program = body[_LENGTH : _LENGTH + length], body[_LENGTH + length :]
     try:
-        content = path.read_bytes()
-    except OSError:
+        return _Traced(export.deserialize(bytearray(program)), structures.from_json(structure))
+    except Exception:  # flatbuffers raises errors of many kinds
         return None
-    size = _DIGEST().digest_size
-    if _DIGEST(content[size:]).digest() != content[:size]:
-        return None
-    # Pickles can run anything, and so can programs: `cache_folder` trusts no folder that somebody else may write to.
-    program, results = pickle.loads(content[size:])
-    return _Traced(export.deserialize(bytearray(program)), results)
 
 
 def _write(path: Path, known: _Traced) -> None:
-    """Keep a program; where nothing can be written, the next process traces it again."""
-    content = pickle.dumps((bytes(known.program.serialize()), known.results))
+    """Keep a program if its results can be rebuilt; where nothing can be written, the next process traces it again."""
+    structure = structures.to_json(known.results)
+    if structure is None:
+        return
+    text = structure.encode()
+    body = len(text).to_bytes(_LENGTH, "little") + text + known.program.serialize()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with replacing(path) as part:
-            part.write_bytes(_DIGEST(content).digest() + content)
+            descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+            with open(descriptor, "wb") as file:
+                file.write(_signed(path, body) + body)
     except OSError:
         return
+
+
+def _signed(path: Path, body: bytes) -> bytes:
+    """Digest the content of a file together with its name, which is the digest of what the program depends on."""
+    return _DIGEST(path.name.encode() + body).digest()
