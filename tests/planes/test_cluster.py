@@ -15,6 +15,7 @@ from pathlib import Path
 import dask
 import distributed
 import numpy as np
+import psutil
 import pytest
 import xarray as xr
 
@@ -178,6 +179,34 @@ def test_a_task_that_nobody_survives_is_given_up(tmp_path):
         list(cluster.done(partial(fragile, tmp_path, 9), range(6), 1))
 
 
+def answers_without_credentials(port: int) -> bytes:
+    """What a port of this machine answers to a request of a page."""
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall(b"GET /info/main/workers.html HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        try:
+            return b"".join(iter(partial(connection.recv, 4096), b""))
+        except ConnectionError:
+            return b""
+
+
+def test_only_this_run_can_connect_to_its_scheduler_and_workers():
+    """Any user of this machine reaches the ports, and whoever connects runs code."""
+    with cluster._local(1) as client:
+        address = client.scheduler_info()["address"]
+        assert client.submit(os.getpid).result() != os.getpid()
+        processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+        listening = [one for process in processes for one in process.net_connections() if one.status == "LISTEN"]
+        ports = {one.laddr.port for one in listening}
+        strangers = [(address.replace("tls:", "tcp:"), None), (address, distributed.Security.temporary())]
+        for place, credentials in strangers:
+            with pytest.raises(OSError, match=r"Timed out|TLS certificate does not match|reset by peer"):
+                distributed.Client(place, security=credentials, timeout=1, set_as_default=False)
+        found = {port: answers_without_credentials(port) for port in ports}
+    assert {one.laddr.ip for one in listening} == {"127.0.0.1"}
+    assert len(found) >= 4  # a scheduler, a nanny, a worker, and pages that are not there
+    assert {answer.partition(b"\r\n")[0] for answer in found.values()} <= {b"", b"HTTP/1.1 404 Not Found"}
+
+
 # --- at the door -----------------------------------------------------------------------------------------------------
 
 BAD = [
@@ -211,5 +240,12 @@ def test_a_scheduler_that_does_not_answer_is_named():
 @pytest.mark.parametrize("workers", [2, "tcp://10.0.0.1:8786"])
 def test_what_must_be_installed_is_said(folder, monkeypatch, workers):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ModuleNotFoundError, match=r"got none; install vijax\[cluster\]"):
+    with pytest.raises(ModuleNotFoundError, match=r"workers must have Dask.*got none; install vijax\[cluster\]"):
         sweep(**AXES, out="map.zarr", workers=workers)
+
+
+def test_what_makes_credentials_must_be_installed(folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(ModuleNotFoundError, match=r"workers must have cryptography.*; install vijax\[cluster\]"):
+        sweep(**AXES, out="map.zarr", workers=2)
+    assert not list(folder.iterdir())

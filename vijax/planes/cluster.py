@@ -36,6 +36,8 @@ ANSWER = 10
 _WAITING = 2
 # Loggers that print tracebacks of connections that are lost.
 _LOGS = ("distributed.batched", "distributed.client", "distributed.core", "distributed.utils", "tornado.application")
+# Settings of Dask by which schedulers and workers serve no page: their pages need no credentials.
+_NO_PAGES: dict[str, list[str]] = {f"distributed.{role}.http.routes": [] for role in ("scheduler", "worker")}
 # Settings of JAX by which new processes keep compiled programs where their driver does.
 _CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
 
@@ -50,7 +52,7 @@ def check(workers: Workers, answer: float = ANSWER) -> None:
     Raises:
         ValueError: If a number is none, or an address no address.
         OSError: If no scheduler answers there.
-        ModuleNotFoundError: Without Dask.
+        ModuleNotFoundError: Without Dask, or without what makes certificates for processes of this machine.
     """
     if isinstance(workers, str):
         with _joined(workers, answer):
@@ -58,6 +60,7 @@ def check(workers: Workers, answer: float = ANSWER) -> None:
     else:
         _dask()
         checks.whole("workers", workers, 1, _MOST_WORKERS)
+        _credentials()
 
 
 def done(work: Callable[[Task], None], tasks: Iterable[Task], workers: Workers) -> Iterator[Task]:
@@ -125,6 +128,20 @@ def _dask() -> ModuleType:
     return distributed
 
 
+def _credentials() -> Any:
+    """Make a key and a certificate that exist in memory alone: without them no other process can connect.
+
+    Raises:
+        ModuleNotFoundError: Without the package that makes them.
+    """
+    try:
+        return _dask().security.Security.temporary()
+    except ImportError:
+        raise ModuleNotFoundError(
+            see("studies", "workers must have cryptography, for their credentials; got none; install vijax[cluster]")
+        ) from None
+
+
 @contextmanager
 def _joined(address: str, answer: float = ANSWER) -> "Iterator[Client]":
     """Join the scheduler at an address."""
@@ -179,17 +196,26 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _local(number: int) -> "Iterator[Client]":
-    """Start so many processes, which share the cores and end with this one, however that ends."""
-    made = _dask().LocalCluster(
-        n_workers=number,
-        threads_per_worker=max((os.cpu_count() or 1) // number, 1),
-        memory_limit=None,  # set by the tile; a worker holds no results that it could spill
-        dashboard_address=None,
-    )
-    with made, _dask().Client(made, set_as_default=False) as client:
-        kept = {name: getattr(jax.config, name) for name in _CACHE}
-        client.register_worker_callbacks(partial(_settle, kept))
-        yield client
+    """Start so many processes, which share the cores and end with this one, however that ends.
+
+    All connections are encrypted and need a certificate of this run: whoever reaches a scheduler can run code by it.
+    """
+    import dask
+
+    # A worker that replaces a lost one reads the settings, too.
+    with dask.config.set(_NO_PAGES):
+        made = _dask().LocalCluster(
+            n_workers=number,
+            threads_per_worker=max((os.cpu_count() or 1) // number, 1),
+            memory_limit=None,  # set by the tile; a worker holds no results that it could spill
+            security=_credentials(),
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # of no fixed port, which another run may have
+        )
+        with made, _dask().Client(made, set_as_default=False) as client:
+            kept = {name: getattr(jax.config, name) for name in _CACHE}
+            client.register_worker_callbacks(partial(_settle, kept))
+            yield client
 
 
 def _settle(kept: dict[str, Any]) -> None:
