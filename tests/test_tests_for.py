@@ -10,28 +10,28 @@ from scripts import tests_for
 from tests import seconds
 
 IMPORTS = {
-    "vijax.low": set(),
-    "vijax.middle": {"vijax.low"},
-    "vijax.other": set(),
-    "tests.helpers": {"vijax.middle"},
-    "tests.test_low": {"vijax.low"},
-    "tests.test_cheap": {"vijax.middle"},
-    "tests.test_dear": {"vijax.middle", "vijax.other"},
+    "package.low": set(),
+    "package.middle": {"package.low"},
+    "package.other": set(),
+    "tests.helpers": {"package.middle"},
+    "tests.test_low": {"package.low"},
+    "tests.test_cheap": {"package.middle"},
+    "tests.test_dear": {"package.middle", "package.other"},
     "tests.test_helped": {"tests.helpers"},
-    "tests.test_apart": {"vijax.other"},
+    "tests.test_apart": {"package.other"},
 }
 
 
 def test_files_are_found_by_distance_then_by_seconds(monkeypatch):
     monkeypatch.setattr(tests_for, "recorded", lambda: {"tests/test_dear.py": 9.0, "tests/test_cheap.py": 1.5})
-    assert tests_for.dependent_files("vijax.low", IMPORTS) == [
+    assert tests_for.dependent_files("package.low", IMPORTS) == [
         ("tests/test_low.py", 1, 0.0),
         ("tests/test_cheap.py", 2, 1.5),
         ("tests/test_dear.py", 2, 9.0),
         ("tests/test_helped.py", 3, 0.0),
     ]
-    with pytest.raises(ValueError, match=r"MODULE must be .*; got 'vijax\.high'"):
-        tests_for.dependent_files("vijax.high", IMPORTS)
+    with pytest.raises(ValueError, match=r"MODULE must be .*; got 'package\.high'"):
+        tests_for.dependent_files("package.high", IMPORTS)
 
 
 def test_a_test_of_a_public_name_depends_on_the_module_that_defines_it():
