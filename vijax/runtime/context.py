@@ -1,7 +1,7 @@
-"""What vijax stands on, whatever the program around it has set: held while a public function runs, in its threads too.
+"""Settings of JAX that a public function runs under, in its threads too, whatever the program around it has set.
 
-NaNs and broadcasts that are meant are ours, and impact times are worth little in 32 bits. A program's own settings
-stand again when the function returns, or raises.
+Impact times need 64 bits. NaNs, broadcasts and transfers between host and device within a public function are intended.
+A program's own settings are restored when the function returns or raises.
 """
 
 import functools
@@ -22,11 +22,15 @@ from vijax.runtime.waiting import tell_of_compilation
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_HELD: dict[str, tuple[Callable[[Any], Any], Any]] = {
-    "jax_enable_x64": (jax.enable_x64, True),
-    "jax_debug_nans": (jax.debug_nans, False),
-    "jax_debug_infs": (jax.debug_infs, False),
-    "jax_numpy_rank_promotion": (jax.numpy_rank_promotion, "allow"),
+# The context manager of each setting, and the values that may stay as they are, the one that is set otherwise first.
+_HELD: dict[str, tuple[Callable[[Any], Any], tuple[Any, ...]]] = {
+    "jax_enable_x64": (jax.enable_x64, (True,)),
+    "jax_debug_nans": (jax.debug_nans, (False,)),
+    "jax_debug_infs": (jax.debug_infs, (False,)),
+    "jax_numpy_rank_promotion": (jax.numpy_rank_promotion, ("allow",)),
+    "jax_transfer_guard_host_to_device": (jax.transfer_guard_host_to_device, ("allow", None)),
+    "jax_transfer_guard_device_to_device": (jax.transfer_guard_device_to_device, ("allow", None)),
+    "jax_transfer_guard_device_to_host": (jax.transfer_guard_device_to_host, ("allow", None)),
 }
 
 
@@ -76,11 +80,11 @@ def beside(work: Callable[..., Any], *args: Any, **named: Any) -> None:
 def _held(*given: Any) -> ExitStack:
     """Set the settings that differ from those of the program, which come back at the end."""
     stack = ExitStack()
-    for name, (setting, value) in _HELD.items():
-        if getattr(jax.config, name) != value:
+    for name, (setting, values) in _HELD.items():
+        if getattr(jax.config, name) not in values:
             if name == "jax_enable_x64":
                 _check_untraced(given)
-            stack.enter_context(setting(value))
+            stack.enter_context(setting(values[0]))
     return stack
 
 
