@@ -1,13 +1,11 @@
 """A page without a browser: what it is asked, what it tells, and which jobs it begins."""
 
-import asyncio
 import threading
 from base64 import b64decode
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bokeh.application.handlers.document_lifecycle import DocumentLifecycleHandler
 from bokeh.document import Document
 
 import vijax
@@ -239,10 +237,47 @@ def test_a_page_that_is_closed_ends_its_jobs(power, monkeypatch):
 
     job = one.jobs.start("slow", slow, heard.append, heard.append)
     assert begun.wait(10)
-    asyncio.run(DocumentLifecycleHandler().on_session_destroyed(SimpleNamespace(_document=document)))
+    document.on_change(heard.append)  # as a session does, which ends its document by the same object
+    document.destroy(heard.append)
     go.set()
     job.future.result(timeout=10)
     assert one.jobs.running() == ()
     assert job.over.is_set()
     assert heard == []
     crew.close()
+
+
+HUGE = 10**400
+NO_NUMBERS = (np.inf, -np.inf, np.nan, "x", [1], {})
+
+
+MEANINGLESS = (
+    *({"kind": "value", "name": "r", "value": value} for value in (*NO_NUMBERS, HUGE, "1e999")),
+    *({"kind": "pick", "column": value, "row": 0} for value in (*NO_NUMBERS, 0.5, None, "1")),
+    {"kind": "pick", "column": 0, "row": 0, "number": np.inf},
+    {"kind": "value", "value": 1},
+    {"kind": "colour", "variable": [1], "scale": "auto", "curves": "stable"},
+    {"kind": "along", "along": None},
+    {"kind": "open", "name": HUGE},
+    {"kind": "export", "what": HUGE, "format": "pdf"},
+)
+
+
+def test_a_message_without_meaning_is_answered_with_one_line(power, opened):
+    one, told = opened(power)
+    before = one.view
+    for message in MEANINGLESS:
+        told.clear()
+        one.heard(message)
+        notes = [said["text"] for said in told if said["section"] == "note"]
+        assert len(notes) == 1, message
+        assert "\n" not in notes[0], message
+        assert len(notes[0]) < 300, message
+        assert one.view == before, message
+        assert not one.jobs.running(), message
+
+
+def test_a_cell_beyond_the_map_is_the_nearest_one(power, opened):
+    one, _ = opened(power)
+    one.heard({"kind": "pick", "column": HUGE, "row": -HUGE})
+    assert one.view.pick == (3, 0)

@@ -1,18 +1,22 @@
 """Who may ask the server, what it says where it cannot serve, and the page in a notebook."""
 
+import gc
 import os
 import time
 
 import nbformat
 import numpy as np
 import pytest
+import xarray as xr
+from bokeh.util.token import generate_jwt_token
 from nbclient import NotebookClient
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 import vijax
 from tests.helpers import no_cell_runs
-from vijax.explorer import door, server, worker
+from vijax.cli.main import main
+from vijax.explorer import door, request_filter, server, worker
 from vijax.explorer.source import Source
 
 
@@ -76,6 +80,77 @@ def test_a_page_from_elsewhere_may_not_ask(serving):
         one.io_loop.run_sync(lambda: websocket_connect(asked, subprotocols=["bokeh", "none"]), timeout=30)
 
 
+def sessions(server):
+    return {session.id for session in server.get_sessions("/")}
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example:{port}", "[::2]:{port}"]
+)
+@pytest.mark.parametrize("path", ["", "ws", "autoload.js?bokeh-autoload-element=1", "static/js/bokeh.min.js"])
+def test_a_request_for_another_host_is_refused(serving, host, path):
+    """A foreign name that points to this machine: its pages could read what is answered."""
+    one, page, ask = serving("127.0.0.1")
+    with pytest.raises(HTTPClientError, match="403") as refused:
+        ask(page + path, headers={"Host": host.format(port=one.port)})
+    assert b"--allow-origin" in refused.value.response.body
+    assert not sessions(one)
+
+
+@pytest.mark.parametrize("host", ["localhost:{port}", "LOCALHOST", "[::1]:{port}", "127.0.0.1:8000"])
+def test_this_machine_is_known_by_its_names(serving, host):
+    """By any port: a tunnel has another."""
+    one, page, ask = serving("127.0.0.1")
+    assert ask(page + "static/js/bokeh.min.js", headers={"Host": host.format(port=one.port)}).code == 200
+
+
+def test_a_host_that_is_allowed_is_answered(serving):
+    one, _, ask = serving("127.0.0.1", ("Lab.example.org:5006",))
+    assert ask(f"http://127.0.0.1:{one.port}/", headers={"Host": "lab.example.org"}).code == 200
+
+
+def connect(one, page, token):
+    """Connect to a session as the script of a page does."""
+    asked = HTTPRequest(page.replace("http:", "ws:") + "ws", headers={"Origin": page.rstrip("/")})
+    return one.io_loop.run_sync(lambda: websocket_connect(asked, subprotocols=["bokeh", token]), timeout=30)
+
+
+@pytest.mark.parametrize("bound", ["MOST_SESSIONS", "MOST_WAITING"])
+def test_there_are_so_many_pages_at_most(serving, monkeypatch, bound):
+    monkeypatch.setattr(request_filter, bound, 3)
+    one, page, ask = serving("127.0.0.1")
+    for _ in range(3):
+        ask(page)
+    for path in ("", "autoload.js?bokeh-autoload-element=1"):
+        with pytest.raises(HTTPClientError, match="503") as refused:
+            ask(page + path)
+        assert b"load this page again in 12 seconds" in refused.value.response.body
+    assert len(sessions(one)) == 3
+    for token in ("none", generate_jwt_token("another")):
+        with pytest.raises(HTTPClientError, match="503"):
+            connect(one, page, token)
+    connection = connect(one, page, generate_jwt_token(min(sessions(one)), expiration=60))
+    one.io_loop.run_sync(connection.read_message)  # what a page is sent when it is connected
+    if bound == "MOST_WAITING":
+        ask(page)
+        assert len(sessions(one)) == 4
+    connection.close()
+
+
+def test_the_end_of_a_page_collects_no_garbage(serving, monkeypatch):
+    """Only that of every so-many-th does: the collector looks at all objects of the process."""
+    monkeypatch.setattr(server, "COLLECTED", 3)
+    collected = []
+    monkeypatch.setattr(gc, "collect", lambda *_: collected.append(1))
+    one, page, ask = serving("127.0.0.1")
+    for _ in range(4):
+        ask(page)
+    monkeypatch.setattr(one._tornado, "_unused_session_lifetime_milliseconds", -1)
+    one.io_loop.run_sync(one._tornado._cleanup_sessions)
+    assert not sessions(one)
+    assert len(collected) == 1
+
+
 def test_an_open_address_needs_an_origin(dataset):
     with pytest.raises(ValueError, match="address must come with allow_origin"):
         server.serve(Source(dataset), "0.0.0.0", 0, ())
@@ -114,6 +189,33 @@ def test_what_a_damaged_store_says_is_text(serving, monkeypatch):
     assert "<script>alert(1)" not in body
 
 
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (MemoryError("no\n7 TiB"), "the map must fit in memory; got plane.zarr (no 7 TiB)"),
+        (KeyError("d"), "the map must be one that vijax.sweep made; got plane.zarr (KeyError: 'd')"),
+        (AttributeError("dims"), "the map must be one that vijax.sweep made; got plane.zarr (AttributeError: dims)"),
+        (OSError("gone"), "gone"),
+    ],
+)
+def test_a_store_that_cannot_be_read_is_one_line(monkeypatch, capsys, error, line):
+    def fail(path):
+        raise error
+
+    monkeypatch.setattr("vijax.explorer.source.load", fail)
+    assert main(["explore", "plane.zarr", "--no-browser"]) == 2
+    assert capsys.readouterr().err == f"error: source: {line}\n"
+
+
+@pytest.mark.parametrize("sizes", [(1, 1), (0, 0), (0, 4), (1, 4), (60_000, 60_000)])
+def test_a_map_that_cannot_be_shown_is_one_line(sizes):
+    """Of which no value is read."""
+    axes = {name: (name, np.zeros(1).repeat(size)) for name, size in zip(("d", "kappa"), sizes, strict=True)}
+    values = np.broadcast_to(np.int8(0), sizes)
+    with pytest.raises(ValueError, match=r"^source: dataset must have (two axes of|at most 67,108,864 cells)"):
+        Source(xr.Dataset({"status": (("d", "kappa"), values)}, axes)).check()
+
+
 def test_without_bokeh_the_extra_is_named(monkeypatch):
     monkeypatch.setattr(door, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'vijax\[explore\]'"):
@@ -145,6 +247,8 @@ def test_a_process_that_is_cancelled_ends_and_the_next_work_has_another():
         one.run(time.sleep, (60,), until_third)
     assert one._process is None
     assert one.run(divmod, (7, 2), lambda done, total: None) == (3, 1)
+    # Ctrl-C reaches all processes of a group, and the server ends this one.
+    assert one.run(os.getpgrp, (), lambda done, total: None) != os.getpgrp()
     with pytest.raises(worker.WorkerError, match="division"):
         one.run(divmod, (7, 0), lambda done, total: None)
     one.close()

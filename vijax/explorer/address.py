@@ -38,6 +38,12 @@ def check_listener(address: Any, port: Any, allow_origin: Any) -> tuple[str, ...
     return tuple(origins)
 
 
+def host_of(origin: str) -> str:
+    """Return the host of HOST or HOST:PORT, in small letters and without brackets."""
+    host, colon, port = origin.rpartition(":")
+    return (host if colon and port.isdecimal() else origin).strip("[]").lower()
+
+
 def bound_port(address: str, port: int) -> int:
     """Find a port that nobody listens on, unless one is given, which has to be such.
 

@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
-from vijax.explorer.worker import Tell, Worker
+from vijax.explorer.worker import Tell, Worker, one_line
 
 
 class CancelledError(Exception):
@@ -110,7 +110,7 @@ class Jobs:
             except CancelledError:
                 return
             except Exception as error:  # whatever it is, the page says it: a server does not end with a job
-                said = " ".join(str(error).split()) or type(error).__name__
+                said = one_line(error)
                 current(lambda: self._end(job, lambda: failed(said)))
                 return
             current(lambda: self._end(job, lambda: done(found)))

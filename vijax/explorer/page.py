@@ -17,7 +17,7 @@ from bokeh.model import DataModel
 from vijax.explorer import answers, export, overlay, recipes, view
 from vijax.explorer.drawing import Drawing
 from vijax.explorer.figures import figures, ranged, scale, tables
-from vijax.explorer.jobs import Crew, Jobs
+from vijax.explorer.jobs import Crew, Jobs, one_line
 from vijax.explorer.motion import CellMotion, motion
 from vijax.explorer.overlay import LaidCurves
 from vijax.explorer.panels import PANEL_KINDS, PanelRequest
@@ -30,6 +30,7 @@ from vijax.explorer.worker import Tell
 from vijax.model.quantities import AXES
 from vijax.planes.sweep import sweep
 from vijax.plots.cell_colours import coloured
+from vijax.runtime import checks
 
 MOST_CELLS = 10**6
 """Cells of a plane that is made without being asked for twice."""
@@ -80,7 +81,10 @@ class ExplorerPage:
     # --- messages ----------------------------------------------------------------------------------------------------
 
     def heard(self, message: dict[str, Any]) -> None:
-        """Do what the page asks; what cannot be is told in a line."""
+        """Do what the page asks; an error is shown in one line.
+
+        A message can be anything that JSON can hold: infinity, a number with 400 digits, a list where a name is due.
+        """
         kinds = {
             "ready": self._ready,
             "pick": self._pick,
@@ -98,8 +102,8 @@ class ExplorerPage:
             return
         try:
             handler(message)
-        except (ValueError, TypeError, KeyError) as error:
-            self.tell("note", text=str(error), error=True)
+        except Exception as error:
+            self.tell("note", text=one_line(error), error=True)
             self._tell_view()
 
     def tell(self, section: str, **content: Any) -> None:
@@ -114,7 +118,8 @@ class ExplorerPage:
 
     def _pick(self, message: dict[str, Any]) -> None:
         columns, rows = self.plane.shape
-        pick = min(max(int(message["column"]), 0), columns - 1), min(max(int(message["row"]), 0), rows - 1)
+        column, row, number = (view.whole(message, name) for name in ("column", "row", "number"))
+        pick = min(max(column, 0), columns - 1), min(max(row, 0), rows - 1)
         values = dict(self.view.values)
         if self.view.follow and self.motion is not None:
             # A rigid gap holds its start, and a soft one nearly so: a start is never far within a membrane.
@@ -123,7 +128,7 @@ class ExplorerPage:
             limits = view.bounds(self.plane) | {"u0": (-half, half)}
             values |= {name: min(max(end, limits[name][0]), limits[name][1]) for name, end in ends.items()}
         self.view = replace(self.view, pick=pick, values=values, panels=())
-        self._run(int(message.get("number", 0)))
+        self._run(number)
 
     def _colour(self, message: dict[str, Any]) -> None:
         asked = view.from_query(self.plane, {name: message[name] for name in ("variable", "scale", "curves")})
@@ -132,14 +137,14 @@ class ExplorerPage:
         self._tell_view()
 
     def _value(self, message: dict[str, Any]) -> None:
-        name = str(message["name"])
+        name, number = str(message["name"]), view.whole(message, "number")
         values = {key: value for key, value in self.view.values.items() if key != name}
         if message.get("value") is not None:
             values |= view.checked(self.plane, {name: message["value"]})
         self.view = replace(self.view, values=values, panels=())
         if name in self.plane.further:
             self._draw_map()
-        self._run(int(message.get("number", 0)))
+        self._run(number)
 
     def _along(self, message: dict[str, Any]) -> None:
         self.view = replace(self.view, along=view.from_query(self.plane, {"along": message["along"]}).along)
@@ -152,15 +157,14 @@ class ExplorerPage:
         self._tell_view()
 
     def _follow(self, message: dict[str, Any]) -> None:
+        number = view.whole(message, "number")
         values = {name: value for name, value in self.view.values.items() if name not in ("u0", "v0")}
         self.view = replace(self.view, follow=bool(message["follow"]), values=values)
         self._trail.clear()
-        self._run(int(message.get("number", 0)))
+        self._run(number)
 
     def _open(self, message: dict[str, Any]) -> None:
-        name = str(message["name"])
-        if name not in view.PANELS:
-            raise ValueError(f"open must be one of {', '.join(view.PANELS)}; got {name!r}")
+        name = checks.choice("open", message["name"], view.PANELS)
         self.view = replace(self.view, panels=tuple(one for one in view.PANELS if one in (*self.view.panels, name)))
         self._start(name)
         self._tell_view()
@@ -376,7 +380,7 @@ class ExplorerPage:
     def _export(self, message: dict[str, Any]) -> None:
         what, ending = str(message["what"]), str(message["format"])
         if what not in self.exports:
-            raise ValueError(f"what must have been computed to be exported; got {what!r}; compute it first")
+            raise ValueError(f"what must have been computed to be exported; got {checks.shown(what)}; compute it first")
         found = self.exports[what]
         self.jobs.start(
             "export",

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 # Of a map of equal walls those without an end; of others those of each wall.
 _PAIR = ("d", "kappa", "kappa_left", "kappa_right", "gamma", "r", "r_left", "r_right")
+MOST_SHOWN = 2**26
+"""Cells of a map, at most: 8192 x 8192, of which a variable takes half a gigabyte."""
 MOST_PERIODS = 100_000
 """Forcing periods of a cell, at most: what a store says must not keep a page busy without an end."""
 
@@ -140,6 +142,11 @@ def explored(dataset: "xr.Dataset") -> ExploredPlane:
     if len(along) < 2:
         got = checks.joined(along) or "none"
         raise ValueError(f"dataset must have two axes of more than one value; got {got}; plots draw what has fewer")
+    count = math.prod(dataset.sizes[name] for name in along)
+    if count > MOST_SHOWN:
+        raise ValueError(
+            f"dataset must have at most {MOST_SHOWN:,} cells to be shown in a browser; got {count:,}; select a part"
+        )
     for name, needed in (("method", "exact"), ("until", "attractor"), ("excitation", "sine")):
         if (got := dataset.attrs.get(name, needed)) != needed:
             raise ValueError(

@@ -1,6 +1,9 @@
-"""The server of a page: where it listens, who may come, what is compiled before somebody asks, and its end."""
+"""The server of a page: where it listens, what is compiled before somebody asks, and what the end of a page costs."""
 
+import gc
+import itertools
 import secrets
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import resources
 from typing import Any
@@ -9,17 +12,21 @@ from urllib.parse import urlencode
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
+from bokeh.document import document as bokeh_document
 from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.models import CustomJS
-from bokeh.server.auth_provider import AuthProvider
-from bokeh.server.server import Server
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import create_hosts_allowlist
 from jinja2 import Template
-from tornado.web import RequestHandler
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop
 
 from vijax.explorer import view
 from vijax.explorer.address import LOCAL, bound_port, check_listener
 from vijax.explorer.jobs import Crew
 from vijax.explorer.page import ExplorerPage
+from vijax.explorer.request_filter import UNUSED_CHECK, UNUSED_LIFETIME, Refusal, RequestFilter, TokenProvider
 from vijax.explorer.source import Source
 from vijax.explorer.theme import plain
 from vijax.explorer.warming import Warmth, warm
@@ -28,76 +35,51 @@ REFRESH = 1000
 """Milliseconds after which a store is looked at again."""
 
 
-class _Visitors(AuthProvider):
-    """Lets in who brings the token in the address, and remembers that in a cookie."""
-
-    def __init__(self, token: str) -> None:
-        self._token = token
-        super().__init__()
-
-    @property
-    def get_user(self) -> Any:
-        """Say who comes; None is nobody."""
-
-        def known(handler: RequestHandler) -> str | None:
-            given = handler.get_argument("token", "") or handler.get_cookie(_COOKIE) or ""
-            if not secrets.compare_digest(given.encode(), self._token.encode()):
-                return None
-            handler.set_cookie(_COOKIE, self._token, httponly=True, samesite="Strict")
-            return "visitor"
-
-        return known
-
-    @property
-    def get_user_async(self) -> None:
-        """Ask nobody else."""
-
-    @property
-    def login_url(self) -> None:
-        """Have no page where a token could be guessed: `get_login_url` says what is missing."""
-
-    @property
-    def get_login_url(self) -> Any:
-        """Send who has no token to a page that says so."""
-        return lambda handler: "/token"
-
-    @property
-    def login_handler(self) -> None:
-        """Have none."""
-
-    @property
-    def logout_url(self) -> None:
-        """Have none."""
-
-    @property
-    def logout_handler(self) -> None:
-        """Have none."""
-
-
-class _NoToken(RequestHandler):
-    """Says that the address lacks its token."""
-
-    def get(self) -> None:
-        """Answer."""
-        self.set_status(403)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish("This page is opened by the whole address that vijax explore printed, with its token.\n")
-
-
-_COOKIE = "vijax_explore"
+COLLECTED = 32
+"""Pages that end between two searches for their garbage: one takes 0.14 s where programs were compiled."""
 
 
 def application(source: Source, crew: Crew, warmth: Warmth) -> Application:
     """Make the application: a page for every session, all of one source."""
+    ended = itertools.count(1)
 
     def session(document: Document) -> None:
-        _open(document, source, crew, warmth)
+        page = _open(document, source, crew, warmth)
+        _on_end(document, lambda: None if page is None else page.jobs.close(), ended)
 
     return Application(FunctionHandler(session))
 
 
-def _open(document: Document, source: Source, crew: Crew, warmth: Warmth) -> None:
-    """Make the page of one session; where the map cannot be read, one that says why."""
+def _on_end(document: Document, close: Callable[[], None], ended: Iterator[int]) -> None:
+    """Close a page when its session ends, and collect garbage only after every `COLLECTED`-th page.
+
+    Bokeh searches all objects of the process for garbage whenever a document ends, and once more for callbacks of
+    `on_session_destroyed`. Many pages that end together would keep the server from answering.
+    """
+    destroy = document.destroy
+
+    def destroyed(session: Any) -> None:
+        close()
+        collects = next(ended) % COLLECTED == 0
+        bokeh_document.gc = gc if collects else _NoCollector  # type: ignore[attr-defined]
+        try:
+            destroy(session)
+        finally:
+            bokeh_document.gc = gc  # type: ignore[attr-defined]
+
+    document.destroy = destroyed  # type: ignore[method-assign]
+
+
+class _NoCollector:
+    """What Bokeh uses of `gc`."""
+
+    @staticmethod
+    def collect() -> None:
+        """Do nothing."""
+
+
+def _open(document: Document, source: Source, crew: Crew, warmth: Warmth) -> ExplorerPage | None:
+    """Make the page of one session; if the map cannot be read, a document with the reason, and return None."""
     document.title = "vijax explore"
     document.template = _template()
     document.config.notify_connection_status = False  # the page says it itself, and comes back by itself
@@ -113,15 +95,16 @@ def _open(document: Document, source: Source, crew: Crew, warmth: Warmth) -> Non
         page = ExplorerPage(document, source, plane, shown, crew)
     except (ValueError, OSError) as error:
         document.template_variables["problem"] = plain(str(error))
-        return
+        return None
     document.template_variables["note"] = plain(note)
-    for name, one in page.drawing.figures.all().items():
-        one.name = name
-        document.add_root(one)
+    with document.models.freeze():  # else Bokeh collects the models of all roots again for each
+        for name, one in page.drawing.figures.all().items():
+            one.name = name
+            document.add_root(one)
     _listen(document, page)
     document.add_periodic_callback(page.refresh, REFRESH)
     document.add_periodic_callback(partial(_tell_of_warmth, page, warmth, [""]), 300)
-    document.on_session_destroyed(lambda context: page.jobs.close())
+    return page
 
 
 def _tell_of_warmth(page: ExplorerPage, warmth: Warmth, told: list[str]) -> None:
@@ -158,7 +141,7 @@ def _template() -> Template:
     return get_env().from_string(text.replace("/*style*/", style).replace("/*script*/", script))
 
 
-def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> tuple[Server, Crew, str]:
+def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> tuple[BaseServer, Crew, str]:
     """Make a server that listens; give it, its threads, and the address of its page.
 
     Args:
@@ -176,16 +159,18 @@ def serve(source: Source, address: str, port: int, origins: tuple[str, ...]) -> 
     own = tuple(f"{host}:{port}" for host in ("127.0.0.1", "localhost"))
     crew, warmth = Crew(), Warmth()
     token = "" if address in LOCAL else secrets.token_urlsafe(24)
-    further: dict[str, Any] = {"extra_patterns": [("/token", _NoToken)]}
-    if token:
-        further["auth_provider"] = _Visitors(token)
-    server = Server(
+    further: dict[str, Any] = {"auth_provider": TokenProvider(token)} if token else {}
+    pages = BokehTornado(
         {"/": application(source, crew, warmth)},
-        address=address,
-        port=port,
-        allow_websocket_origin=list(origins or own),
+        extra_patterns=[("/token", Refusal)],
+        extra_websocket_origins=create_hosts_allowlist(list(origins or own), port),
+        unused_session_lifetime_milliseconds=UNUSED_LIFETIME,
+        check_unused_sessions_milliseconds=UNUSED_CHECK,
         **further,
     )
+    listener = HTTPServer(RequestFilter(pages, (address, *origins)))
+    listener.listen(port, address)
+    server = BaseServer(IOLoop.current(), pages, listener)
     host = (origins or own)[0]
     crew.submit("warming", lambda: warm(source, crew, warmth))
     server.start()

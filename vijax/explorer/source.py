@@ -7,6 +7,7 @@ import numpy as np
 
 from vijax.explorer import overlay
 from vijax.explorer.plane import ExploredPlane, explored
+from vijax.explorer.worker import one_line
 from vijax.planes import inventory
 from vijax.planes.store import load
 from vijax.planes.sweep import sweep
@@ -46,14 +47,22 @@ class Source:
         return len(records), max((file.stat().st_mtime_ns for file in files if file.exists()), default=0)
 
     def plane(self) -> ExploredPlane:
-        """Read the map, or give what was read if nothing has changed since.
+        """Read the map, or return what was read if nothing has changed since.
 
         Raises:
-            ValueError, OSError: What is wrong with it.
+            ValueError, OSError: What is wrong with it, in one line: a damaged or hostile store raises anything.
         """
         stamp = self.stamp()
         if self._read is None or self._read[0] != stamp:
-            self._read = stamp, explored(self._found())
+            try:
+                self._read = stamp, explored(self._found())
+            except MemoryError as error:
+                raise ValueError(f"the map must fit in memory; got {self.name} ({one_line(error)})") from None
+            except (ValueError, OSError):
+                raise
+            except Exception as error:
+                cause = f"{type(error).__name__}: {one_line(error)}"
+                raise ValueError(f"the map must be one that vijax.sweep made; got {self.name} ({cause})") from error
         return self._read[1]
 
     def check(self) -> None:

@@ -120,7 +120,7 @@ def checked(plane: ExploredPlane, values: Mapping[str, Any]) -> dict[str, float]
         if name in values:
             try:
                 number = float(values[name])
-            except ValueError:
+            except (OverflowError, TypeError, ValueError):
                 number = math.nan
             if not low <= number <= high:
                 got = checks.shown(values[name])
@@ -138,3 +138,17 @@ def _pick(plane: ExploredPlane, text: str) -> tuple[int, int]:
     if not (0 <= column < columns and 0 <= row < rows):
         raise ValueError(f"cell must be column,row of a map of {columns} x {rows} cells; got {checks.shown(text)}")
     return column, row
+
+
+def whole(message: Mapping[str, Any], name: str) -> int:
+    """Return a whole number of a message; 0 if it is left out.
+
+    Raises:
+        ValueError: Another number, or no number.
+    """
+    given = message.get(name, 0)
+    if isinstance(given, float) and given.is_integer():
+        return int(given)
+    if not isinstance(given, int):
+        raise ValueError(f"{name} must be a whole number; got {checks.shown(given)}")
+    return given

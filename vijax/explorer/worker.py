@@ -64,8 +64,9 @@ class Worker:
 
     def _started(self) -> subprocess.Popen[bytes]:
         if self._process is None or self._process.poll() is not None:
-            line = [sys.executable, "-c", _PROGRAM]
-            self._process = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            line, pipe = [sys.executable, "-c", _PROGRAM], subprocess.PIPE
+            # In a group of its own, which Ctrl-C in a terminal does not reach: the server ends it.
+            self._process = subprocess.Popen(line, stdin=pipe, stdout=pipe, process_group=0)
         return self._process
 
     def close(self) -> None:
@@ -89,8 +90,13 @@ def serve() -> None:
             work, given = pickle.loads(content)
             answer = pickle.dumps((True, work(*given)))
         except Exception as error:  # whatever it is, the page says it
-            answer = pickle.dumps((False, " ".join(str(error).split()) or type(error).__name__))
+            answer = pickle.dumps((False, one_line(error)))
         _sent(answers, answer)
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error says, in one line."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 _BYTES = 8  # that say how long a message is

@@ -198,8 +198,8 @@ def shapes(**arrays: Any) -> tuple[int, ...]:
 
 
 def joined(names: Iterable[str]) -> str:
-    """Join names in a sentence: d, kappa and r."""
-    *others, last = names
+    """Join names in a sentence: d, kappa and r; none are an empty text."""
+    *others, last = list(names) or [""]
     return f"{', '.join(others)} and {last}" if others else last
 
 
@@ -283,10 +283,24 @@ def function(name: str, value: Any) -> Any:
 
 
 def path(name: str, value: Any) -> Path:
-    """Take the value as a path."""
+    """Return the value as a path.
+
+    Raises:
+        ValueError: No path.
+        FileNotFoundError: A relative path in a working directory that was deleted.
+    """
     if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
         raise ValueError(f"{name} must be a path, as text or a pathlib.Path; got {shown(value)}")
-    return Path(value)
+    found = Path(value)
+    if not found.is_absolute():
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{name} must be an absolute path, as the working directory was deleted; got {shown(str(value))}; "
+                "change to another folder, or give the whole path"
+            ) from None
+    return found
 
 
 def fits(names: Iterable[str], size: float, what: str, hint: str = "") -> None:
