@@ -5,7 +5,7 @@ python scripts/grid.py --help  # options, and more lines to begin with
 """
 
 from vijax.cli.grid import grid
-from vijax.cli.process import leave, run
+from vijax.cli.process import command, run
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -14,4 +14,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    leave(main())
+    command(main)

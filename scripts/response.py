@@ -4,7 +4,7 @@ python scripts/response.py --noise 0.05,32
 python scripts/response.py --help  # options, and more lines to begin with
 """
 
-from vijax.cli.process import leave, run
+from vijax.cli.process import command, run
 from vijax.cli.response import response
 
 
@@ -14,4 +14,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    leave(main())
+    command(main)

@@ -45,7 +45,6 @@ Pictures: `plots`, which is loaded, and matplotlib with it, when it is first ask
 import os
 import sys
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,6 +59,8 @@ else:
     # that would take ten times as long, so of what is offered each name is loaded when it is first asked for.
     def __getattr__(name):
         if name == "__version__":
+            from importlib import metadata
+
             return metadata.version("vijax")
         if name == "__all__":
             return __dir__()

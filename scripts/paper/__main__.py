@@ -84,4 +84,4 @@ def _check(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    process.leave(process.run(paper))
+    process.command(lambda: process.run(paper))

@@ -372,7 +372,7 @@ def test_bash_completes_after_the_line_of_the_pages(tmp_path):
     """By a command of the name that a wheel installs."""
     (line,) = set(re.findall(r'`(eval "[^`]*")`', (ROOT / "docs/maps.md").read_text(encoding="utf-8")))
     stub = tmp_path / "vijax"
-    stub.write_text(f"#!{sys.executable}\nfrom vijax.cli.main import command\ncommand()\n")
+    stub.write_text(f"#!{sys.executable}\nfrom vijax.__main__ import command\ncommand()\n")
     stub.chmod(0o755)
     environment = os.environ | {"PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
     asked = 'COMP_WORDS=(vijax sweep --wall s) COMP_CWORD=3; _vijax_completion vijax; echo "${COMPREPLY[@]}"'

@@ -189,11 +189,18 @@ def answers_without_credentials(port: int) -> bytes:
             return b""
 
 
+def blocks_ctrl_c() -> bool:
+    """Whether the thread of a task, and so its process, blocks the signal that Ctrl-C sends to all of a terminal."""
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
 def test_only_this_run_can_connect_to_its_scheduler_and_workers():
     """Any user of this machine reaches the ports, and whoever connects runs code."""
     with cluster._local(1) as client:
         address = client.scheduler_info()["address"]
         assert client.submit(os.getpid).result() != os.getpid()
+        assert client.submit(blocks_ctrl_c).result()
+        assert not blocks_ctrl_c()
         processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
         listening = [one for process in processes for one in process.net_connections() if one.status == "LISTEN"]
         ports = {one.laddr.port for one in listening}

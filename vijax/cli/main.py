@@ -1,13 +1,12 @@
 """The command `vijax`: a group of pages, each imported when it is asked for."""
 
 from importlib import import_module
-from typing import NoReturn
 
 import click
 from click.shell_completion import add_completion_class
 
 from vijax.cli.completion import Fish, Zsh
-from vijax.cli.process import leave, run
+from vijax.cli.process import run
 
 add_completion_class(Zsh)
 add_completion_class(Fish)
@@ -58,8 +57,3 @@ def vijax(ctx: click.Context) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command and return its exit code; see `process.run`."""
     return run(vijax, arguments)
-
-
-def command() -> NoReturn:
-    """Run the command as a shell calls it: the process ends with its exit code."""
-    leave(main())

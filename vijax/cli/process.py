@@ -1,4 +1,4 @@
-"""What the process of a command does: bad input is one line, warnings are, signals have their exit codes.
+"""What the process of a command does: bad input is one line, warnings are, and every end has its exit code.
 
 A page is one `door`, one run under `progress` and one `closing.finish`.
 """
@@ -6,17 +6,17 @@ A page is one `door`, one run under `progress` and one `closing.finish`.
 import gc
 import io
 import os
-import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
+from vijax.cli import signals
 from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
@@ -30,11 +30,12 @@ _ROLLED = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
 
 @contextmanager
 def door() -> Iterator[None]:
-    """Turn what is raised within into one line and exit code 2: bad input, before anything runs."""
+    """Turn an error within into one line and exit code 2: bad input, before anything runs. A run may begin after it."""
     try:
         yield
     except (ValueError, TypeError, OSError, ImportError) as error:
         raise click.UsageError(str(error)) from None
+    signals.begin_run()
 
 
 def agree(expected: "Estimate", yes: bool) -> None:
@@ -59,33 +60,36 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
     It is 0; 1 if what is to be written could not be; 2 after bad input, when nothing was run; 130 after Ctrl-C and 143
     after SIGTERM.
     """
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, _terminate)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show must not end a finished run
-    try:
-        with _compiler_told(), _warnings_told():
-            command.main(arguments, standalone_mode=False)
-    except click.ClickException as error:
-        click.echo(f"error: {error.format_message()}", err=True)
-        return 2
-    except (click.Abort, KeyboardInterrupt) as error:
-        cause = error.__cause__ or error
-        click.echo(f"stopped; {_kept(cause)}", err=True)
-        return 143 if isinstance(cause, _Terminated) else 130
-    except OSError as error:
-        where = f" ({error.filename})" if error.filename else ""
-        click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
-        return 1
-    return 0
+    _open_streams()
+    with signals.handled():
+        try:
+            with _compiler_told(), _warnings_told():
+                command.main(arguments, standalone_mode=False)
+        except click.ClickException as error:
+            click.echo(f"error: {error.format_message()}", err=True)
+            return 2
+        except (click.Abort, KeyboardInterrupt) as error:
+            cause = error.__cause__ or error
+            click.echo(f"stopped; {_kept(cause)}", err=True)
+            return 143 if isinstance(cause, signals.Terminated) else 130
+        except OSError as error:
+            where = f" ({error.filename})" if error.filename else ""
+            click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
+            return 1
+        return 0
 
 
 def stop(note: str) -> NoReturn:
-    """End a run whose Ctrl-C, or SIGTERM, was caught to keep what there was until then; the note says what that is."""
-    error: KeyboardInterrupt = _Terminated() if _TERMINATED else KeyboardInterrupt()
+    """End a run whose Ctrl-C, or SIGTERM, was caught to keep its results until then; the note says what is kept."""
+    error = signals.stopped()
     error.add_note(note)
     raise error
+
+
+def command(main: Callable[[], int]) -> NoReturn:
+    """Run what is the whole process, and end the process with the exit code that it returns."""
+    signals.own_process()
+    leave(main())
 
 
 def leave(code: int) -> NoReturn:
@@ -93,12 +97,33 @@ def leave(code: int) -> NoReturn:
 
     A compiled call that is under way then cannot be stopped, and leaving as Python does would wait for it.
     """
+    if code == 0:
+        signals.ignore()
     if code in (0, 2):
         # What is left goes back to the system, with the process: to look through all of it first takes a third of a
         # second where programs were traced.
         gc.freeze()
         sys.exit(code)
     os._exit(code)
+
+
+def _open_streams() -> None:
+    """Open the standard streams that are closed, on the null device, and let none of them fail at a character.
+
+    A file that is opened while descriptor 2 is closed becomes descriptor 2, and what a library writes to the standard
+    error goes into the file.
+    """
+    descriptor = os.open(os.devnull, os.O_RDWR)
+    while descriptor <= 2:
+        os.set_inheritable(descriptor, True)  # processes that this one starts need it, too
+        descriptor = os.dup(descriptor)
+    os.close(descriptor)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, open until the process ends
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal cannot show must not end a finished run
 
 
 @contextmanager
@@ -131,18 +156,6 @@ def _warnings_told() -> Iterator[None]:
         warnings.filterwarnings("always", category=UserWarning, module="vijax")
         warnings.showwarning = tell
         yield
-
-
-class _Terminated(KeyboardInterrupt):
-    """What SIGTERM raises."""
-
-
-_TERMINATED: list[int] = []  # signals that have come: a run that catches what they raise goes on to its end
-
-
-def _terminate(signum: int, frame: Any) -> None:
-    _TERMINATED.append(signum)
-    raise _Terminated
 
 
 def _kept(error: BaseException) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing import resource_tracker
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -204,22 +205,37 @@ def _local(number: int) -> "Iterator[Client]":
 
     # A worker that replaces a lost one reads the settings, too.
     with dask.config.set(_NO_PAGES):
-        made = _dask().LocalCluster(
-            n_workers=number,
-            threads_per_worker=max((os.cpu_count() or 1) // number, 1),
-            memory_limit=None,  # set by the tile; a worker holds no results that it could spill
-            security=_credentials(),
-            dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # of no fixed port, which another run may have
-        )
+        with _without_interrupts():
+            made = _dask().LocalCluster(
+                n_workers=number,
+                threads_per_worker=max((os.cpu_count() or 1) // number, 1),
+                memory_limit=None,  # set by the tile; a worker holds no results that it could spill
+                security=_credentials(),
+                dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # of no fixed port, which another run may have
+            )
         with made, _dask().Client(made, set_as_default=False) as client:
             kept = {name: getattr(jax.config, name) for name in _CACHE}
             client.register_worker_callbacks(partial(_settle, kept))
             yield client
 
 
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Leave Ctrl-C, which reaches all processes of a terminal, to this one alone.
+
+    Threads and processes inherit which signals are blocked: those that are started here, and what they start later.
+    Here a signal that comes meanwhile is handled at the end.
+    """
+    resource_tracker.ensure_running()  # which unblocks the signal in the thread that starts it
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _settle(kept: dict[str, Any]) -> None:
-    """Make a new process ready: it keeps compiled programs where its driver does, and leaves Ctrl-C to that."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # which reaches all processes of a terminal
+    """Make a new process keep compiled programs where its driver does."""
     for name, value in kept.items():
         jax.config.update(name, value)
