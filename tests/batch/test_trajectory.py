@@ -69,6 +69,24 @@ def test_derivatives_of_a_few_starts_at_numbers_are_those_of_differences(kappa):
                 np.testing.assert_allclose(slopes[place][which], np.diag(known), rtol=1e-7, atol=1e-9)
 
 
+def test_sums_that_mask_the_padding_have_derivatives():
+    """0 times NaN stays within the padding; both ways."""
+
+    def masked(v, transform=lambda f: f):
+        def total(v):
+            run = vijax.trajectory(impact_pair([0.2, 0.25], 50.0, [0.5, 0.6]), 0.02, v, 4, max_impacts=3)
+            impacts, states = run.impacts, run.states
+            squares = jax.numpy.where(impacts.side != 0, impacts.v_in**2, 0.0).sum()
+            return squares + jax.numpy.where(jax.numpy.isfinite(states.u), states.u**2, 0.0).sum()
+
+        return transform(total)(v)
+
+    v, h = np.array([0.3, 0.31]), 1e-6
+    assert np.isnan(vijax.trajectory(impact_pair(0.2, 50.0, 0.5), 0.02, 0.3, 4, max_impacts=3).states.u).any()
+    quotient = [(masked(v + h * row) - masked(v - h * row)) / (2 * h) for row in np.eye(2)]
+    np.testing.assert_allclose(masked(v, jax.grad), quotient, rtol=1e-6)
+
+
 def test_restarting_from_a_stroboscopic_state_goes_on_the_same():
     pair = impact_pair([0.2, 0.2, 0.15], [4.0, 40.0, 12.0], [0.5, 0.5, 0.1], [0.0, 0.05, 0.1])
     whole = vijax.trajectory(pair, 0.02, 0.3, 6)

@@ -174,6 +174,39 @@ def test_rows_and_derivatives_of_any_number_share_a_program_until_they_are_many(
     assert 5 in rows_traced[before:]
 
 
+def test_batches_of_any_length_share_a_program():
+    """Those of a few; a batch that JAX makes outside of a program is padded."""
+
+    def of_rows(y):
+        return FALLING(2.0, X[:1], y[None], room=3)[0].sum()
+
+    def of_one(y):
+        return product(GIVEN | {"y": y})
+
+    for of, known, slope, count in (
+        (of_rows, lambda y: X[0] * np.sin(y) * TIMES.sum(), lambda y: X[0] * np.cos(y) * TIMES.sum(), rows_traced),
+        (
+            of_one,
+            lambda y: np.sum(GIVEN["x"] * ABOUT) * y + np.sum(GIVEN["x"]),
+            lambda y: np.sum(GIVEN["x"] * ABOUT) + 0 * y,
+            traced,
+        ),
+    ):
+        for derivative, expected in ((lambda f: f, known), (jax.grad, slope), (jax.jacfwd, slope)):
+            y = jnp.linspace(1.0, 1.3, 8)
+            jax.vmap(derivative(of))(y[:2])
+            before = len(count)
+            for length in range(1, 9):
+                np.testing.assert_allclose(
+                    jax.vmap(derivative(of))(y[:length]), expected(np.asarray(y[:length])), rtol=1e-14
+                )
+            assert len(count) == before
+        outside = jax.grad(lambda y, of=of: jax.vmap(of)(y).sum())(y)
+        np.testing.assert_allclose(outside, slope(np.asarray(y)), rtol=1e-14)
+        nested = jax.vmap(jax.vmap(of))(jnp.stack([y, 2 * y]))
+        np.testing.assert_allclose(nested[1], known(2 * np.asarray(y)), rtol=1e-14)
+
+
 def test_what_no_row_moves_and_what_counts_has_no_slope():
     (moved, count, still), (slope, none, zero) = jax.jvp(lambda x: FALLING(2.0, x, Y, room=3), (X,), (np.ones(3),))
     np.testing.assert_array_equal(count, [1, 0, 1])

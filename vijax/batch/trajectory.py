@@ -16,8 +16,8 @@ from vijax.batch.stepped_run import stepped_run
 from vijax.engine.method import Method
 from vijax.engine.method_choice import choose
 from vijax.model import units
-from vijax.model.choices import MethodName, SolverName
-from vijax.model.excitation import Excitation, check_excitation
+from vijax.model.choices import MethodName, Periods, SolverName
+from vijax.model.excitation import Excitation, check_excitation, counted
 from vijax.model.membrane import Laws, Linear, check_restitution, of_pair
 from vijax.model.pair import ImpactPair, check_pair, check_start
 from vijax.model.records import Status
@@ -69,7 +69,7 @@ def trajectory(
     pair: ImpactPair,
     u0: ArrayLike | Sequence[float],
     v0: ArrayLike | Sequence[float],
-    periods: int,
+    periods: Periods,
     t0: ArrayLike | Sequence[float] = 0.0,
     *,
     max_impacts: int | None = None,
@@ -87,7 +87,7 @@ def trajectory(
     Args:
         pair: One cell, or arrays that broadcast against the starts.
         u0, v0: Displacement and velocity at time t0.
-        periods: The motion is followed to t = 2 periods.
+        periods: The motion is followed to t = 2 periods; "all" of a record that ends.
         t0: Time of the start, in [0, 2 periods).
         max_impacts: Room for impacts; 16 a period and 16 more unless given.
         method: "exact", "ode" or "rk4", as in `sweep`; or a `vijax.engine.method.Method`.
@@ -106,7 +106,7 @@ def trajectory(
         ValueError: Which argument, what must hold, what came.
     """
     options = {"solver": solver, "rtol": rtol, "atol": atol, "membrane": membrane, "friction": friction, "steps": steps}
-    periods = checks.whole("periods", periods, 1)
+    periods = counted(periods, check_excitation(excitation, 0))
     told = _told(check_pair(pair), method, options, check_excitation(excitation, periods))
     room = _most(periods) if max_impacts is None else checks.whole("max_impacts", max_impacts, 1)
     u0, v0, t0 = _check_starts(pair, periods, {"u0": u0, "v0": v0, "t0": t0})
@@ -190,4 +190,18 @@ def _cut(found: Trajectory, shape: tuple[int, ...], periods: int, max_impacts: i
         jax.tree.map(partial(shaped, width=width), part)
         for part, width in ((found.impacts, max_impacts), (found.states, periods))
     )
+    impacts, states = (
+        _padded_by_constants(impacts, impacts.side != 0),
+        _padded_by_constants(states, states.u == states.u),
+    )
     return tiles.arrays(Trajectory(impacts, shaped(found.filled), states, shaped(found.status)))
+
+
+def _padded_by_constants(records: Any, real: Any) -> Any:
+    """Return records whose padding is the constant NaN to a derivative.
+
+    The derivative of a sum that masks the padding holds 0 times NaN there, which goes no further than this.
+    """
+    if tiles.library(records) is np:
+        return records
+    return jax.tree.map(lambda x: jnp.where(real, x, jnp.nan) if x.dtype.kind == "f" else x, records)

@@ -14,3 +14,5 @@ Precision = Literal["float64", "float32"]
 Direction = Literal["down", "up", "both"]
 Objective = Literal["P", "power", "speed", "mean", "worst", "expected"]
 Motion = Literal["any", "periodic"]
+Periods = int | Literal["all"]
+"""Forcing periods of a run; "all" are those of a record that ends."""

@@ -285,6 +285,30 @@ def instance(excitation: Any) -> Excitation:
     return checks.instance("excitation", excitation, Excitation, "vijax.Harmonics(...), Record(...) or Noise(...)")
 
 
+def counted(periods: Any, excitation: Excitation | None, transient: int = 0) -> int:
+    """Return a number of forcing periods; for "all" the whole ones that a record holds after a transient.
+
+    Args:
+        periods: The number, or "all".
+        excitation: The excitation, in the units of a pair; None is the sine.
+        transient: Forcing periods before.
+
+    Raises:
+        ValueError: No such number, no record that ends, or one that ends within the transient.
+    """
+    if not isinstance(periods, str):
+        return checks.whole("periods", periods, 1)
+    checks.choice("periods", periods, ("all",), "or a whole number of at least 1")
+    waves = [] if excitation is None else [wave for wave in excitation.of(Waveform) if not wave.looped]
+    if not waves:
+        raise ValueError(see("excitation", 'periods must be a number unless a record ends the run; got "all"'))
+    count = int(min(wave.periods for wave in waves)) - transient
+    if count < 1:
+        must = f"transient must leave a whole period of the record, {count + transient} periods; got {transient}"
+        raise ValueError(see("excitation", must))
+    return count
+
+
 def check_excitation(excitation: Any, periods: int, *, repeats: bool = False) -> Excitation | None:
     """Pass an excitation in the units of a pair, if a run can have it; None is the sine.
 
@@ -320,7 +344,7 @@ def check_excitation(excitation: Any, periods: int, *, repeats: bool = False) ->
                 see(
                     "excitation",
                     f"periods and transient must end within the record, {wave.periods:.6g} periods; got {periods}; "
-                    "looped=True begins it again",
+                    'periods="all" takes all of it, looped=True begins it again',
                 )
             )
     return excitation

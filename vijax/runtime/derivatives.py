@@ -24,6 +24,8 @@ from vijax.runtime.xla import share
 
 T = TypeVar("T")
 
+_LEAST = 8  # elements of a batch: compiling one element less takes longer than running eight
+
 
 def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Callable[[Any], Any]) -> Callable[..., T]:
     """Compile a function, and its derivatives where its arguments are numbers.
@@ -62,20 +64,25 @@ def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Call
 
     @partial(jax.custom_jvp, nondiff_argnums=(2,))
     def call(variables: Any, fixed: Any, kind: Hashable) -> T:
-        return both(program, variables, fixed, kind)
+        return of_few_lengths(lambda variables, fixed: both(program, variables, fixed, kind))(variables, fixed)
 
     @partial(call.defjvp, symbolic_zeros=True)
     def derivative(kind: Hashable, primals: Any, tangents: Any) -> tuple[T, T]:
         variables, fixed = primals
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(primals)):
+        if not _numbers(primals):
             moved = jax.tree.map(_dense, tangents[0], is_leaf=_is_zero)
             return jax.jvp(lambda variables: both(program, variables, fixed, kind), (variables,), (moved,))
-        # Within a derivative JAX takes a program apart before it compiles it, and what is to be shared is shared no
-        # longer: twice the operations. No other thread is within one.
-        with context.pool(1) as elsewhere:
-            columns, result = elsewhere.submit(both, slopes, variables, fixed, kind).result()
+        if tiles.library(primals) is np:
+            # Within a derivative JAX takes a program apart before it compiles it, and what is to be shared is shared
+            # no longer: twice the operations. No other thread is within one.
+            with context.pool(1) as elsewhere:
+                columns, result = elsewhere.submit(both, slopes, variables, fixed, kind).result()
+            columns = list(map(np.asarray, columns))
+        else:
+            batched = of_few_lengths(lambda variables, fixed: both(slopes, variables, fixed, kind))
+            columns, result = batched(variables, fixed)
         moved = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
-        rows = iter([_by_variable(np.asarray(column), variables) for column in columns])
+        rows = iter([_by_variable(column, variables) for column in columns])
         return result, jax.tree.map(lambda leaf: _along(leaf, rows, moved, _contracted), result)
 
     return wraps(work)(lambda variables, fixed, *, kind: call(variables, fixed, kind))
@@ -109,27 +116,61 @@ def differentiable_rows(work: Callable[..., T], sizes: tuple[int, ...]) -> Calla
 
     @partial(jax.custom_jvp, nondiff_argnums=(0, 2))
     def call(fixed: Any, variables: Any, room: Hashable) -> T:
-        return part(fixed, *variables, room=room)
+        return of_few_lengths(partial(part, fixed, room=room))(*variables)
 
     @partial(call.defjvp, symbolic_zeros=True)
     def derivative(fixed: Any, room: Hashable, primals: Any, tangents: Any) -> tuple[T, T]:
         (variables,), (moved,) = primals, tangents
         rows = jax.tree.leaves(variables)
-        if tiles.library(rows) is jnp or len(rows[0]) > sizes[-1]:
+        if not _numbers(rows) or len(rows[0]) > sizes[-1]:
             steps = jax.tree.map(_dense, moved, is_leaf=_is_zero)
             return jax.jvp(lambda *variables: part(fixed, *variables, room=room), variables, steps)
-        # In a thread of its own, as above.
-        with context.pool(1) as elsewhere:
-            told = partial(slopes, fixed, room=room)
-            result, columns = elsewhere.submit(tiles.map_tiles, told, variables, sizes).result()
-        each, steps = (np.moveaxis(column, -1, 0) for column in columns), jax.tree.leaves(moved, is_leaf=_is_zero)
-        return tiles.arrays(result), jax.tree.map(lambda leaf: _along(leaf, each, steps, _row_by_row), result)
+        told, own = partial(slopes, fixed, room=room), tiles.library(rows)
+        if own is np:
+            # In a thread of its own, as above.
+            with context.pool(1) as elsewhere:
+                result, columns = elsewhere.submit(tiles.map_tiles, told, variables, sizes).result()
+            result = tiles.arrays(result)
+        else:
+            result, columns = of_few_lengths(told)(variables)
+        each, steps = (own.moveaxis(column, -1, 0) for column in columns), jax.tree.leaves(moved, is_leaf=_is_zero)
+        return result, jax.tree.map(lambda leaf: _along(leaf, each, steps, _row_by_row), result)
 
     @wraps(work)
     def run(fixed: Any, *variables: Any, room: Hashable) -> T:
         return part(fixed, *variables, room=room) if tracing() else call(fixed, variables, room)
 
     return run
+
+
+def of_few_lengths(work: Callable[..., T]) -> Callable[..., T]:
+    """Return a function of which `jax.vmap` compiles few lengths of a batch, outside of a compiled program.
+
+    A batch is padded by its last element to the next power of two, and to `_LEAST` at least. No derivative is taken of
+    the function itself.
+
+    Args:
+        work: Function of pytrees of arrays to a pytree of arrays.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def call(*given: Any) -> T:
+        return work(*given)
+
+    @call.def_vmap
+    def batch(count: int, batched: Any, *given: Any) -> tuple[Any, Any]:
+        several = jax.vmap(work, in_axes=tuple(jax.tree.map(lambda yes: 0 if yes else None, batched)))
+        if tracing():
+            result = several(*given)
+        elif tiles.library(given) is jnp:  # one batch within another
+            result = of_few_lengths(several)(*given)
+        else:
+            rows = np.minimum(np.arange(max(_LEAST, tiles.padded(count))), count - 1)
+            wide = jax.tree.map(lambda leaf, yes: np.asarray(leaf)[rows] if yes else leaf, given, tuple(batched))
+            result = tiles.arrays(jax.tree.map(lambda leaf: np.asarray(leaf)[:count], several(*wide)))
+        return result, jax.tree.map(lambda _: True, result)
+
+    return call
 
 
 @jax.custom_jvp
@@ -143,10 +184,22 @@ def _shared_slopes_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return shared_slopes(primals[0]), share(tangents[0])
 
 
-def _by_variable(column: np.ndarray, variables: Any) -> list[np.ndarray]:
+def _numbers(tree: Any) -> bool:
+    """Return whether all leaves are numbers, or batches of numbers that `jax.vmap` makes outside of a program."""
+    return not tracing() and not any(isinstance(_unbatched(leaf), jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _unbatched(leaf: Any) -> Any:
+    # The class has no public name. By another name its batches would be differentiated as JAX does, for every length.
+    while type(leaf).__name__ == "BatchTracer":
+        leaf = leaf.val
+    return leaf
+
+
+def _by_variable(column: Any, variables: Any) -> list[Any]:
     """Cut the derivatives of a result, by all numbers of the variables, into those by each of them."""
     shapes = [np.shape(leaf) for leaf in jax.tree.leaves(variables)]
-    parts = np.split(column, np.cumsum([math.prod(shape) for shape in shapes])[:-1], axis=-1)
+    parts = tiles.library(column).split(column, np.cumsum([math.prod(shape) for shape in shapes])[:-1], axis=-1)
     return [part.reshape((*column.shape[:-1], *shape)) for part, shape in zip(parts, shapes, strict=True)]
 
 
