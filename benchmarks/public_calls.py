@@ -14,7 +14,7 @@ import numpy as np
 
 import vijax
 from benchmarks import malformed
-from vijax import plots
+from vijax import plots, public
 from vijax.design.tolerance import Tolerance
 from vijax.orbits import continuation, events
 from vijax.plots import figure
@@ -70,7 +70,7 @@ class PublicCall(NamedTuple):
 
 def names() -> Iterator[str]:
     """Name everything public that has parameters: functions, records, and the methods of records."""
-    offered = {name: getattr(vijax, name) for name in vijax.__all__ if name not in RESULTS | ABSTRACT}
+    offered = {name: getattr(vijax, name) for name in public.__all__ if name not in RESULTS | ABSTRACT}
     offered |= {f"plots.{name}": getattr(plots, name) for name in plots.__all__}
     for name, one in offered.items():
         if isinstance(one, FunctionType):

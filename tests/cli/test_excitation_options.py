@@ -47,6 +47,22 @@ def test_what_cannot_be_names_its_option(given, says):
         taken(**given)
 
 
+@pytest.mark.parametrize(
+    ("names", "delimiter"), [("time,acceleration", ","), ("t a", " "), ('"t [s]", "a [m/s^2]"', ",")]
+)
+def test_a_first_line_of_names_is_left_out(tmp_path, names, delimiter):
+    file, rows = tmp_path / "bench.csv", np.c_[np.arange(5.0), np.ones(5)]
+    np.savetxt(file, rows, delimiter=delimiter, header=names, comments="")
+    assert str(taken(record=str(file))) == str(Record(*rows.T))
+
+
+def test_a_line_of_names_among_numbers_is_refused(tmp_path):
+    file = tmp_path / "bench.csv"
+    file.write_text("0,1\ntime,acceleration\n1,1\n")
+    with pytest.raises(ValueError, match="--record must be a text file of two columns of numbers; got"):
+        taken(record=str(file))
+
+
 def test_a_file_of_other_columns(tmp_path):
     file = tmp_path / "three.txt"
     np.savetxt(file, np.ones((5, 3)))

@@ -85,6 +85,8 @@ BAD = [
     (["--method", "ode", "--exponent", "2"], "exponent must be left out"),
     (["--method", "ode", "--membrane", "hyperelastic", "--radius", "0.1"], "prestretch must be given"),
     (["--method", "ode", "--membrane", "hyperelastic", "--prestretch", "2", "--radius", "3kg"], "radius must be in m"),
+    (["--beta", "20"], "beta must have a unit beyond pi/2, as 20deg or 20rad; got '20'"),
+    (["--beta", "0:20:3"], "beta must have a unit beyond pi/2"),
     (["--method", "ode", "--membrane", "hyperelastic", "--chi", "2"], "chi must be left out unless --membrane is hunt"),
     (["--method", "ode", "--stretch-limit", "20"], "stretch_limit must be left out unless --membrane is hyper"),
     (["--method", "ode", "--membrane", "hunt-crossley", "--chi=-1"], "chi must be one finite number"),
@@ -220,6 +222,7 @@ def test_walls_that_differ_arrive(planned):
     assert float(given.cells.quantities["r_right"]) == 0.6
     assert (float(given.device.V.left), float(given.device.V.right)) == (1500.0, 2000.0)
     assert planned("--wall", "rigid_left").settings.wall == "rigid_left"
+    assert planned("--set", "w0_left=0.2mm").device.w0.left == pytest.approx(2e-4, rel=1e-12)
 
 
 def test_methods_and_membranes_arrive(planned):

@@ -9,6 +9,7 @@ import vijax
 from vijax import Harmonics, Harvester, Noise, Record, Waveform
 from vijax.engine.forcing import forcing
 from vijax.model.excitation import check_excitation
+from vijax.planes.axes import counted_periods
 
 TIME = np.linspace(0, 4, 401)
 SHAKEN = np.cos(4 * np.pi * TIME)
@@ -67,7 +68,7 @@ def test_what_a_run_can_have():
     record, once = Record(TIME, SHAKEN), Waveform(SHAKEN, 50.0, looped=False)
     with pytest.raises(ValueError, match=r"excitation must be in the units of the pair; got a Record"):
         check_excitation(record, 5)
-    with pytest.raises(ValueError, match="periods and transient must end within the record, 8 periods; got 9"):
+    with pytest.raises(ValueError, match='within the record, 8 periods; got 9; periods="all" takes all of it'):
         check_excitation(once, 9)
     with pytest.raises(ValueError, match='until must be "window" with an excitation that does not repeat'):
         check_excitation(Harmonics() + Noise(0.1, 32), 9, repeats=True)
@@ -145,3 +146,23 @@ def test_power_under_a_record_does_not_hang_on_the_units():
     assert one.attrs["excitation"] == str(record)
     with pytest.raises(ValueError, match="omega must be one number with a record, which is told in units of it; got 2"):
         vijax.sweep(**told, omega=[3.0, 4.0])
+
+
+def test_all_of_a_record_is_as_many_whole_periods_as_it_holds():
+    record = Record(np.arange(0.0, 10.7, 0.1), np.ones(107))
+    device = Harvester(omega=2 * np.pi)
+    assert counted_periods("all", record, 2, {"d": 0.2, "omega": None}, device) == 8
+    assert counted_periods("all", record, 0, {"omega": 4 * np.pi}, device) == 21
+    wave = record.waveform(device)
+    pair = vijax.impact_pair(0.2, 40.0, 0.5)
+    assert vijax.trajectory(pair, 0.0, 0.3, "all", excitation=wave).states.u.shape == (10,)
+    for excitation, message in (
+        (None, 'periods must be a number unless a record ends the run; got "all"'),
+        (Record(record.time, record.acceleration, looped=True), "periods must be a number unless a record ends"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vijax.sweep(d=0.2, device=device, until="window", periods="all", excitation=excitation)
+    with pytest.raises(ValueError, match="transient must leave a whole period of the record, 10 periods; got 10"):
+        vijax.response(device, record, periods="all", transient=10)
+    with pytest.raises(ValueError, match=r'periods must be "all"; got .half.; or a whole number of at least 1'):
+        vijax.response(device, record, periods="half")

@@ -6,9 +6,11 @@ import re
 from pathlib import Path
 
 import click
+import jax
 import numpy as np
 import pytest
 
+from vijax import HuntCrossley, Hyperelastic, sweep
 from vijax.cli import main as command
 from vijax.model import quantities, variables
 from vijax.model.device import Harvester, with_constants
@@ -158,6 +160,25 @@ def test_membranes_are_a_diameter_further_apart_than_the_ball_travels():
         cells({"distance": 0.1, "s": 0.1}, device, "soft")
     with pytest.raises(TypeError, match="a distance D apart have s = D - 2 r_b, the free travel of the ball"):
         Harvester(distance=0.014)
+
+
+def test_whole_numbers_of_a_device_have_derivatives():
+    made = Harvester(V=1500, s=[1, 2], penetration_limit=1)
+    assert isinstance(made.V, float)
+    assert made.s.dtype == np.float64
+    assert isinstance(with_constants(made, k=560, V_left=1000).V.left, float)
+    slope = jax.grad(lambda device: device.V * device.R0)(Harvester(V=1500))
+    assert (float(slope.V), float(slope.R0)) == (0.0063, 1500.0)
+    assert isinstance(HuntCrossley(1, 2, 3).chi, float)
+    assert isinstance(Hyperelastic(2, 1, 9).prestretch, float)
+
+
+@pytest.mark.parametrize(("name", "advice"), [("s", "give s as an axis"), ("m_b", "m_b is no axis")])
+def test_a_device_of_several_is_refused_with_what_can_be_done(name, advice):
+    several = Harvester(**{name: np.array([0.003, 0.004])})
+    message = rf"device.{name} must be one number; got shape \(2,\); {advice}, or make a call for each device"
+    with pytest.raises(ValueError, match=message):
+        sweep(device=several)
 
 
 def test_a_diagram_may_be_along_every_parameter():

@@ -160,8 +160,10 @@ def test_from_the_command_line(tmp_path, monkeypatch, capsys):
     assert diagram_script.main(["--set", "V=2mm"]) == 2
     assert "V must be in V" in capsys.readouterr().err
     with pytest.raises(_StopError):
-        diagram_script.main(["--beta", "20", "--along", "omega=1:2:3"])
+        diagram_script.main(["--beta", "20rad", "--along", "omega=1:2:3"])
     assert capsys.readouterr().err.count("warning: beta is up to 20 rad") == 1
+    assert diagram_script.main(["--beta", "20", "--along", "omega=1:2:3"]) == 2
+    assert capsys.readouterr().err.startswith("error: beta must have a unit beyond pi/2, as 20deg or 20rad; got '20'")
 
 
 class _StopError(Exception):

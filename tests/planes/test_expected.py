@@ -105,6 +105,9 @@ def test_a_run_stops_between_two_starts():
         dispatch.perform(dispatch.Call(planned, np.arange(1), 8, 0), places()[0], stopped)
 
 
+RECORD = vijax.Record(np.arange(0.0, 9.0, 0.5), np.ones(18))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -115,6 +118,11 @@ def test_a_run_stops_between_two_starts():
         ({"until": "window"}, "until must be left out of a map of several starts; got 'window'"),
         ({"dtype": "float32"}, "dtype must be left out of a map of several starts"),
         ({"outputs": ["period"]}, "outputs must"),
+        (
+            {"excitation": RECORD},
+            "excitation must be left out of a map of several starts; got record .*; vijax.response",
+        ),
+        ({"excitation": RECORD, "until": "window"}, "excitation must be left out of a map of several starts"),
     ],
 )
 def test_bad_input_is_told(change, message):

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vijax.cli.options import PHYSICAL
-from vijax.model.quantities import AXES, of_both_walls
+from vijax.model.quantities import AXES, of_both_walls, whole
 
 if TYPE_CHECKING:
     from vijax.model.choices import Walls
@@ -51,7 +51,7 @@ def device(constants: Iterable[str]) -> "Harvester":
         except ValueError:
             raise ValueError(f"set must be NAME=VALUE with a number; got {text!r}") from None
         if unit:
-            values[name] = units.with_unit(name, values[name], unit)
+            values[name] = units.with_unit(whole(name), values[name], unit, name)
     with about("set"):
         return with_constants(Harvester(), **values)
 

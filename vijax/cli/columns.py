@@ -10,7 +10,7 @@ _WORDS = {2: "two", 3: "three"}
 
 
 def columns(name: str, path: str, counts: Collection[int]) -> "np.ndarray":
-    """Read the columns of a file, lines that begin with # left out.
+    """Read the columns of a file, without lines that begin with # and a first line of names.
 
     Args:
         name: Of the argument.
@@ -24,7 +24,11 @@ def columns(name: str, path: str, counts: Collection[int]) -> "np.ndarray":
 
     must = f"{name} must be a text file of {' or '.join(_WORDS[count] for count in counts)} columns of numbers"
     try:
-        read = np.loadtxt(path, delimiter="," if _parted_by_commas(path) else None, unpack=True, ndmin=2)
+        with open(path, encoding="utf-8") as file:
+            lines = [line for line in file if line.strip() and not line.lstrip().startswith("#")]
+        delimiter = "," if lines and "," in lines[0] else None
+        names = lines and not _are_numbers(lines[0].split(delimiter))
+        read = np.loadtxt(lines[1:] if names else lines, delimiter=delimiter, unpack=True, ndmin=2)
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise ValueError(f"{must}; got {path!r}: {error}") from None
     if len(read) not in counts:
@@ -32,6 +36,12 @@ def columns(name: str, path: str, counts: Collection[int]) -> "np.ndarray":
     return read
 
 
-def _parted_by_commas(path: str) -> bool:
-    with open(path, encoding="utf-8") as file:
-        return "," in next((line for line in file if line.strip() and not line.startswith("#")), "")
+def _are_numbers(items: list[str]) -> bool:
+    """Return whether any of the items is a number: a line of names has none."""
+    for item in items:
+        try:
+            float(item)
+        except ValueError:
+            continue
+        return True
+    return False

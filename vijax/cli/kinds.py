@@ -42,6 +42,14 @@ class Whole(click.IntRange):
             return checks.whole(_name(param), number, least)
 
 
+class Periods(Whole):
+    """A whole number of forcing periods, or "all" of a record."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number, or the word."""
+        return value if value == "all" else super().convert(value, param, ctx)
+
+
 class Number(click.ParamType):
     """A real number; of a quantity that has a unit, with that unit or another one of the kind, as in 20mm.
 

@@ -9,7 +9,7 @@ from vijax.cli import options, process
 from vijax.cli.arguments import at_one_point, device, take_axes
 from vijax.cli.closing import finish, how_many
 from vijax.cli.excitation import excitation_options, take_excitation
-from vijax.cli.kinds import Whole
+from vijax.cli.kinds import Periods, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress
 from vijax.cli.targets import targets
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _DEVICE = {"d": "0.2", "kappa": "30"}
+_PERIODS = "forcing periods measured; all of a record"
 _FILES = ("response.zarr", "response.png")
 
 
@@ -83,7 +84,7 @@ def _sections() -> Sections:
             click.Option(
                 ["--realisations"], type=Whole(2), default=64, show_default=True, help="starts, each with noise"
             ),
-            click.Option(["--periods"], type=Whole(1), default=400, show_default=True, help="forcing periods measured"),
+            click.Option(["--periods"], type=Periods(1), default=400, show_default=True, help=_PERIODS),
             click.Option(["--transient"], type=Whole(0), default=100, show_default=True, help="periods to drop before"),
             click.Option(["--bins"], type=Whole(1), default=50, show_default=True, help="of the distributions"),
         ],

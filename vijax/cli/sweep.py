@@ -11,7 +11,7 @@ from vijax.cli import membranes, options, process
 from vijax.cli.arguments import device, take_axes
 from vijax.cli.closing import finish, statuses, tally
 from vijax.cli.excitation import excitation_options, take_excitation
-from vijax.cli.kinds import Choice, Real, Whole
+from vijax.cli.kinds import Choice, Periods, Real, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
 from vijax.cli.targets import drawn, targets
@@ -141,11 +141,13 @@ def _wanted(outputs: str | None, show: str, starts: int) -> list[str] | None:
 
 
 def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: dict[str, Any]) -> "SweepPlan":
+    from vijax.planes.axes import counted_periods
     from vijax.planes.sweep import plan
     from vijax.planes.sweep_settings import SweepSettings
 
     membrane = membranes.take_membrane(given)
     refine, starts, excitation = given.pop("refine"), given.pop("starts"), take_excitation(given)
+    given["periods"] = counted_periods(given["periods"], excitation, given["transient"], axes, device)
     settings = SweepSettings(**given, membrane=membrane, excitation=excitation)
     return plan(axes, outputs, device, settings, refine, starts)
 
@@ -234,7 +236,7 @@ def plane_options() -> list[click.Parameter]:
 def run_options() -> list[click.Parameter]:
     """Make options of how long cells are run."""
     return [
-        options.setting("periods", "forcing periods to run, at most", Whole(1)),
+        options.setting("periods", "forcing periods to run, at most; all of a record", Periods(1)),
         options.setting("until", "what cells are run to"),
         options.setting("transient", "periods to drop before a window", Whole(0)),
     ]

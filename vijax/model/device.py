@@ -13,7 +13,7 @@ import numpy as np
 from vijax.model import units
 from vijax.model.choices import Walls
 from vijax.model.pair import WALLS, ImpactPair, Real, check_pair, impact_pair, pair_of
-from vijax.model.quantities import SIDES, whole
+from vijax.model.quantities import AXES, SIDES, whole
 from vijax.model.sides import Sides, apart, at, each, named, with_own
 from vijax.runtime import checks
 from vijax.runtime.checks import is_concrete
@@ -356,8 +356,9 @@ def one_device(device: Any) -> Harvester:
     for name, value in vars(checks.known("device", check_device(device))).items():
         for argument, one in named(name, value).items():
             if one is not None and np.ndim(one):
+                advice = f"give {argument} as an axis" if argument in AXES else f"{argument} is no axis"
                 raise ValueError(
                     f"device.{argument} must be one number; got shape {np.shape(one)}; "
-                    "give it as an axis, or one device each"
+                    f"{advice}, or make a call for each device"
                 )
     return device

@@ -6,12 +6,16 @@ several together in `cells`.
 
 import errno
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
 from vijax.model import units
+from vijax.model.choices import Periods
+from vijax.model.device import Harvester, one_device, with_constants
+from vijax.model.excitation import Excitation, Record, counted, instance
 from vijax.model.quantities import check
 from vijax.model.units import Given
 from vijax.runtime import checks
@@ -95,6 +99,9 @@ def _number(name: str, item: str, unit: str, text: str) -> float:
     except ValueError:
         within = "" if item == text else f" in {text!r}"
         raise ValueError(see("maps", f"{name} must be {_FORMS}; got {item!r}{within}")) from None
+    # Degrees taken for radians would be another device, and nobody would see it.
+    if not unit and units.UNITS.get(name) == "rad" and abs(value) > 0.5 * math.pi:
+        raise ValueError(see("maps", f"{name} must have a unit beyond pi/2, as 20deg or 20rad; got {item!r}"))
     return units.with_unit(name, value, unit) if unit else value
 
 
@@ -178,3 +185,36 @@ def check_axis(name: str, values: Any, quantity: str | None = None) -> np.ndarra
     array = array.astype(np.float64)
     check(quantity or name, array, name)
     return array
+
+
+def counted_periods(
+    periods: Periods, excitation: Excitation | None, transient: int, axes: Mapping[str, Any], device: Harvester | None
+) -> int:
+    """Return a number of forcing periods; for "all" those of a record in the units of axes and device.
+
+    Args:
+        periods, excitation, transient, device: As in `sweep`.
+        axes: Value or values of each axis; None counts as not given.
+    """
+    if not isinstance(periods, str):
+        return periods
+    given = {name: values for name, values in axes.items() if values is not None}
+    own = units_of_record(one_device(device), given, excitation)
+    shaken = None if excitation is None else instance(excitation).scaled(own)
+    return counted(periods, shaken, checks.whole("transient", transient, 0))
+
+
+def units_of_record(device: Harvester, given: Mapping[str, Any], excitation: Excitation | None) -> Harvester:
+    """Return the device whose units are those of a record in every cell.
+
+    Raises:
+        ValueError: Several A or omega, which would be several units.
+    """
+    if excitation is None or not instance(excitation).of(Record):
+        return device
+    scales = {name: check_axis(name, given[name], name) for name in ("A", "omega") if name in given}
+    for name, values in scales.items():
+        if values.size != 1:
+            must = f"{name} must be one number with a record, which is told in units of it; got {values.size}"
+            raise ValueError(see("excitation", must))
+    return with_constants(device, **{name: float(values.flat[0]) for name, values in scales.items()})

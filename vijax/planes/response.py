@@ -10,9 +10,9 @@ import numpy as np
 
 from vijax.batch.trajectory import complete_trajectory
 from vijax.model import energy
-from vijax.model.choices import Walls
+from vijax.model.choices import Periods, Walls
 from vijax.model.device import Harvester, depth_unit, one_device
-from vijax.model.excitation import Excitation, Noise, Sum, check_excitation, instance
+from vijax.model.excitation import Excitation, Noise, Sum, check_excitation, counted, instance
 from vijax.model.pair import WALLS
 from vijax.model.quantities import MEASURED
 from vijax.model.records import State, Status
@@ -43,7 +43,7 @@ def response(
     *,
     wall: Walls = "soft",
     realisations: int = 64,
-    periods: int = 400,
+    periods: Periods = 400,
     transient: int = 100,
     bins: int = 50,
     attractors: bool = True,
@@ -65,7 +65,7 @@ def response(
         excitation: What shakes it; a `Record` is told in the device's units. The sine unless given.
         wall: "soft", "rigid", "rigid_left" or "rigid_right", as in `sweep`.
         realisations: How many, at least 2.
-        periods: Forcing periods that are measured, after `transient` of them.
+        periods: Forcing periods that are measured, after `transient` of them; "all" of a record that ends.
         transient: Forcing periods to drop first.
         bins: Of the distributions.
         attractors: Whether to find the attractors that the excitation has without its noise, where it has noise, and
@@ -90,13 +90,15 @@ def response(
 
     device = one_device(device)
     checks.choice("wall", wall, WALLS)
+    scaled = None if excitation is None else instance(excitation).scaled(device)
+    transient = checks.whole("transient", transient, 0)
     asked = _Asked(
         device,
-        None if excitation is None else instance(excitation).scaled(device),
+        scaled,
         wall,
         checks.whole("realisations", realisations, 2, MOST_STARTS),
-        checks.whole("periods", periods, 1),
-        checks.whole("transient", transient, 0),
+        counted(periods, scaled, transient),
+        transient,
         checks.whole("bins", bins, 1, 10_000),
     )
     check_excitation(asked.excitation, asked.periods + asked.transient)

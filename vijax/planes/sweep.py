@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from vijax.model.choices import MethodName, Precision, SolverName, Until, Walls
-from vijax.model.device import Harvester, one_device, with_constants
-from vijax.model.excitation import Excitation, Record
+from vijax.model.choices import MethodName, Periods, Precision, SolverName, Until, Walls
+from vijax.model.device import Harvester, one_device
+from vijax.model.excitation import Excitation
 from vijax.model.membrane import Laws, Linear, has_units, one_of
 from vijax.planes import cluster, dispatch, estimate, store_filling, tile_size, tiled_store
 from vijax.planes import refine as refinement
-from vijax.planes.axes import Axes, check_axis
+from vijax.planes.axes import Axes, counted_periods, units_of_record
 from vijax.planes.cells import Cells, cells
 from vijax.planes.dataset import DEFAULT, SweepPlan, label, warn_if_held
 from vijax.planes.dispatch import Fields
@@ -39,7 +39,7 @@ _LOG = logging.getLogger(__name__)
 @door
 def sweep(
     *,
-    periods: int = SweepSettings.periods,
+    periods: Periods = SweepSettings.periods,
     until: Until = SweepSettings.until,
     transient: int = SweepSettings.transient,
     wall: Walls = SweepSettings.wall,
@@ -83,7 +83,8 @@ def sweep(
     walls however many kappa: it then enters energies alone.
 
     Args:
-        periods: Forcing periods to run: at most (until="attractor"), or after the transient (until="window").
+        periods: Forcing periods to run: at most (until="attractor"), or after the transient (until="window"); "all" of
+            a record that ends.
         until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
             `transient` periods and measures over the next `periods`.
         transient: Forcing periods to drop before a window. The search for an attractor begins at once and takes none;
@@ -146,7 +147,7 @@ def sweep(
     Source: Eqs. (36)-(38), corrected.
     """
     settings = SweepSettings(
-        periods=periods,
+        periods=counted_periods(periods, excitation, transient, axes, device),
         until=until,
         transient=transient,
         wall=wall,
@@ -189,9 +190,9 @@ def plan(
     wanted = checks.words("outputs", outputs, table(starts))
     device = one_device(device)
     given = {name: values for name, values in axes.items() if values is not None}
-    method = settings.integrator(_in_units(device, given, settings))
     if starts > 1:
         _check_spread(given, settings, refine)
+    method = settings.integrator(units_of_record(device, given, settings.excitation))
     law = Linear() if method is None else method.law
     lossy = one_of(law).restitution
     laid_out = cells(given, device, settings.wall, restitution=lossy, dimensional=has_units(law))
@@ -213,22 +214,6 @@ def plan(
     )
 
 
-def _in_units(device: Harvester, given: Mapping[str, Any], settings: SweepSettings) -> Harvester:
-    """Give the device in whose units a record is told: those of every cell.
-
-    Raises:
-        ValueError: Several A or omega, which would be several units.
-    """
-    if settings.excitation is None or not settings.excitation.of(Record):
-        return device
-    units = {name: check_axis(name, given[name], name) for name in ("A", "omega") if name in given}
-    for name, values in units.items():
-        if values.size != 1:
-            must = f"{name} must be one number with a record, which is told in units of it; got {values.size}"
-            raise ValueError(see("excitation", must))
-    return with_constants(device, **{name: float(values.flat[0]) for name, values in units.items()})
-
-
 def _check_spread(given: Mapping[str, Any], settings: SweepSettings, refine: int | None) -> None:
     """Raise unless cells can be run from many starts each."""
     for name in ("u0", "v0"):
@@ -238,6 +223,11 @@ def _check_spread(given: Mapping[str, Any], settings: SweepSettings, refine: int
             )
     if refine is not None:
         raise ValueError(f"refine must be left out where cells have several starts; got {checks.shown(refine)}")
+    if settings.excitation is not None:
+        raise ValueError(
+            f"excitation must be left out of a map of several starts; got {settings.excitation}; vijax.response runs "
+            "many starts of one device"
+        )
     settings.only("a map of several starts", "periods", "wall")
 
 
