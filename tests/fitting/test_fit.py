@@ -91,7 +91,7 @@ def test_units_of_pint(timed):
     plain = vijax.fit(timed.times, timed.sides, timing_error=ERROR, **told)
     with_units = vijax.fit(timed.times * 1e3 * ureg.ms, timed.sides, timing_error=ERROR * 1e6 * ureg.us, **told)
     assert with_units.values["r"] == pytest.approx(plain.values["r"], rel=1e-6)
-    with pytest.raises(ValueError, match="time must be in s"):
+    with pytest.raises(ValueError, match="times must be in s"):
         vijax.fit(timed.times * ureg.m, timed.sides, timing_error=ERROR, **told)
     record = vijax.Record(np.arange(5) * 1e3 * ureg.ms, np.ones(5) * ureg.cm / ureg.s**2)
     assert record.step == pytest.approx(1.0)
