@@ -28,6 +28,20 @@ def measured(device, periods, *, excitation=None, wall="soft", skip=10, error=0.
     return Measured(times, side.astype(float), np.abs(v) * float(device.speed_unit))
 
 
+def with_faults(times, sides, missed=(), false=()):
+    """Remove impacts, and add false ones: each after an impact, at a part of the gap, on a side.
+
+    Returns:
+        Times, sides, and which impacts are false.
+    """
+    kept = np.delete(np.arange(times.size), missed)
+    added = np.array([times[k] + part * (times[k + 1] - times[k]) for k, part, _ in false])
+    every = np.append(times[kept], added)
+    order = np.argsort(every)
+    walls = np.append(sides[kept], [side for *_, side in false])
+    return every[order], walls[order], np.flatnonzero(order >= kept.size)
+
+
 def measured_one_by_one(device, count, restitution, *, error=0.0, seed=0, skip=10):
     """Do what `measured` does where restitution is a function of the impact speed in m/s: impact by impact."""
     half, unit = float(device.pair().d) / 2, float(device.speed_unit)

@@ -8,7 +8,7 @@ import vijax
 from tests.fitting.bench import SIDES, measured
 from vijax.fitting import unknowns
 from vijax.fitting.fit_model import FitModel
-from vijax.fitting.interval import Ends, motions
+from vijax.fitting.interval import Ends, Restitution, guessed_motions, interval
 from vijax.fitting.mismatch import least_chain, linearised
 from vijax.fitting.series import Series
 from vijax.fitting.shaking import shaking
@@ -71,7 +71,13 @@ def test_no_motion_to_the_next_impact_is_missed(onsets):
     t, speed = (np.ravel(numbers) for numbers in onsets)
     after = vijax.trajectory(pair, 0.5 * pair.d, speed, 3, t).impacts
     n, next_t, next_side = (np.asarray(leaf, float)[:, 0] for leaf in (after.n, after.t, after.side))
-    each = jax.vmap(lambda *told: motions(pair, push, Ends(np.asarray(1.0), *told)).speed)
+
+    def speeds(*told):
+        ends, none = Ends(np.asarray(1.0), *told), Restitution(np.asarray(0.0), np.asarray(0.0))
+        near, _ = guessed_motions(pair, push, ends)
+        return jax.vmap(lambda one: interval(pair, push, none, ends, one).speed)(near)
+
+    each = jax.vmap(speeds)
     off = np.abs(np.asarray(jax.jit(each)(next_side, t, 2 * n + next_t)) - speed[:, None])
     assert np.nanmin(off, axis=1).max() < 1e-9
 

@@ -5,7 +5,7 @@ that two equations share is counted once, so that the standard errors of the unk
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -13,20 +13,53 @@ import scipy.sparse
 
 from vijax.fitting.fit_model import FitModel
 from vijax.fitting.interval import Motion
-from vijax.fitting.mismatch import Equations, linearised
+from vijax.fitting.mismatch import Equations, finite, linearised
 from vijax.fitting.series import Series
 
-# The adjustment ends when no time moves by this part of its error any more, or after so many steps.
-_SETTLED = 1e-4
-_MOST_STEPS, _MOST_FREE_STEPS = 12, 40
+# The adjustment ends when no time moves by this part of its error any more, after so many steps, and when so many steps
+# in a row are larger than one before.
+_SETTLED, _MOST_STEPS, _PATIENCE = 1e-4, 40, 6
 # Steps that shrink by less are swinging.
 _SHRINKS, _HALF = 0.5, 0.5
 # No time moves by more than this part of the way to the next one, and no variable by more in one step.
-_FARTHEST, _LONGEST = 0.3, 0.3
+_FARTHEST, _LONGEST = 0.3, 0.2
 # By what part the variance of an equation is its own at least.
 _INDEPENDENT = 1e-9
 # An equation without a motion counts as one that is missed by so many standard errors.
 _UNANSWERED = 10.0
+
+
+class Prior(NamedTuple):
+    """What is known of the unknowns before the impacts: combinations that these do not tell stay near it.
+
+    Attributes:
+        z: Their variables.
+        error: The standard error of each.
+    """
+
+    z: np.ndarray
+    error: float
+
+
+@dataclass
+class _Steps:
+    """Steps of an adjustment: which part of each is taken, and when they end."""
+
+    ends: bool = False
+    taken: int = 0
+    part: float = 1.0
+    last: float = np.inf
+    least: float = np.inf
+    larger: int = 0
+
+    def part_of(self, size: float, enough: float) -> float:
+        """Return the part of a step that is taken."""
+        # Steps that swing to and fro are halved: their mean lies nearer.
+        self.part, self.last = (self.part if size < _SHRINKS * self.last else _HALF), size
+        self.larger = 0 if size < self.least else self.larger + 1
+        self.least, self.taken = min(size, self.least), self.taken + 1
+        self.ends = size < enough or self.taken == _MOST_STEPS or self.larger == _PATIENCE
+        return self.part
 
 
 @dataclass(frozen=True)
@@ -75,6 +108,17 @@ class Settled:
         """Compute the derivatives of the residuals by the variables [equation, unknown]."""
         return self.white(self.linear.by_unknown)
 
+    def step(self, prior: Prior, among: np.ndarray | None = None) -> np.ndarray:
+        """Compute the step of the variables to the least sum of squares, to first order.
+
+        Args:
+            prior: What is known of them beforehand.
+            among: Orthonormal directions among which the step lies [direction, unknown]; all unless given.
+        """
+        basis = np.eye(self.z.size) if among is None else among
+        slopes = np.vstack([self.slopes @ basis.T, np.eye(len(basis)) / prior.error])
+        return np.linalg.lstsq(slopes, -np.append(self.residuals, basis @ (self.z - prior.z) / prior.error))[0] @ basis
+
     @property
     def penalised(self) -> np.ndarray:
         """Give the residuals, and one more of the equations that no motion answers."""
@@ -100,7 +144,7 @@ class Adjustment:
     Attributes:
         model: What is fitted.
         series: What it is fitted to.
-        soft: To within what equations are kept, in units of A pi/omega.
+        soft: To within what equations are kept, in units of A pi/omega; of speeds, in m/s.
         aside: Which of them do not count [equation]; None for none.
     """
 
@@ -110,38 +154,34 @@ class Adjustment:
     aside: np.ndarray | None = None
 
 
-def settle(task: Adjustment, z: np.ndarray, times: np.ndarray, *, free: bool = False) -> Settled:
+def settle(task: Adjustment, z: np.ndarray, times: np.ndarray, prior: Prior | None = None) -> Settled:
     """Adjust times to unknowns, from times to begin with.
 
     Args:
         task: What is fitted to what.
         z: Variables of the unknowns.
         times: Onsets to begin with [s].
-        free: Whether to adjust the unknowns as well, in the same steps, which is quick near the right ones.
+        prior: What is known of the unknowns, to adjust them as well, in the same steps, which is quick near the right
+            ones.
     """
-    series = task.series
+    series, motion = task.series, _Steps()
     gaps = np.diff(series.times)
     most = _FARTHEST * np.minimum(np.append(gaps, np.inf), np.insert(gaps, 0, np.inf))
     enough = _SETTLED * series.timing_error
-    part, last, lost, near = 1.0, np.inf, False, None
-    for _ in range(_MOST_FREE_STEPS if free else _MOST_STEPS):
+    lost, near = False, None
+    while not motion.ends:
         # An equation that once had no motion stays away: it would come and go, and no time would come to rest.
         now = adjusted(task, z, times, lost, near)
         near = now.linear.motions
         lost = now.counts & ~now.used
         off, farther = now.off, np.zeros_like(z)
-        if free:
-            farther = np.clip(z + np.linalg.lstsq(now.slopes, -now.residuals)[0], *task.model.limits) - z
-            farther = np.clip(farther, -_LONGEST, _LONGEST)
+        if prior is not None:
+            farther = np.clip(z + np.clip(now.step(prior), -_LONGEST, _LONGEST), *task.model.limits) - z
             off = off + np.where(now.used, now.linear.by_unknown @ farther, 0.0)
         moved = series.timing_error**2 * (now.kept.T @ scipy.linalg.cho_solve_banded((now.factor, True), off))
         step = series.times - np.clip(moved, -most, most) - times
-        # Steps that swing to and fro are halved: their mean lies nearer.
-        size = np.abs(step).max()
-        part, last = (part if size < _SHRINKS * last else _HALF), size
+        part = motion.part_of(float(np.abs(step).max()), enough)
         times, z = times + part * step, z + part * farther
-        if size < enough:
-            break
     resting = now.kept.astype(bool) @ (np.abs(step) >= enough)
     return replace(now, restless=lost | (now.counts & resting))
 
@@ -160,11 +200,18 @@ def adjusted(
     return Settled(z, times, linear, factor, off, kept, counts, used, counts)
 
 
-def finite(matrix: Any) -> Any:
-    """Copy a sparse matrix with 0 in place of what is not finite."""
-    matrix = matrix.copy()
-    matrix.data = np.nan_to_num(matrix.data, nan=0.0, posinf=0.0, neginf=0.0)
-    return matrix
+def without(series: Series, found: Settled, equations: np.ndarray) -> Settled:
+    """Return adjusted times without some equations; times and unknowns stay.
+
+    Args:
+        series: What was fitted.
+        found: Where the equations hold.
+        equations: Which are left out [equation].
+    """
+    used = found.used & ~equations
+    kept = scipy.sparse.diags_array(used.astype(float)) @ found.kept
+    factor = _factor(series.timing_error**2 * (kept @ kept.T), found.linear.own_variance, used)
+    return replace(found, factor=factor, kept=kept, used=used, counts=found.counts & ~equations)
 
 
 def _factor(shared: Any, own: np.ndarray, used: np.ndarray) -> np.ndarray:

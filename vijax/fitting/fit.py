@@ -92,7 +92,7 @@ def fit(
     shape = _shaking(series, shaken, device, wall)
     model = FitModel(jax.tree.map(np.asarray, device), names, wall, shape, limits(device, names))
     begin = known(device, names)
-    ends = least_squares(model, series, _begin(model, series, begin))
+    ends = least_squares(model, series, _places(model, begin))
     return told(model, series, ends, begin)
 
 
@@ -133,15 +133,10 @@ def _shaking(series: Series, excitation: Excitation | None, device: Harvester, w
     return jax.tree.map(np.asarray, shaking(excitation, 2 * longest, softest / 2))
 
 
-def _begin(model: FitModel, series: Series, here: np.ndarray) -> np.ndarray:
-    """Choose where to begin: at the device as it is known, or about it where that explains more, at any delay."""
-    from vijax.fitting.search import answers, best_begin
-
-    if DELAY not in model.names and answers(model, series, here):
-        return here
+def _places(model: FitModel, here: np.ndarray) -> list[np.ndarray]:
+    """List where a search may begin: at the device as it is known, and about it, at any delay."""
     moves = np.array([_LINEAR_ABOUT if name in LINEAR else _ABOUT for name in model.names])
     if DELAY in model.names:
         moves[-1] = 0.0 if model.shaking.sampled else 1.0
     points = 2 * lattice(_PLACES, len(here)).T - 1
-    places = np.clip([here, *(here + moves * point for point in points)], *model.limits)
-    return best_begin(model, series, list(places))
+    return list(np.clip([here, *(here + moves * point for point in points)], *model.limits))

@@ -62,19 +62,23 @@ class Fit:
     Attributes:
         device: With the fitted values.
         values: Of every unknown, in SI units.
-        stderr: Their standard errors; infinite where the data do not tell the value.
+        stderr: Their standard errors, which include the distances to `alternatives`; infinite where the data do not
+            tell the value.
         correlation: Of their errors [unknown, unknown]; NaN where they are infinite.
         untold: Combinations that the data do not tell, the names of each: of these only what is held can be told.
         alternatives: Other values of all unknowns that fit as well.
         misfit: How much larger residuals are than the stated errors; where that is not by chance, `stderr` is as many
             times as large as the stated errors make it.
         constancy: Whether restitution hangs on speed.
-        residuals: Measured less adjusted times, in standard errors [impact].
-        speeds: Impact speeds [m/s] [impact].
-        astray: Impacts on which the motion before and the motion after do not agree, and that were left out: the bench
-            missed one there, or took something else for one, or it was too slow to tell [impact].
+        residuals: Measured less adjusted times, in standard errors; NaN for false impacts [impact].
+        speeds: Impact speeds [m/s]; NaN for false impacts [impact].
+        astray: Impacts that were left out: they are false, or the bench missed one before or after them, or the contact
+            was too long for the time of the next impact to depend on them [impact].
+        false: Impacts that are not impacts of the ball: the motions before and after agree without them alone [impact].
+        decisive: Impacts without one of which the error of a value more than doubles. If such an impact is false, no
+            other impact contradicts the values; `stderr` is therefore the error without them [impact].
         converged: Whether a device was found that explains at least two thirds of the impacts, to five times the stated
-            errors.
+            errors, with at most 12 faults of the bench, or a tenth of the impacts if that is more.
     """
 
     device: Harvester
@@ -88,6 +92,8 @@ class Fit:
     residuals: np.ndarray
     speeds: np.ndarray
     astray: np.ndarray
+    false: np.ndarray
+    decisive: np.ndarray
     converged: bool
 
     def report(self) -> dict[str, Any]:
@@ -99,7 +105,7 @@ class Fit:
         own["converged"] = self.converged
         own["units"] = {name: unit_of(name) for name in self.values}
         own["constancy"] = {"slope": test.slope, "stderr": test.stderr, "p_value": test.p_value}
-        return own | {name: getattr(self, name) for name in ("residuals", "speeds", "astray")}
+        return own | {name: getattr(self, name) for name in ("residuals", "speeds", "astray", "false", "decisive")}
 
     def __str__(self) -> str:
         """Say what was found, a line each."""
@@ -120,7 +126,9 @@ class Fit:
             yield "as good: " + ", ".join(f"{name} = {value:.6g}" for name, value in other.items())
         misfit = self.misfit
         yield f"misfit: {misfit.size:.3g} of the stated errors ({misfit.freedom} degrees, p = {misfit.p_value:.2g})"
-        yield f"impacts left out: {int(self.astray.sum())} of {self.astray.size}"
+        yield f"impacts left out: {int(self.astray.sum())} of {self.astray.size}" + _listed("; false", self.false)
+        if self.decisive.any():
+            yield "values rest on single impacts, and errors are those without them" + _listed("", self.decisive)
         yield self._on_restitution()
 
     def _on_restitution(self) -> str:
@@ -129,3 +137,8 @@ class Fit:
             return "whether restitution hangs on speed is not told: all impacts are as fast as each other"
         told = "hangs on speed" if test.p_value < 0.01 else "constant as far as is told"
         return f"restitution: {told}, dr/dv = {test.slope:.2g} +- {test.stderr:.2g} per m/s (p = {test.p_value:.2g})"
+
+
+def _listed(text: str, impacts: np.ndarray) -> str:
+    """List impacts after a text, or nothing if there are none."""
+    return f"{text}: {', '.join(map(str, np.flatnonzero(impacts)))}" if impacts.any() else ""

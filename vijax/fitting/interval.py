@@ -98,35 +98,35 @@ def interval(pair: ImpactPair, shaking: Shaking, added: Restitution, ends: Ends,
     return pair.met(ends.side, partial(_behind_rigid, told=told), partial(_behind_soft, told=told, near=near))
 
 
-def motions(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Interval:
-    """List what an interval may be [motion]: a slow ball may stay long, or enter faster, leave sooner and fly longer.
+def guessed_motions(pair: ImpactPair, shaking: Shaking, ends: Ends) -> tuple[Motion, Flag]:
+    """List near what an interval may be: a slow ball may stay long, or enter faster and fly longer.
 
     For every duration of the contact its two ends say how fast the ball enters and leaves, and the next impact says
     how fast it must leave: a function of the duration alone, of which every change of sign is followed.
+
+    Returns:
+        Guesses [motion], NaN where there are no more; and whether all durations that the interval leaves were tried.
     """
-    none = Restitution(jnp.zeros_like(ends.t), jnp.zeros_like(ends.t))
-    told = shaking, none, ends
 
-    def rigid(wall: ImpactPair) -> Interval:
-        return jax.tree.map(lambda x: jnp.full(_MOTIONS, jnp.nan).at[0].set(x), _behind_rigid(wall, told))
+    def rigid(_: ImpactPair) -> tuple[Motion, Flag]:
+        # The motion behind a rigid wall is known without a guess.
+        one = jnp.full(_MOTIONS, jnp.nan).at[0].set(1.0)
+        return Motion(one, 0.0 * one), jnp.asarray(True)
 
-    def soft(wall: ImpactPair) -> Interval:
-        def of(near: Motion) -> Interval:
-            x, arrived = _solved(wall, told, near)
-            return _held(wall, told, x, _followed(x, wall, told), arrived)
-
-        return jax.vmap(of)(_crossings(wall, shaking, ends))
+    def soft(wall: ImpactPair) -> tuple[Motion, Flag]:
+        longest = _HALF_TURNS * jnp.pi / flow.membrane(wall, rolled=True).omega1
+        return _crossings(wall, shaking, ends, longest), longest >= ends.next_t - ends.t
 
     return pair.met(ends.side, rigid, soft)
 
 
-def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends) -> Motion:
+def _crossings(pair: ImpactPair, shaking: Shaking, ends: Ends, longest: Scalar) -> Motion:
     """Guess the motions [motion]: where the miss changes its sign from duration to duration, or turns back near 0.
 
     Where it turns back two motions may lie closer to each other than the durations; they are those of a parabola.
     """
     wall = flow.membrane(pair, rolled=True)
-    longest = jnp.minimum(_HALF_TURNS * jnp.pi / wall.omega1, ends.next_t - ends.t)
+    longest = jnp.minimum(longest, ends.next_t - ends.t)
 
     def stay_at(place: Values) -> Values:
         # The last leaves room for the shortest flight.

@@ -15,7 +15,7 @@ import scipy.sparse
 from jaxtyping import Array, Float
 
 from vijax.fitting.fit_model import FitModel
-from vijax.fitting.interval import Ends, Interval, Motion, Restitution, interval, motions
+from vijax.fitting.interval import Ends, Interval, Motion, Restitution, guessed_motions, interval
 from vijax.fitting.series import Series
 from vijax.fitting.shaking import Shaking
 from vijax.fitting.unknowns import DELAY, made
@@ -26,8 +26,9 @@ from vijax.runtime import tiles
 from vijax.runtime.programs import jitted
 
 _TILES = (64, 1024)  # intervals of one compiled call
-# An interval without a motion costs a chain as much as motions that differ by so much, in units of A pi/omega.
-_NO_MOTION = 10.0
+# An interval without a motion costs a chain as much as motions that differ by so much, in units of A pi/omega. A
+# disagreement costs no more than this, so that a false impact does not change the motions about it.
+_NO_MOTION, _DISAGREEMENT = 10.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Equations:
         answered: Whether there is a motion from impact to impact [equation].
         outside: How far the flight after an impact would pass through a wall [interval].
         speeds: Impact speeds in units of A pi/omega [impact].
+        speed_unit: A pi/omega of the device as it is known [m/s].
         motions: From impact to impact [interval].
     """
 
@@ -56,16 +58,58 @@ class Equations:
     answered: np.ndarray
     outside: np.ndarray
     speeds: np.ndarray
+    speed_unit: float
     motions: Motion
 
+    def errors(self, series: Series, soft: float) -> np.ndarray:
+        """Compute the standard error of each equation: of its times, of its speed, and a tolerance besides [equation].
 
-class _Row(NamedTuple):
-    """Two impacts in a row: times [s] and sides, of one interval or of many."""
+        Args:
+            series: Impacts with their errors.
+            soft: The tolerance, in units of A pi/omega.
+        """
+        shared = finite(self.by_time).power(2).sum(axis=1)
+        tolerance = soft * np.where(self.own_variance > 0, self.speed_unit, 1.0)
+        variance = self.own_variance + tolerance**2 + series.timing_error**2 * shared
+        # An equation without a motion has no derivatives yet.
+        return np.sqrt(np.where(self.answered, variance, np.median(variance)))
+
+
+class Intervals(NamedTuple):
+    """The times [s] and sides of the impacts at both ends, of one interval or of many."""
 
     time: Any
     next_time: Any
     side: Any
     next_side: Any
+
+
+class Solved(NamedTuple):
+    """Motions of intervals.
+
+    Attributes:
+        interval: Of which interval each is [motion].
+        values: Speed at the start, velocity at the end, and speed at the start in m/s [motion, 3].
+        slopes: Their derivatives by the unknowns, by offset and slope of r, and by the times of start and end
+            [motion, 3, variable].
+        motion: All that is known of it [motion].
+    """
+
+    interval: np.ndarray
+    values: np.ndarray
+    slopes: np.ndarray
+    motion: Interval
+
+    def chosen(self, rows: np.ndarray) -> "Solved":
+        """Return some motions; one after the last is none, all of whose numbers are NaN."""
+
+        def of(leaf: np.ndarray) -> np.ndarray:
+            if rows.dtype == bool:
+                return leaf[rows]
+            none = np.full((1, *leaf.shape[1:]), -1 if leaf.dtype.kind == "i" else np.nan, leaf.dtype)
+            return np.concatenate([leaf, none])[rows]
+
+        return jax.tree.map(of, self)
 
 
 class _InUnits(NamedTuple):
@@ -76,7 +120,7 @@ class _InUnits(NamedTuple):
     ends: Ends
 
 
-def _in_units(device: Harvester, names: tuple[str, ...], wall: Walls, z: Array, row: _Row) -> _InUnits:
+def _in_units(device: Harvester, names: tuple[str, ...], wall: Walls, z: Array, row: Intervals) -> _InUnits:
     own = made(device, names, z)
     delay = z[-1] * jnp.pi / device.omega if DELAY in names else 0.0
     t, next_t = ((when - delay) * own.omega / jnp.pi for when in (row.time, row.next_time))
@@ -84,14 +128,20 @@ def _in_units(device: Harvester, names: tuple[str, ...], wall: Walls, z: Array, 
 
 
 @partial(jitted, static=("names", "wall"))
-def _possible(
-    device: Harvester, shaking: Shaking, z: Float[Array, "unknown"], rows: _Row, *, names: tuple[str, ...], wall: Walls
-) -> Interval:
-    """List the motions of every interval [interval, motion]."""
+def _guessed(
+    device: Harvester,
+    shaking: Shaking,
+    z: Float[Array, "unknown"],
+    rows: Intervals,
+    *,
+    names: tuple[str, ...],
+    wall: Walls,
+) -> tuple[Motion, Array]:
+    """Guess the motions of every interval [interval, motion], and say whether all durations were tried [interval]."""
 
-    def each(row: _Row) -> Interval:
+    def each(row: Intervals) -> tuple[Motion, Array]:
         scene = _in_units(device, names, wall, z, row)
-        return motions(scene.pair, shaking, scene.ends)
+        return guessed_motions(scene.pair, shaking, scene.ends)
 
     return jax.vmap(each)(rows)
 
@@ -101,21 +151,21 @@ def _said(
     device: Harvester,
     shaking: Shaking,
     z: Float[Array, "unknown"],
-    rows: tuple[_Row, Motion],
+    rows: tuple[Intervals, Motion],
     *,
     names: tuple[str, ...],
     wall: Walls,
 ) -> tuple[Array, Array, Interval]:
     """Tell of every interval its two speeds and the first in m/s; their derivatives; and all that it says."""
 
-    def numbers(x: Array, row: _Row, near: Motion) -> tuple[Array, tuple[Array, Interval]]:
+    def numbers(x: Array, row: Intervals, near: Motion) -> tuple[Array, tuple[Array, Interval]]:
         own, (offset, slope, time, next_time) = x[: len(names)], x[len(names) :]
         scene = _in_units(device, names, wall, own, row._replace(time=time, next_time=next_time))
         found = interval(scene.pair, shaking, Restitution(offset, slope), scene.ends, near)
         values = jnp.stack([found.speed, found.arrival, found.speed * scene.device.speed_unit])
         return values, (values, found)
 
-    def told(row: _Row, near: Motion):
+    def told(row: Intervals, near: Motion):
         zero = jnp.zeros_like(row.time)
         x = jnp.concatenate([z, jnp.stack([zero, zero, row.time, row.next_time])])
         slopes, (values, found) = jax.jacfwd(numbers, has_aux=True)(x, row, near)
@@ -124,21 +174,52 @@ def _said(
     return jax.vmap(told)(*rows)
 
 
-def _rows(series: Series, times: np.ndarray) -> _Row:
-    return _Row(times[:-1], times[1:], series.sides[:-1], series.sides[1:])
+def consecutive(series: Series, times: np.ndarray) -> Intervals:
+    """Return the intervals between consecutive impacts."""
+    return Intervals(times[:-1], times[1:], series.sides[:-1], series.sides[1:])
 
 
-def likely_motions(model: FitModel, series: Series, z: np.ndarray, times: np.ndarray) -> Motion:
-    """Find the motions from impact to impact that hang together best: speeds where two of them meet differ least."""
-    asked: Any = (model.device, model.shaking, z)
-    named = partial(_possible, *asked, names=model.names, wall=model.wall)
-    found = jax.tree.map(np.asarray, tiles.map_tiles(named, _rows(series, times), _TILES))
-    speeds, own = found.speed, np.where(np.isnan(found.speed), _NO_MOTION, 0.0)
+def solved_near(model: FitModel, z: np.ndarray, intervals: Intervals, near: Motion) -> Solved:
+    """Compute the motions of intervals near given ones."""
+    known: Any = (model.device, model.shaking, z)
+    named = partial(_said, *known, names=model.names, wall=model.wall)
+    values, slopes, found = jax.tree.map(np.asarray, tiles.map_tiles(named, (intervals, near), _TILES))
+    return Solved(np.arange(len(values)), values, slopes, found)
+
+
+def solved(model: FitModel, z: np.ndarray, intervals: Intervals) -> tuple[Solved, np.ndarray]:
+    """Compute all motions of intervals, and whether contacts of all durations were tried [interval]."""
+    known: Any = (model.device, model.shaking, z)
+    named = partial(_guessed, *known, names=model.names, wall=model.wall)
+    guess, tried = jax.tree.map(np.asarray, tiles.map_tiles(named, intervals, _TILES))
+    valid = np.isfinite(guess.speed)
+    valid[0, 0] = True  # a call has a row at least, if only one of NaN
+    interval, _ = np.nonzero(valid)
+    near = Motion(guess.speed[valid], guess.stay[valid])
+    found = solved_near(model, z, Intervals(*(row[interval] for row in intervals)), near)
+    return found._replace(interval=interval).chosen(np.isfinite(found.motion.speed)), tried
+
+
+def _likely(model: FitModel, series: Series, every: Solved) -> Solved:
+    """Choose the motions from impact to impact that hang together best: speeds where two of them meet differ least."""
+    count, (place, most) = series.times.size - 1, _places(every.interval)
+    # The last motion of every interval is none.
+    speeds, arrivals = np.full((2, count, most + 1), np.nan)
+    speeds[every.interval, place], arrivals[every.interval, place] = every.values[:, 0], every.values[:, 1]
+    own = np.where(np.isnan(speeds), _NO_MOTION, 0.0)
     if series.speeds is not None:
         own += np.nan_to_num(np.abs(speeds - series.speeds[:-1, None] / float(model.device.speed_unit)))
-    which = least_chain(speeds, series.sides[1:, None] * found.arrival, own)
-    rows: Any = np.arange(len(which))
-    return Motion(speeds[rows, which], found.stay[rows, which])
+    which = least_chain(speeds, series.sides[1:, None] * arrivals, own)
+    rows = np.full((count, most + 1), len(place))
+    rows[every.interval, place] = np.arange(len(place))
+    return every.chosen(rows[np.arange(count), which])
+
+
+def _places(interval: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return which motion of its interval each is, and how many there are at most."""
+    first = np.searchsorted(interval, interval)
+    place = np.arange(interval.size) - first
+    return place, int(place.max(initial=-1)) + 1
 
 
 def least_chain(speeds: np.ndarray, arrivals: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -154,7 +235,8 @@ def least_chain(speeds: np.ndarray, arrivals: np.ndarray, own: np.ndarray) -> np
     """
     cost, came_from = own[0], []
     for k in range(1, len(speeds)):
-        total = cost[:, None] + np.nan_to_num(np.abs(arrivals[k - 1][:, None] - speeds[k]))
+        apart = np.nan_to_num(np.abs(arrivals[k - 1][:, None] - speeds[k]))
+        total = cost[:, None] + np.minimum(apart, _DISAGREEMENT)
         came_from.append(total.argmin(axis=0))
         cost = total.min(axis=0) + own[k]
     chosen = [int(cost.argmin())]
@@ -175,12 +257,10 @@ def linearised(
         times: Onsets of the impacts [s].
         near: Motions from impact to impact, near which to look; the likely ones unless given.
     """
-    near = likely_motions(model, series, z, times) if near is None else near
-    asked: Any = (model.device, model.shaking, z)
-    named = partial(_said, *asked, names=model.names, wall=model.wall)
-    told = tiles.map_tiles(named, (_rows(series, times), near), _TILES)
-    values, slopes, found = jax.tree.map(np.asarray, told)
-    speed, arrival, metres = values.T
+    rows = consecutive(series, times)
+    chain = _likely(model, series, solved(model, z, rows)[0]) if near is None else solved_near(model, z, rows, near)
+    slopes, found = chain.slopes, chain.motion
+    speed, arrival, metres = chain.values.T
     # The ball arrives at a wall with a velocity towards it.
     off = series.sides[1:-1] * arrival[:-1] - speed[1:]
     by = series.sides[1:-1, None] * slopes[:-1, 1]
@@ -196,19 +276,27 @@ def linearised(
         by_time = scipy.sparse.vstack([by_time, _banded(len(times), slopes[:, 2, known], slopes[:, 2, known + 1])])
         own_variance = np.append(own_variance, np.full(len(metres), series.speed_error**2))
     answered = np.isfinite(off) & np.isfinite(by_x).all(axis=1) & np.isfinite(by_time @ np.ones(len(times)))
-    order = _in_order(len(times), len(off))
+    order, impact, _ = _in_order(series)
     return Equations(
         off=off[order],
-        impact=np.append(np.arange(1, len(times) - 1), np.arange(len(off) - len(times) + 2))[order],
+        impact=impact,
         by_unknown=by_x[order, : len(z)],
         by_restitution=by_x[order, len(z) :],
         by_time=by_time.tocsr()[order],
         own_variance=own_variance[order],
         answered=answered[order],
-        outside=found.outside,
+        outside=np.asarray(found.outside),
         speeds=np.append(speed, series.sides[-1] * arrival[-1]),
+        speed_unit=float(model.device.speed_unit),
         motions=Motion(found.speed, found.stay),
     )
+
+
+def finite(matrix: Any) -> Any:
+    """Copy a sparse matrix with 0 in place of what is not finite."""
+    matrix = matrix.copy()
+    matrix.data = np.nan_to_num(matrix.data, nan=0.0, posinf=0.0, neginf=0.0)
+    return matrix
 
 
 def _banded(impacts: int, *bands: np.ndarray) -> Any:
@@ -217,8 +305,21 @@ def _banded(impacts: int, *bands: np.ndarray) -> Any:
     return scipy.sparse.diags_array(bands, offsets=range(len(bands)), shape=(rows, impacts), format="csr")
 
 
-def _in_order(impacts: int, equations: int) -> np.ndarray:
-    """Sort equations by the times they read, so that those of a covariance that are not 0 lie near its diagonal."""
+def speed_equations(series: Series) -> tuple[np.ndarray, np.ndarray]:
+    """Return which impact each equation is about, and whether it is about a measured speed [equation]."""
+    _, impact, about_speed = _in_order(series)
+    return impact, about_speed
+
+
+def _in_order(series: Series) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sort equations by the times they read, so that those of a covariance that are not 0 lie near its diagonal.
+
+    Returns:
+        The order, and in that order which impact each equation is about and whether it is about a measured speed.
+    """
+    inner, speeds = np.arange(1, series.times.size - 1), np.arange(series.equations - series.times.size + 2)
+    impact = np.append(inner, speeds)
+    about_speed = np.arange(impact.size) >= inner.size
     # The speed before the impact between two intervals, then their agreement on it.
-    place = np.concatenate([np.arange(impacts - 2) + 0.5, np.arange(equations - impacts + 2)])
-    return np.argsort(place, kind="stable")
+    order = np.argsort(impact - np.where(about_speed, 0.0, 0.5), kind="stable")
+    return order, impact[order], about_speed[order]

@@ -17,7 +17,7 @@ def fit(found: Fit) -> Figure:
     """Draw what `vijax.fit` left unexplained: of every time, in standard errors, over impacts and over impact speed.
 
     A device and errors that are right leave points that know of neither; in the grey band lie 19 of 20. Crosses are
-    impacts that were left out. What rises or falls along either axis is what the device lacks.
+    impacts that were left out, at 0 if they are false. What rises or falls along either axis is what the device lacks.
 
     Args:
         found: As `vijax.fit` returns it.
@@ -43,7 +43,7 @@ def _residuals(axes: Axes, where: np.ndarray, found: Fit, text: str) -> None:
     axes.axhspan(-_BAND, _BAND, color="0.9", zorder=0)
     axes.axhline(0, color="0.6", linewidth=0.6)
     axes.plot(where[good], found.residuals[good], ".", color="black", markersize=3)
-    axes.plot(where[~good], found.residuals[~good], "x", color="tab:red", markersize=4)
+    axes.plot(where[~good], np.nan_to_num(found.residuals[~good]), "x", color="tab:red", markersize=4)
     axes.set_xlabel(text)
 
 
