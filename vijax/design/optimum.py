@@ -168,7 +168,7 @@ def verified(
                 P_stderr=0.0,
                 state=seen[row],
                 gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
-                active=_active(scene, end, found.sequence.side[row], settings.active_margin),
+                active=_active(scene, end, sequence.side[row], settings.active_margin),
                 stopped=_reason(end, max_evaluations),
                 evaluations=end.evaluations,
                 path=np.asarray(values(scene.names, end.path[there])),

@@ -11,14 +11,14 @@ import numpy as np
 
 from vijax.model.device import Harvester, one_device
 from vijax.model.records import Status
-from vijax.orbits import symmetry
+from vijax.orbits import periodic, repetition, symmetry
 from vijax.orbits.arclength_step import BranchPlace, advance, settled
 from vijax.orbits.arclength_walk import Walked
 from vijax.orbits.branch_path import FIRST_END, FOLD, Arc, Tests, heading, upwards
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import BranchEvent, Point, blur, events, kind_of, locate, orbits_at
 from vijax.orbits.parameter import able, check_along, check_bounds, skews
-from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit
+from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit, to_least_period
 from vijax.orbits.pieces import Followed, Piece, follow_pieces, joined
 from vijax.orbits.soft_graze import Passage, branch_passage
 from vijax.runtime import checks, tiles
@@ -27,7 +27,7 @@ from vijax.runtime.pages import see
 
 MOST_POINTS = 10**6  # of a branch: beyond, a number was mistyped, and is refused before memory is taken
 Direction = Literal["up", "down", "both"]
-_NEAR = 1e-4  # arclength on either side of a pitchfork, known to 1e-8, in which it is located once more
+_NEAR = 1e-4  # arclength on either side of a pitchfork or flip, known to 1e-8, in which it is located once more
 _WAYS: dict[Direction, tuple[float, ...]] = {"up": (1.0,), "down": (-1.0,), "both": (-1.0, 1.0)}
 
 
@@ -70,7 +70,7 @@ def follow(
     """Follow periodic orbits, stable or not, along one parameter, through folds, and through grazes at soft walls.
 
     Args:
-        orbit: Where to start, each a branch of its own; all at once.
+        orbit: Where to start, each a branch of its own; all at once, each at its least period.
         along: "d", "kappa", "r", "gamma", or a quantity of the device, which moves several of them together: "omega",
             "omega0" [rad/s], "s" [m], "A" [m/s^2], "beta" [rad] or "k" [N/m]; of one wall "kappa_left", "r_right" and
             so on, also of omega0 and k.
@@ -91,7 +91,7 @@ def follow(
     """
     checks.choice("direction", direction, _WAYS)
     points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
-    orbit = able(check_orbit(orbit), along)
+    orbit = able(to_least_period(orbit), along)
     arcs, y = set_out(orbit, along, within, device, settings)
     begin_proofs(orbit.pair, orbit.sequence, orbit.knots)
     first = settled(upwards(arcs, y), FIRST_END)
@@ -201,26 +201,37 @@ def _beyond(arc: Arc, event: BranchEvent, y: np.ndarray, tests: np.ndarray) -> P
 
 
 def _point(arc: Arc, kind: str, y: np.ndarray, orbit: Orbit, settings: ContinuationSettings) -> Point:
-    """Make a point of what was met; of a pitchfork at the orbit closed half way, if that can be found.
+    """Make a point of what was met; of a pitchfork or flip that mirror pairs or doubled orbits meet on simpler orbits.
 
-    In full two branches of orbits cross there, Newton is singular, and the place is known to 1e-8 only.
+    Two branches of orbits cross there, so that Newton is singular and the place is known to 1e-8 only. On the branch of
+    the simpler orbit, closed half way or of half the period, a multiplier passes -1 there, which is regular.
     """
     value = float(y[-1] * (arc.high - arc.low))
     plain = Point(kind, value, orbit)
-    if kind != "pitchfork" or bool(arc.sequence.mirrored) or skews(arc.along):
+    if (simpler := _simpler(arc, kind, orbit, settings)) is None:
         return plain
-    half, row = symmetry.halved(orbit, blur(settings)), jax.tree.map(np.atleast_1d, arc)
-    arcs, known = arcs_from(half, arc.along, np.array([value]), row.steepest, (row.low, row.high), settings)
+    row = jax.tree.map(np.atleast_1d, arc)
+    arcs, known = arcs_from(simpler, arc.along, np.array([value]), row.steepest, (row.low, row.high), settings)
     first, reach = upwards(arcs, known), np.array([_NEAR])
     before = advance(arcs, first.y, first.tangent, -reach)
     test = np.array([Tests._fields.index("minus")])
     _, there, sure = locate(arcs, before.y, before.tangent, 2 * reach, test, before.tests[0, test], settings)
     if not sure[0]:
-        exact = bool(symmetry.symmetric(orbit, settings.asymmetry)[0])
+        exact = kind == "pitchfork" and bool(symmetry.symmetric(orbit, settings.asymmetry)[0])
         return plain if exact else plain._replace(kind="fold")
     arc = jax.tree.map(lambda leaf: leaf[0], arcs)
     full = symmetry.unfolded(orbits_at(arc, there))
     return Point(kind, float(there[0, -1] * (arc.high - arc.low)), full)
+
+
+def _simpler(arc: Arc, kind: str, orbit: Orbit, settings: ContinuationSettings) -> Orbit | None:
+    """Find the simpler orbit that a mirror pair, or doubled orbits, have come to; None of all others."""
+    if kind == "pitchfork" and not (bool(arc.sequence.mirrored) or skews(arc.along)):
+        return symmetry.halved(orbit, blur(settings))
+    if kind == "flip":
+        number = repetition.turns(orbit.sequence, orbit.knots, blur(settings))
+        return periodic.mean_turn(orbit, number) if number[0] > 1 else None
+    return None
 
 
 def _joined(down: Branch, up: Branch) -> Branch:

@@ -134,20 +134,25 @@ def _moved(start: CurveStart, path: CurvePath, y: np.ndarray) -> CurveStart:
 
 
 def traits(orbit: Orbit, images: bool = False) -> Traits:
-    """Give numbers that tell orbits apart, whichever impact they begin with; those of their mirror images, too."""
+    """Give numbers that tell orbits apart, whichever impact they begin with; those of their mirror images, too.
+
+    They are sums over the impacts of a forcing period, the same for an orbit that is run through several times.
+    """
     host = jax.tree.map(np.asarray, orbit)
     side, knots = host.sequence.side, host.knots
-    half = orbit_properties.marks_of_knots(side, knots)
+
+    def summed(side: Any, knots: Any) -> np.ndarray:
+        return orbit_properties.marks_of_knots(side, knots) / (0.5 * host.sequence.span[:, None])
 
     def later(wait: Any) -> np.ndarray:
         return knots + np.array([1.0, 0.0, 0.0]) * np.broadcast_to(wait, host.sequence.span.shape)[:, None, None]
 
     # An orbit closed half way goes on as its own mirror image.
-    again = orbit_properties.marks_of_knots(-side, later(host.sequence.span))
-    own = half + np.where(host.sequence.mirrored[:, None], again, 0.0)
+    half, again = summed(side, knots), summed(-side, later(host.sequence.span))
+    own = np.where(host.sequence.mirrored[:, None], 0.5 * (half + again), half)
     if not images or not np.all(host.pair.symmetric) or host.sequence.mirrored.any():
         return own
-    return np.concatenate([own, orbit_properties.marks_of_knots(-side, later(1.0))])
+    return np.concatenate([own, summed(-side, later(1.0))])
 
 
 def _set_out(starts: list[CurveStart], plane: Plane, device: Harvester, settings: ContinuationSettings):

@@ -83,7 +83,4 @@ def _simple(kind: str, orbit: Orbit, place: tuple[float, float], asymmetry: floa
     """Begin the flips, or pitchforks, of the orbit that doubled ones, or mirror pairs, have come to."""
     if kind == "pitchfork":
         return _start(kind, symmetry.halved(orbit, asymmetry), place)
-    count, host = int(orbit.count[0]) // 2, jax.tree.map(np.asarray, orbit)
-    side, knots = host.sequence.side[:, :count], host.knots[:, :count]
-    once = periodic.guessed(side, 0.5 * host.sequence.span, host.sequence.mirrored, knots)
-    return _start(kind, periodic.solved(host.pair, *once), place)
+    return _start(kind, periodic.mean_turn(orbit, np.full(1, 2)), place)

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 
-from vijax.orbits import periodic, symmetry
+from vijax.orbits import periodic, repetition, symmetry
 from vijax.orbits.arclength_step import BranchPlace, Path, advance
 from vijax.orbits.branch_path import FIRST_END, FOLD, PLUS, Arc, Tests
 from vijax.orbits.continuation_settings import ContinuationSettings
@@ -31,7 +32,8 @@ class Point(NamedTuple):
             A graze at a soft wall has the name that fits the orbit with fewer impacts, from whichever side it is met:
             "grazing flight" or "grazing contact", unless none would be left.
         value: Of the parameter.
-        orbit: The orbit there, along a leading axis of one.
+        orbit: The orbit there, along a leading axis of one. At a flip that a branch of doubled orbits meets it is the
+            orbit of half the period, which has the multiplier -1.
         gained: Impacts with which the branch goes on through a graze: more where positive, fewer where negative; 0
             where it does not.
         wall: Where those are, -1 or +1; 0 at both.
@@ -154,18 +156,27 @@ def kind_of(arc: Arc, event: BranchEvent, neighbours: np.ndarray, settings: Cont
         return "pitchfork" if half else "flip"
     if half:
         return "fold"
-    # A branch of mirror pairs turns where the two of a pair meet; a symmetric one passes +1 there without turning.
+    # A branch of mirror pairs turns where the two of a pair meet; a symmetric one passes +1 there without turning. So
+    # does a branch of doubled orbits where both turns become one; one of two equal turns passes without turning.
     around = orbits_at(arc, np.concatenate([event.y[None], neighbours]))
-    meets = np.asarray(symmetry.symmetric(around[:1], blur(settings)))[0]
-    stays = np.asarray(symmetry.symmetric(around[1:], settings.asymmetry)).all()
-    return "pitchfork" if meets and (test == "fold") != stays else "fold"
+    for kind, is_simpler in (("pitchfork", symmetry.symmetric), ("flip", _repeats)):
+        meets, stays = is_simpler(around[:1], blur(settings))[0], is_simpler(around[1:], settings.asymmetry).all()
+        if meets and (test == "fold") != stays:
+            return kind
+    return "fold"
+
+
+def _repeats(orbit: Orbit, tolerance: float) -> Bool[np.ndarray, "orbit"]:
+    """Return True for orbits that consist of several turns."""
+    return repetition.turns(orbit.sequence, orbit.knots, tolerance) > 1
 
 
 def blur(settings: ContinuationSettings) -> float:
     """Say how far from its mirror image an orbit may come out at a pitchfork that a branch of mirror pairs meets.
 
-    Newton's equations are singular there: what they miss grows as the third power of the distance only, so that with a
-    tolerance of 1e-11 it may be a few times 1e-4.
+    The two turns of a doubled orbit may come out as far apart at its flip. Newton's equations are singular there: what
+    they miss grows as the third power of the distance only, so that with a tolerance of 1e-11 it may be a few times
+    1e-4.
     """
     return 5 * settings.asymmetry
 

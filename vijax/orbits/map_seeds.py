@@ -9,7 +9,7 @@ import numpy as np
 
 from vijax.model.device import Harvester
 from vijax.model.records import Status
-from vijax.orbits import orbit_search, periodic, symmetry
+from vijax.orbits import orbit_search, periodic, repetition, symmetry
 from vijax.orbits.arclength_walk import Walked, walk
 from vijax.orbits.branch_path import Arc, Tests, heading, upwards
 from vijax.orbits.continuation import arcs_from
@@ -182,16 +182,19 @@ def _starts(
     orbit = periodic.proven(pair, own.sequence, knots)
     x, other = there[:, -1] * (own.high - own.low), still[lane[met]]
     mirrored = np.asarray(orbit.sequence.mirrored)
-    # A branch of mirror pairs turns where the two of a pair meet.
+    # A branch of mirror pairs turns where the two of a pair meet, and one of doubled orbits where both turns do.
     alike = np.asarray(symmetry.symmetric(orbit, settings.asymmetry)) & ~mirrored
+    number = repetition.turns(orbit.sequence, orbit.knots, settings.asymmetry)
     found = []
     for row in np.flatnonzero(zero):
-        kind = _KINDS[Tests._fields[test[row]]]
+        kind, here = _KINDS[Tests._fields[test[row]]], orbit[row : row + 1]
         if (kind == "flip" and mirrored[row]) or (kind == "fold" and alike[row]):
             kind = "pitchfork"
+        elif kind == "fold" and number[row] > 1:
+            kind, here = "flip", periodic.mean_turn(here, number[row : row + 1])
         value = float(x[row])
         place = (value, float(other[row])) if way == 0 else (float(other[row]), value)
-        begun = curve_start(Point(kind, value, orbit[row : row + 1]), place, settings.asymmetry, plane)
+        begun = curve_start(Point(kind, value, here), place, settings.asymmetry, plane)
         if not isinstance(begun, str):
             found.append(begun)
     return found

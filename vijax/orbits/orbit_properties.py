@@ -14,7 +14,7 @@ from vijax.model.energy import harvested_energy
 from vijax.model.label import label
 from vijax.model.records import Impact
 from vijax.model.sides import at
-from vijax.orbits import shooting
+from vijax.orbits import repetition, shooting
 from vijax.orbits.motion import MOST_SAMPLES, pieces
 from vijax.orbits.periodic import SAME, TILES, Orbit, check_orbit
 from vijax.orbits.symmetry import unfolded
@@ -36,19 +36,9 @@ class Counts(NamedTuple):
 def counts(orbit: Orbit, tolerance: float = SAME) -> Counts:
     """Count what is in the label of each orbit, over the fewest whole periods after which it recurs to a tolerance."""
     full = jax.tree.map(np.asarray, unfolded(orbit))
-    side, number = full.sequence.side, full.count
     period = np.round(0.5 * full.sequence.span).astype(int)
-    index = np.arange(side.shape[1])
-    turns = np.ones_like(period)
-    for parts in range(2, int(period.max(initial=1)) + 1):
-        shift = np.where(number % parts == 0, number // parts, 0)[:, None]
-        there = np.minimum(index + shift, side.shape[1] - 1)
-        wait = np.array([1.0, 0.0, 0.0]) * (full.sequence.span / parts)[:, None, None]
-        moved = np.take_along_axis(full.knots, there[..., None], axis=1) - full.knots - wait
-        same = (np.abs(moved).max(axis=2) < tolerance) & (np.take_along_axis(side, there, axis=1) == side)
-        recurs = (period % parts == 0) & (shift[:, 0] > 0) & (same | (index >= number[:, None] - shift)).all(axis=1)
-        turns = np.where(recurs, parts, turns)
-    left, right = ((side == wall).sum(axis=1) for wall in (-1, 1))
+    turns = repetition.turns(full.sequence, full.knots, tolerance)
+    left, right = ((full.sequence.side == wall).sum(axis=1) for wall in (-1, 1))
     return Counts(left // turns, right // turns, period // turns)
 
 
@@ -134,12 +124,15 @@ def _pieces(full: Orbit, samples: int) -> tuple[Array, ...]:
 
 @door
 def marks(orbit: Orbit) -> Float[np.ndarray, "orbit 6"]:
-    """Sum over the impacts what tells orbits of one pair apart, mirror images too."""
-    return marks_of_knots(orbit.sequence.side, orbit.knots)
+    """Sum over the impacts of a forcing period what tells orbits of one pair apart, mirror images too.
+
+    An orbit and the same orbit run through several times have the same marks.
+    """
+    return marks_of_knots(orbit.sequence.side, orbit.knots) / (0.5 * np.asarray(orbit.sequence.span)[:, None])
 
 
 def marks_of_knots(side: Any, knots: Any) -> Float[np.ndarray, "orbit 6"]:
-    """Do what `marks` does, with the walls and knots of orbits that need not be proved."""
+    """Sum what `marks` does over all impacts, with the walls and knots of orbits that need not be proved."""
     t, speed, stay = np.moveaxis(np.asarray(knots), -1, 0)
     signed = np.asarray(side) * speed
     # Odd harmonics are alike for mirror images, (side, t) -> (-side, t + 1); even ones change sign.

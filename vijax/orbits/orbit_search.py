@@ -18,7 +18,18 @@ from vijax.model.membrane import Laws, with_law
 from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
-from vijax.orbits.periodic import SAME, Orbit, begin_judgement, check_orbit, concatenate, guessed, judged, shot, solved
+from vijax.orbits.periodic import (
+    SAME,
+    Orbit,
+    begin_judgement,
+    check_orbit,
+    concatenate,
+    guessed,
+    judged,
+    shot,
+    solved,
+    to_least_period,
+)
 from vijax.runtime import checks, tiles
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
@@ -46,7 +57,7 @@ def from_state(
     Args:
         pair: One cell, or one a state.
         u, v, t: Displacements, velocities and phases in [0, 2).
-        period: Forcing periods of the orbits.
+        period: Forcing periods of the orbits, or a multiple of these: each orbit is returned at its least period.
         settle: Forcing periods that the states are flown first: the guesses are then near attractors.
         membrane: The membrane, as in `trajectory`; the linear one if None. States are then flown by "ode".
         excitation: What shakes the capsule, if not the sine: `vijax.Harmonics`, as orbits need it to repeat.
@@ -113,7 +124,7 @@ def search(
         excitation: As in `from_state`.
 
     Returns:
-        The distinct orbits, each once.
+        The distinct orbits, each once and at its least period: that of 1:1, too, where 2:2/2T was asked for.
 
     Raises:
         ValueError: Neither a sequence nor a label, a period that does not agree with it, or an excitation that does
@@ -194,7 +205,7 @@ def _search(pair: ImpactPair, walls: tuple[int, ...], period: int, guesses: int,
     # Most guesses lead to the same few orbits, of which each is proved once.
     first = _each_once(side, claim.knots, np.flatnonzero(np.isfinite(claim.residual)))
     kept = first if first.size else np.zeros(1, int)
-    return judged(*jax.tree.map(lambda leaf: np.asarray(leaf)[kept], (wide, sequence, claim)))
+    return to_least_period(judged(*jax.tree.map(lambda leaf: np.asarray(leaf)[kept], (wide, sequence, claim))))
 
 
 def _strength(pair: ImpactPair) -> float:

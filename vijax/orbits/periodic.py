@@ -15,7 +15,7 @@ from vijax.engine.ground import Ground, ground_of
 from vijax.model import flow
 from vijax.model.pair import ImpactPair, check_pair
 from vijax.model.records import Status, WithStatus
-from vijax.orbits import contacts, multipliers, shooting
+from vijax.orbits import contacts, multipliers, repetition, shooting
 from vijax.orbits.grazing import Clearance, between
 from vijax.orbits.shooting import Sequence
 from vijax.runtime import checks, context, tiles
@@ -93,7 +93,7 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit im
         sequence, knots: Guesses; padded impacts hold anything.
 
     Returns:
-        Orbits in the order of the guesses, each with its `status`.
+        Orbits in the order of the guesses, each with its `status`, at its least period (`to_least_period`).
     """
     checks.known("pair", check_pair(pair, of_orbit=True))
     checks.instance("sequence", sequence, Sequence, "vijax.orbits.shooting.Sequence(...)")
@@ -106,7 +106,7 @@ def solve(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbit im
 
 def solved(pair: ImpactPair, sequence: Sequence, knots: Any) -> Orbit:
     """Do what `solve` does, with arguments that are known to be right."""
-    return judged(pair, sequence, shot(pair, sequence, knots))
+    return to_least_period(judged(pair, sequence, shot(pair, sequence, knots)))
 
 
 def shot(pair: ImpactPair, sequence: Sequence, knots: Any) -> "Claim":
@@ -152,6 +152,35 @@ def judged(pair: ImpactPair, sequence: Sequence, claim: "Claim") -> Orbit:
     if pair.law is not None or pair.waves is not None:
         return _by_tiles(_prove_between, (pair, sequence, claim))
     return _by_tiles(partial(_prove, ground_of(pair.gamma)), (pair, sequence, claim))
+
+
+@door
+def to_least_period(orbit: Orbit) -> Orbit:
+    """Return each orbit at its least period: where it consists of several equal turns, one turn, solved for anew.
+
+    Turns are equal where they agree to the accuracy of the orbit (`repetition.apart`). A symmetric orbit stays as it is
+    closed, in full or onto its mirror image: symmetry is a property of an orbit and does not change its period.
+    """
+    host = jax.tree.map(np.asarray, check_orbit(orbit))
+    near = repetition.turns(host.sequence, host.knots, repetition.most_apart(host.residual))
+    rows = np.flatnonzero(near > 1)
+    if not rows.size:
+        return orbit
+    some = jax.tree.map(lambda leaf: leaf[rows], host)
+    accuracy = repetition.apart(some.pair, some.sequence, some.knots, some.residual)
+    number = repetition.turns(some.sequence, some.knots, accuracy)
+    turn = jax.tree.map(np.asarray, widened(mean_turn(some, number), host.knots.shape[1]))
+    # The turn must be an orbit as the whole is, and the whole that turn again and again.
+    again = np.where(turn.sequence.real[..., None], turn.knots - some.knots, 0.0)
+    same = (number > 1) & (turn.status == some.status) & (np.abs(again[..., 1:]).max(axis=(1, 2)) < accuracy)
+    return tiles.arrays(jax.tree.map(lambda old, new: tiles.replaced(rows[same], old, new[same]), host, turn))
+
+
+def mean_turn(orbit: Orbit, number: Int[np.ndarray, "orbit"]) -> Orbit:
+    """Solve for one turn of orbits that consist of so many equal turns, from the mean of these."""
+    host = jax.tree.map(np.asarray, orbit)
+    sequence, guess = guessed(*repetition.mean_turn(host.sequence, host.knots, number))
+    return judged(host.pair, sequence, shot(host.pair, sequence, guess))
 
 
 @door

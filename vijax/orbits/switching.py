@@ -15,7 +15,7 @@ from vijax.orbits.continuation import MOST_POINTS, Branch, follow, follow_arcs, 
 from vijax.orbits.continuation_settings import DEFAULT, ContinuationSettings, check_settings
 from vijax.orbits.events import Point
 from vijax.orbits.parameter import able, check_bounds, skews
-from vijax.orbits.periodic import Orbit, begin_proofs, check_orbit, widened
+from vijax.orbits.periodic import Orbit, begin_proofs, to_least_period, widened
 from vijax.runtime import checks
 from vijax.runtime.context import door
 from vijax.runtime.programs import begin, jitted
@@ -108,7 +108,7 @@ def family(
     """
     max_switches = checks.whole("max_switches", max_switches, 0, MOST_SWITCHES)
     points, settings = checks.whole("points", points, 2, MOST_POINTS), check_settings(settings)
-    orbit = able(check_orbit(orbit), along)
+    orbit = able(to_least_period(orbit), along)
     set_out(orbit, along, within, device, settings)
     # What follow and switch are told alike.
     told: Any = {"device": device, "points": points, "settings": settings}
@@ -128,9 +128,15 @@ def family(
         grown += _new(follow(one, along, within, **told), grown, settings)
     youngest = grown
     for _ in range(max_switches):
-        known = [mark for branch in grown for mark in _marks(branch) if not mark.half]
-        where = [point for branch in youngest for point in branch.points if _begins(point) and _real(point)]
-        where = [point for point in where if point.kind == "flip" or not _in_full(point, known, settings)]
+        known = [mark for branch in grown for mark in _marks(branch) if not mark.simpler]
+        met = [
+            (mark, point)
+            for branch in youngest
+            for mark, point in zip(_marks(branch), branch.points, strict=True)
+            if mark.simpler and _begins(point) and _real(point)
+        ]
+        # A known branch of mirror pairs, or of doubled orbits, that comes by is the one which begins there.
+        where = [point for mark, point in met if not _among(mark._replace(simpler=False), known, settings)]
         youngest = []
         for point in where:
             begun = switch(point, along, within, **told)
@@ -153,32 +159,33 @@ def _new(found: list[Branch], known: list[Branch], settings: ContinuationSetting
 
 
 class _Mark(NamedTuple):
-    """What tells points apart: of what kind they are, whether on a branch of orbits closed half way, numbers.
+    """What tells points apart.
 
-    A pitchfork is on two branches, and closed half way on one of them.
+    Attributes:
+        kind: Of the point.
+        simpler: Whether it is on the branch of the simpler orbits: of a pitchfork those closed half way, of a flip
+            those of half the period. Both are on another branch, too.
+        traits: Numbers that tell orbits apart, whichever impact they begin with, and the place of the point.
     """
 
     kind: str
-    half: bool
+    simpler: bool
     traits: np.ndarray
 
 
 def _marks(branch: Branch) -> list[_Mark]:
-    return [_mark(point) for point in branch.points]
+    return [_mark(point, float(branch.orbit.sequence.span[0])) for point in branch.points]
 
 
-def _mark(point: Point) -> _Mark:
-    """Give numbers that tell orbits apart, whichever impact they begin with, and the place of the point."""
+def _mark(point: Point, span: float) -> _Mark:
+    """Make the mark of a point on a branch of orbits with a span."""
+    sequence = point.orbit.sequence
+    simpler = float(sequence.span[0]) == span if point.kind == "flip" else bool(sequence.mirrored[0])
     numbers = np.asarray(orbit_properties.marks(symmetry.unfolded(point.orbit)))[0]
-    return _Mark(point.kind, bool(point.orbit.sequence.mirrored[0]), np.append(numbers, point.value))
-
-
-def _in_full(pitchfork: Point, known: list[_Mark], settings: ContinuationSettings) -> bool:
-    """Say whether a known branch of mirror pairs comes by a pitchfork: that is the one which begins there."""
-    return _among(_mark(pitchfork)._replace(half=False), known, settings)
+    return _Mark(point.kind, simpler, np.append(numbers, point.value))
 
 
 def _among(mark: _Mark, known: list[_Mark], settings: ContinuationSettings) -> bool:
     """Say whether a mark is one of those known."""
-    alike = [other for other in known if (other.kind, other.half) == (mark.kind, mark.half)]
+    alike = [other for other in known if (other.kind, other.simpler) == (mark.kind, mark.simpler)]
     return any(np.allclose(mark.traits, other.traits, atol=settings.asymmetry) for other in alike)
