@@ -2,7 +2,7 @@
 
     python benchmarks/faults.py                          # every fault, each from the start
     python benchmarks/faults.py --only kill --kills 20   # one of them: kill, stop, worker, disk, readonly,
-                                                         # damages, overwrite, foreign, writers
+                                                         # damages, overwrite, foreign, writers, savers
     python benchmarks/faults.py --side 256               # a smaller plane
 
 Each fault befalls `scripts/grid.py` on the (d, kappa) plane of side x side cells. Said are the moments, what the script
@@ -27,7 +27,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,6 +45,7 @@ WRAPPER = (
 )
 _WARM = 182  # the least side whose tiles are as large as any, so that they are compiled
 _REACH = 0.6  # of a tile's time past the first tile, up to which moments are drawn: most kills find none done
+_SAVES = 60  # of two processes at the same time
 _DISK, _LARGER_DISK = 5, 100  # MiB; a tile of 32,768 cells takes about 2
 
 
@@ -386,6 +387,45 @@ def writers(scene: Scene) -> bool:
     return verdict(scene, out, ended(process).began + second.began)
 
 
+# Saves a map of its own number at every line that it is sent.
+SAVER = """
+import sys, numpy as np, xarray as xr, vijax
+whole = xr.Dataset({"P": ("d", np.full(4096, float(sys.argv[2])))}, coords={"d": np.arange(4096.0)})
+print("ready", flush=True)
+for line in sys.stdin:
+    vijax.save(whole, sys.argv[1], overwrite=True)
+    print("saved", flush=True)
+"""
+
+
+def savers(scene: Scene) -> bool:
+    """Let two processes save to one path at the same time, each the first of its own PID namespace if that may be."""
+    out, wrong = scene.store("saved"), 0
+    apart = ["unshare", "--user", "--map-root-user", "--pid", "--fork"]
+    allowed = shutil.which("unshare") and subprocess.run([*apart, "true"], capture_output=True).returncode == 0
+    command = [*(apart if allowed else ()), sys.executable, "-c", SAVER, str(out)]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
+    crew = [subprocess.Popen([*command, str(number)], **pipes) for number in (1, 2)]
+    orders, answers = [one.stdin for one in crew if one.stdin], [one.stdout for one in crew if one.stdout]
+    for answer in answers:
+        answer.readline()
+    for _ in range(_SAVES):
+        for order in orders:
+            order.write("go\n")
+        saved = [answer.readline() for answer in answers]
+        try:
+            numbers = set(np.unique(vijax.load(out)["P"]).tolist())
+            wrong += len(numbers) != 1 or saved != ["saved\n"] * 2
+        except (ValueError, OSError) as error:
+            print(f"    load: {error}")
+            wrong += 1
+    for one in crew:
+        one.communicate()
+    where = "two PID namespaces" if allowed else "one PID namespace, as no other may be made"
+    print(f"    {where}: {wrong} of {_SAVES} times wrong; left beside: {', '.join(left(out)) or 'nothing'}")
+    return not wrong and not left(out)
+
+
 FAULTS: dict[str, Callable[[Scene], bool]] = {
     "kill": kill,
     "stop": stop,
@@ -396,6 +436,7 @@ FAULTS: dict[str, Callable[[Scene], bool]] = {
     "overwrite": stopped_overwrite,
     "foreign": foreign,
     "writers": writers,
+    "savers": savers,
 }
 
 

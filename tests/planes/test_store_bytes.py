@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from vijax.planes.store import array, compressors, encoded, write_blank
-from vijax.planes.store_metadata import void
+from vijax.planes.store import array, compressors, encoded, metadata_files, void, write_files
 
 KINDS = st.sampled_from(["<f8", "<f4", "<i4", "|i1", "|b1"])
 SHAPES = arrays.array_shapes(min_dims=0, max_dims=3, max_side=9)
@@ -37,7 +36,8 @@ def test_metadata_are_zarrs_own(kinds, shape, parts):
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # consolidated metadata are no part of the format yet
         ours, theirs = Path(folder, "ours"), Path(folder, "theirs")
-        write_blank(ours, told, {name: array(each, shape, chunks, voids[name]) for name, each in variables.items()})
+        layouts = {name: array(each, shape, chunks, voids[name]) for name, each in variables.items()}
+        write_files(ours, metadata_files(told, layouts))
         group = zarr.create_group(theirs, attributes=told)
         for name, each in variables.items():
             group.create_array(

@@ -374,9 +374,16 @@ def test_quantities_are_taken_cell_by_cell(calls, out):
 
 def test_files_of_a_killed_process_are_cleared_and_no_others(calls, out):
     stopped_after(8, out, **AXES)
-    left = [out / "P" / "c" / "0" / ".1.99.part", out / "status" / "tiles" / ".3.99.part.json"]
-    others = [out / "notes.part1.txt", out / "P" / "c" / ".notes.99.part", out / "x.part" / "thesis.tex"]
-    others[-1].parent.mkdir()
+    tiles, token = out / "status" / "tiles", "0123456789abcdef"
+    left = [out / "P" / "c" / "0" / ".1.99.part", tiles / ".3.99.part.json", tiles / f".3.{token}.part.json"]
+    others = [
+        out / "notes.part1.txt",
+        out / "P" / "c" / ".notes.99.part",
+        out / "x.part" / "thesis.tex",
+        out / "P" / "c" / "9" / f".9.{token}.part",
+    ]
+    for folder in (others[-1].parent, others[-2].parent):
+        folder.mkdir()
     for path in (*left, *others):
         path.write_text("half")
     sweep(**AXES, out=out)
@@ -408,46 +415,76 @@ def test_a_record_of_nonsense_is_written_again(calls, out, files):
 # --- left by killed runs ---------------------------------------------------------------------------------------------
 
 
-def nobody() -> int:
-    """The number of a process that has ended."""
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
+def left_beside(out: Path, *files: str) -> Path:
+    """The working folder of a killed run."""
+    folder = out.with_name(".map.0123456789abcdef.part.zarr")
+    folder.mkdir()
+    for name in files:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("{")
+    return folder
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("kind", ["part", "old"])
-@pytest.mark.parametrize("who", [nobody, os.getpid], ids=["another", "as this one"])  # in containers numbers come again
-def test_what_a_killed_run_left_is_cleared_away(calls, out, caplog, kind, overwrite, who):
+@pytest.mark.parametrize(
+    "files", [[], ["lock"], ["lock", "new/zarr.json"], ["old/zarr.json", "old/vijax.json"]], ids=str
+)
+def test_what_a_killed_run_left_is_cleared_away(calls, out, caplog, files, overwrite):
     sweep(**AXES, out=out)
-    left = out.with_name(f".map.{who()}.{kind}.zarr")
-    left.mkdir()
-    (left / "zarr.json").write_text("{")
+    left = left_beside(out, *files)
     sweep(**AXES, out=out, overwrite=overwrite)
-    assert [said.getMessage() for said in caplog.records] == [f"{left.name}, which a killed run had left, is removed"]
+    # What is empty may be of a living run, which would make another.
+    told = [f"{left.name}, which a killed run had left, is removed"] if files[1:] else []
+    assert [said.getMessage() for said in caplog.records] == told
     assert [path.name for path in out.parent.iterdir()] == [out.name]
 
 
-def test_what_a_killed_run_had_put_aside_is_back(calls, out, caplog):
+@pytest.mark.parametrize("reads", [False, True])
+def test_what_a_killed_run_had_put_aside_is_back(calls, out, caplog, reads):
+    """Where the disk cannot exchange two names a store is nowhere for a moment."""
     whole = sweep(**AXES, out=out).load()
-    left = out.with_name(f".map.{nobody()}.old.zarr")
-    out.rename(left)
+    left = left_beside(out, "lock", "new/zarr.json")
+    out.rename(left / "old")
     calls.clear()
-    xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
+    xr.testing.assert_identical(load(out) if reads else sweep(**AXES, out=out).load(), whole)
     assert sum(calls) == 0
-    assert [said.getMessage() for said in caplog.records] == [
-        f"map.zarr, which a killed run had put aside as {left.name}, is back"
-    ]
+    assert [said.getMessage() for said in caplog.records] == ["map.zarr, which a killed run had put aside, is back"]
     assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from vijax.planes.store_folder import replacing_store
+with replacing_store("out", Path(sys.argv[1]), overwrite=True) as new:
+    new.mkdir()
+    print(new, flush=True)
+    input()
+"""
 
 
 def test_what_a_living_run_is_at_stays(calls, out):
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        left = out.with_name(f".map.{process.pid}.part.zarr")
-        left.mkdir()
-        sweep(**AXES, out=out)
-        assert left.is_dir()
-        process.communicate(b"\n")
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(out)], **pipes) as process:
+        part = Path(process.stdout.readline().strip())
+        whole = sweep(**AXES, out=out).load()
+        assert part.is_dir()
+        process.kill()
+        process.communicate()
+    sweep(**AXES, out=out)
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+    xr.testing.assert_identical(load(out), whole)
+
+
+@pytest.mark.parametrize("kind", ["study", "saved"])
+def test_a_disk_that_cannot_exchange_names_loses_nothing(calls, out, monkeypatch, kind):
+    monkeypatch.setattr("vijax.planes.store_folder.exchange", lambda one, other: False)
+    sweep(**AXES, r=0.4, out=out) if kind == "study" else sweeps.save(sweep(**AXES, r=0.4), out)
+    found = sweep(**AXES, out=out, overwrite=True).load()
+    xr.testing.assert_identical(load(out), found)
+    sweeps.save(found, out, overwrite=True)
+    xr.testing.assert_identical(load(out), found)
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
 
 
 # --- damage ----------------------------------------------------------------------------------------------------------

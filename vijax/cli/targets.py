@@ -30,7 +30,7 @@ def drawn(plot: Path | None, given: str | None, sizes: Mapping[str, int]) -> Pat
 
 
 def _store(out: str, ending: str, overwrite: bool, goes_on: bool) -> Path:
-    from vijax.planes.store import check_place, check_store
+    from vijax.planes.store_folder import check_place, check_store
     from vijax.runtime.files import check_ending, check_output
 
     if ending != ".zarr":

@@ -8,7 +8,7 @@ import numpy as np
 from vijax.explorer import overlay
 from vijax.explorer.plane import ExploredPlane, explored
 from vijax.explorer.worker import one_line
-from vijax.planes import inventory
+from vijax.planes import store_names
 from vijax.planes.store import load
 from vijax.planes.sweep import sweep
 
@@ -42,8 +42,8 @@ class Source:
         """Tell a state of the store from any other: how many tiles are done, and when a file of it was last written."""
         if self.path is None:
             return 0, 0
-        records = [file for file in (self.path / inventory.TILES).glob("[0-9]*.json")]
-        files = [*records, self.path / "zarr.json", self.path / inventory.LIST]
+        records = [file for file in (self.path / store_names.TILES).glob("[0-9]*.json")]
+        files = [*records, self.path / "zarr.json", self.path / store_names.LIST]
         return len(records), max((file.stat().st_mtime_ns for file in files if file.exists()), default=0)
 
     def plane(self) -> ExploredPlane:

@@ -11,7 +11,7 @@ import numpy as np
 from vijax.planes import cluster, dispatch, tiled_store
 from vijax.planes.dataset import SweepPlan, variables
 from vijax.planes.dispatch import Call
-from vijax.runtime import context
+from vijax.runtime import checks, context
 from vijax.runtime.context import door
 from vijax.runtime.tiles import places
 
@@ -39,7 +39,10 @@ def fill(plane: tiled_store.Study, tell: Callable[[int, int], None], workers: cl
                 done += tile.planned.count
                 tell(done, total)
     except (KeyboardInterrupt, OSError) as error:
-        error.add_note(f"{done:,} of {total:,} cells are in {plane.path}; the same command goes on from there")
+        # Workers may have written tiles since they were last heard of.
+        done = total - sum(map(plane.count, tiled_store.unfinished(plane)))
+        there = checks.shown_path(plane.path)
+        error.add_note(f"{done:,} of {total:,} cells are in {there}; the same command goes on from there")
         raise
 
 

@@ -1,18 +1,17 @@
 """What a store of tiles holds besides them, metadata and coordinates: made, mended, compared with a plan."""
 
 import json
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vijax.model.records import Status
-from vijax.planes import inventory, store
+from vijax.planes import inventory, store, store_names
 from vijax.planes.dataset import SweepPlan, asked, coordinates, provenance, specimen
-from vijax.runtime.files import replacing
+from vijax.planes.store_names import LIST, METADATA
+from vijax.runtime import checks
+from vijax.runtime.files import replace_files
 from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
@@ -23,14 +22,16 @@ _OFTEN_LEFT_OUT = "excitation", "starts"
 _SHOWN = 3  # Settings that differ which an error names; of others it says how many.
 
 
-def write(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path) -> None:
-    """Write the store of a plan, every variable void: its metadata do not change with its tiles.
+def contents(planned: SweepPlan, tile: Mapping[str, int], birth: str) -> dict[str, bytes]:
+    """Make the files of the store of a plan, every variable void: its metadata do not change with its tiles.
 
     Args:
         planned: What it will hold.
         tile: Lengths of a tile along the dimensions that the dynamics see.
         birth: Of the store: no other has the same.
-        path: Folder to make.
+
+    Returns:
+        Contents by name, the list of the files among them.
     """
     sizes, axes = planned.cells.sizes, coordinates(planned.cells)
     arrays = {
@@ -40,22 +41,15 @@ def write(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path) -
     for name, variable in specimen(planned).data_vars.items():
         shape = tuple(sizes[str(dim)] for dim in variable.dims)
         chunks = tuple({**sizes, **tile}[str(dim)] for dim in variable.dims)
-        arrays[str(name)] = store.array(variable.variable, shape, chunks, void(str(name), variable.dtype))
+        arrays[str(name)] = store.array(variable.variable, shape, chunks, store.void(str(name), variable.dtype))
     # Arrays named as their only dimension pass for coordinates; by this xarray knows the others, as CF has it.
     others = " ".join(sorted(name for name, axis in axes.items() if axis.dims != (name,)))
-    store.write_blank(path, provenance(planned) | {"coordinates": others}, arrays)
-    for name, axis in axes.items():
-        file = store.chunk(path, name, [0] * axis.ndim)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(store.encoded(axis.values))
-    inventory.write(path, birth=birth, tile=dict(tile))
-
-
-def void(name: str, dtype: np.dtype) -> Any:
-    """Give what a variable holds where nothing was run."""
-    if name == "status":
-        return int(Status.NOT_RUN)
-    return {"f": np.nan, "i": -1, "b": False}[dtype.kind]
+    files = store.metadata_files(provenance(planned) | {"coordinates": others}, arrays)
+    files |= {store.chunk(name, [0] * axis.ndim): store.encoded(axis.values) for name, axis in axes.items()}
+    listed = inventory.FileList()
+    for name, content in files.items():
+        listed.add(name, content)
+    return {**files, LIST: listed.content(birth=birth, tile=dict(tile))}
 
 
 # --- damage ----------------------------------------------------------------------------------------------------------
@@ -64,9 +58,11 @@ def void(name: str, dtype: np.dtype) -> Any:
 def mend(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
     """Write again what is damaged: metadata by their copies, coordinates by the plan if it has the same as was there.
 
+    No file is written that the store of the plan would not have.
+
     Args:
         planned: What the store should hold.
-        tile, birth: As in `write`, for a store that has lost the list of its files.
+        tile, birth: As in `contents`, for a store that has lost the list of its files.
         path: Of the store; one of an earlier version, which never had such a list, stays as it is.
         say: Takes a line for every file.
 
@@ -78,58 +74,49 @@ def mend(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path, sa
         _mend_list(planned, tile, birth, path, say)
         return
     faults = dict(inventory.faults(path, listed["files"]))
-    for name in [name for name in faults if name in listed["metadata"]]:
-        _put(name, faults.pop(name), listed["metadata"][name].encode(), path, say)
     if not faults:
         return
-    with _fresh(planned, listed["tile"], listed["birth"]) as fresh:
-        for name, reason in faults.items():
-            if inventory.fault(fresh / name, listed["files"][name]):
-                raise FileExistsError(
-                    see(
-                        "studies",
-                        f"out must be whole or what this plane can mend; got {path}, where {name} {reason}, "
-                        "and this plane has something else there; allow overwriting, or take another name",
-                    )
+    alike = set(listed.get("tile", ())) == set(tile)
+    fresh = contents(planned, listed["tile"], listed["birth"]) if alike else {}
+    copies = {name: text.encode() for name, text in listed["metadata"].items()}
+    mended = {name: copies.get(name, fresh[name]) for name in faults if name in fresh}
+    for name, reason in faults.items():
+        if name not in mended or inventory.fingerprint(mended[name]) != listed["files"][name]:
+            raise FileExistsError(
+                see(
+                    "studies",
+                    f"out must be whole or what this plane can mend; got {checks.shown_path(path)}, where "
+                    f"{checks.shown_path(name)} {reason}, and this plane has something else there; allow overwriting, "
+                    "or take another name",
                 )
-            _put(name, reason, (fresh / name).read_bytes(), path, say)
+            )
+    _put(mended, faults, path, say)
 
 
 def _mend_list(planned: SweepPlan, tile: Mapping[str, int], birth: str, path: Path, say: Callable[[str], None]) -> None:
     """Write the list of a store again that has lost it, and what metadata of arrays differ from those of the store."""
-    reason = inventory.fault(path / inventory.LIST, None)
+    reason = inventory.fault(path, LIST, None)
     if reason == "is missing" and not inventory.had_list(path):
         return
-    with _fresh(planned, tile, birth) as fresh:
-        faults = dict(inventory.faults(path, (inventory.read(fresh) or {})["files"]))
-        if any("/zarr.json" not in name for name in faults):
-            raise FileExistsError(
-                see(
-                    "studies",
-                    f"out must be whole or what this plane can mend; got {path}, where {inventory.LIST} {reason}, "
-                    f"which would tell whether {next(iter(faults))} is what was written; allow overwriting, "
-                    "or take another name",
-                )
+    fresh = contents(planned, tile, birth)
+    expected = {name: inventory.fingerprint(content) for name, content in fresh.items() if name != LIST}
+    faults = dict(inventory.faults(path, expected))
+    if unknown := [name for name in faults if not name.endswith(f"/{METADATA}")]:
+        raise FileExistsError(
+            see(
+                "studies",
+                f"out must be whole or what this plane can mend; got {checks.shown_path(path)}, where {LIST} {reason}, "
+                f"which would tell whether {unknown[0]} is what was written; allow overwriting, or take another name",
             )
-        for name, fault in [*faults.items(), (inventory.LIST, reason)]:
-            _put(name, fault, (fresh / name).read_bytes(), path, say)
+        )
+    _put(fresh, faults | {LIST: reason}, path, say)
 
 
-@contextmanager
-def _fresh(planned: SweepPlan, tile: Mapping[str, int], birth: str) -> Iterator[Path]:
-    """Make the store of a plan as it would be made now, for a while."""
-    with tempfile.TemporaryDirectory() as folder:
-        write(planned, tile, birth, Path(folder, "fresh"))
-        yield Path(folder, "fresh")
-
-
-def _put(name: str, reason: str, content: bytes, path: Path, say: Callable[[str], None]) -> None:
-    """Write a file of a store again."""
-    target = path / name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(target) as part:
-        part.write_bytes(content)
-    say(f"{name} of {path} is written again: it {reason}")
+def _put(mended: Mapping[str, bytes], faults: Mapping[str, str], path: Path, say: Callable[[str], None]) -> None:
+    """Write files of a store again, those that have faults."""
+    replace_files({path / name: mended[name] for name in faults}, within=path)
+    for name, reason in faults.items():
+        say(f"{name} of {checks.shown_path(path)} is written again: it {reason}")
 
 
 # --- which plane -----------------------------------------------------------------------------------------------------
@@ -138,13 +125,14 @@ def _put(name: str, reason: str, content: bytes, path: Path, say: Callable[[str]
 def check_same(planned: SweepPlan, path: Path) -> None:
     """Raise FileExistsError unless a store holds the plane of a plan, or part of it."""
     with store.view(path) as written:
-        found = list(_differences(planned, written))
+        found = [*_differences(planned, written), *_other_tiles(planned, path)]
     if found:
         more = f"; and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         raise FileExistsError(
             see(
                 "studies",
-                f"out must be new or hold the same plane; got {path}, where {'; '.join(found[:_SHOWN])}{more}; "
+                f"out must be new or hold the same plane; got {checks.shown_path(path)}, where "
+                f"{'; '.join(found[:_SHOWN])}{more}; "
                 "allow overwriting, or take another name",
             )
         )
@@ -163,6 +151,20 @@ def _differences(planned: SweepPlan, written: "xr.Dataset") -> Iterator[str]:
         if here is None or there is None or here.dims != there.dims or not _equal(here.values, there.values):
             yield f"{name} is {_words(there)}, and not {_words(here)}"
     yield from (f"{name} is left out" for name in planned.outputs if name not in written)
+
+
+def _other_tiles(planned: SweepPlan, path: Path) -> Iterator[str]:
+    """Find variables whose chunks are not the tiles of the store, a phrase each."""
+    arrays = {name: grid for name, grid in store_names.layouts(path).items() if name in planned.outputs}
+    status, listed = arrays.get("status"), inventory.read(path)
+    tile = dict(zip(status.dims, status.chunk, strict=True)) if status else {}
+    if tuple(tile) != planned.cells.dynamic or (listed and listed.get("tile") != tile):
+        yield "status has chunks that are not its tiles"
+        return
+    for name, grid in arrays.items():
+        chunk = {dim: tile.get(dim, size) for dim, size in planned.cells.sizes.items()}
+        if grid is None or grid.chunk != tuple(chunk.get(dim) for dim in grid.dims):
+            yield f"{name} has chunks that are not its tiles"
 
 
 def _equal(one: np.ndarray, other: np.ndarray) -> bool:

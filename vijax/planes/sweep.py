@@ -22,7 +22,8 @@ from vijax.planes.cells import Cells, cells
 from vijax.planes.dataset import DEFAULT, SweepPlan, label, warn_if_held
 from vijax.planes.dispatch import Fields
 from vijax.planes.outputs import ON_REQUEST, table
-from vijax.planes.store import check_store, load, save, view
+from vijax.planes.store import load, save, view
+from vijax.planes.store_folder import check_store
 from vijax.planes.sweep_settings import MOST_STARTS, SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -302,7 +303,7 @@ def check(planned: SweepPlan, out: str | Path, overwrite: bool = False) -> None:
     """Raise unless the map of a plan can be written there, or goes on there; makes nothing.
 
     Raises:
-        ValueError, OSError: As `tiled_store.check`; of a refined map as `store.check_store`, or it does not fit
+        ValueError, OSError: As `tiled_store.check`; of a refined map as `store_folder.check_store`, or it does not fit
             in memory.
     """
     for name, labels in planned.cells.labels.items():

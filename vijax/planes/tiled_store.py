@@ -5,10 +5,10 @@ record is written last, after its chunks, and tells how and by what the tile was
 Records and lock lie beside the chunks of `status`, where no reader of zarr looks.
 """
 
+import itertools
 import logging
 import math
 import os
-import shutil
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
@@ -19,11 +19,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vijax.planes import inventory, store_metadata, tile_size
+from vijax.planes import inventory, store_metadata, store_names, tile_size
 from vijax.planes.cells import Cells
 from vijax.planes.dataset import SweepPlan, made_by
-from vijax.planes.store import check_place, check_store, chunk, encoded
-from vijax.runtime.files import beside, replacing, replacing_folder, write_json
+from vijax.planes.store import chunk, encoded, void, write_files
+from vijax.planes.store_folder import alone, check_place, check_store, lock, replacing_store
+from vijax.runtime import checks
+from vijax.runtime.files import create, make_folder, make_folders, remove, remove_part, replace_files, write_json
 from vijax.runtime.pages import see
 from vijax.runtime.tiles import places
 
@@ -128,7 +130,7 @@ class StudyTile:
 
 
 def _record(path: Path, tile: int) -> Path:
-    return path / inventory.TILES / f"{tile}.json"
+    return path / store_names.TILES / f"{tile}.json"
 
 
 def extents(sizes: dict[str, int], most: int) -> dict[str, int]:
@@ -181,8 +183,8 @@ def opened(planned: SweepPlan, path: str | Path, overwrite: bool = False) -> Ite
     if not target.exists():
         _make(planned, birth, target)
     elif overwrite:
-        with _locked(target, overwrite), replacing_folder(target) as part:
-            _write_blank(planned, birth, part)
+        with _locked(target, overwrite), replacing_store("out", target, overwrite) as new:
+            _write_blank(planned, birth, new)
     with _locked(target):
         # What was made here a moment ago is known.
         if _birth(target) != birth:
@@ -192,31 +194,28 @@ def opened(planned: SweepPlan, path: str | Path, overwrite: bool = False) -> Ite
 
 def _make(planned: SweepPlan, birth: str, target: Path) -> None:
     """Make a store without any tile, unless another run was faster."""
-    part = beside(target, "part")
     try:
-        _write_blank(planned, birth, part)
-        part.rename(target)
-    except OSError:
+        with replacing_store("out", target, overwrite=False) as new:
+            _write_blank(planned, birth, new)
+    except FileExistsError:
         if not target.exists():
             raise
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _write_blank(planned: SweepPlan, birth: str, path: Path) -> None:
-    store_metadata.write(planned, blocks(planned.cells), birth, path)
-    _lock(path).parent.mkdir()
-    _lock(path).write_text(birth, encoding="utf-8")
-
-
-def _lock(path: Path) -> Path:
-    """Name the file that a writer of the store locks; within, the birth of the store."""
-    return path / inventory.TILES / "lock"
+    write_files(path, store_metadata.contents(planned, blocks(planned.cells), birth))
+    make_folder(lock(path).parent)
+    create(lock(path), birth.encode())
+    # Folders of chunks that are on disk with the store need not be flushed with every tile.
+    arrays = {name: grid for name, grid in store_names.layouts(path).items() if grid and grid.shape}
+    firsts = {name: itertools.product(*map(range, grid.counts[:-1]), [0]) for name, grid in arrays.items()}
+    make_folders(path, (path / chunk(name, place) for name, places in firsts.items() for place in places))
 
 
 def _birth(path: Path) -> str:
-    with _lock(path).open("rb") as lock:
-        return lock.read(_LONGEST_BIRTH).decode(errors="replace")
+    """Read the birth of a store in its lock."""
+    with lock(path).open("rb") as file:
+        return file.read(_LONGEST_BIRTH).decode(errors="replace")
 
 
 def _most(of: Cells) -> int:
@@ -228,46 +227,27 @@ def _most(of: Cells) -> int:
 
 def _found(planned: SweepPlan, path: Path) -> Study:
     """Describe the study that a store is, its tiles as long as they were when it was made."""
-    arrays = {name: inventory.content(path / name / "zarr.json") or {} for name in planned.outputs}
-    dims = {name: tuple(array.get("dimension_names", ())) for name, array in arrays.items()}
-    chunks = arrays["status"]["chunk_grid"]["configuration"]["chunk_shape"]
-    return Study(path, planned, dims, dict(zip(planned.cells.dynamic, chunks, strict=True)), _birth(path))
+    arrays = store_names.layouts(path)
+    dims = {name: grid.dims for name in planned.outputs if (grid := arrays[name])}
+    tile = arrays["status"]
+    assert tile is not None  # which `check_same` saw, or this process made it
+    return Study(path, planned, dims, dict(zip(tile.dims, tile.chunk, strict=True)), _birth(path))
 
 
 @contextmanager
 def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
-    """Be alone with a store; the lock ends with its process, however that ends. What was saved whole nobody writes."""
-    from filelock import FileLock, Timeout  # here, as importing vijax would take a twentieth longer
-
-    if not inventory.is_study(path):
-        if not overwrite:
-            raise FileExistsError(
-                see(
-                    "studies",
-                    f"out must be new or the store of a run that can go on; got {path}, which was saved whole; "
-                    "allow overwriting, or take another name",
-                )
+    """Be the only writer of a study; a map that was saved whole is written by nobody."""
+    if not overwrite and not inventory.is_study(path):
+        raise FileExistsError(
+            see(
+                "studies",
+                f"out must be new or the store of a run that can go on; got {checks.shown_path(path)}, which was saved "
+                "whole; allow overwriting, or take another name",
             )
-        yield
-        return
-    lock = _lock(path)
-    odd = inventory.fault(lock, None) in ("is missing", "is no regular file")
-    try:
-        if odd:
-            lock.unlink(missing_ok=True)
-            lock.parent.mkdir(parents=True, exist_ok=True)
-            lock.touch()
-        # No file that merely exists may stand in for the lock where the disk knows none: a killed run would leave it.
-        alone = FileLock(lock, fallback_to_soft=False).acquire(blocking=False)
-    except Timeout:
-        raise BlockingIOError(
-            see("studies", f"out must not be in use; got {path}, which another run is writing")
-        ) from None
-    except OSError as error:
-        raise PermissionError(f"out must be a store that can be written; got {path} ({error.strerror})") from None
-    with alone:
-        if (listed := inventory.read(path)) and listed["birth"] != _birth(path):
-            lock.write_text(listed["birth"], encoding="utf-8")
+        )
+    with alone("out", path):
+        if (listed := inventory.read(path)) and "birth" in listed and listed["birth"] != _birth(path):
+            lock(path).write_text(listed["birth"], encoding="utf-8")
         yield
 
 
@@ -280,46 +260,51 @@ def _check_same(planned: SweepPlan, path: Path) -> None:
 # --- what is done, what is left --------------------------------------------------------------------------------------
 
 
+def unfinished(study: Study) -> list[int]:
+    """Find the tiles that have no record."""
+    return [tile for tile in study.tiles if not os.path.lexists(study.record(tile))]
+
+
 def left(study: Study, say: Callable[[str], None]) -> list[int]:
     """Find tiles that are not done, and those whose files are no longer what was written; of these say why."""
     for file in inventory.half_written(study.path):
-        file.unlink(missing_ok=True)  # a worker that lost its driver may still be writing
+        remove_part(file)  # unless a worker that lost its driver is still writing it
     found = []
+    without = set(unfinished(study))
     for tile in study.tiles:
-        record = study.record(tile)
-        if not os.path.lexists(record):
+        if tile in without:
             found.append(tile)
         elif reason := _damage(study, tile):
-            record.unlink()
+            remove(study.record(tile))
             found.append(tile)
-            say(f"tile {tile} of {study.path} is run again: {reason}")
+            say(f"tile {tile} of {checks.shown_path(study.path)} is run again: {reason}")
     return found
 
 
 def _damage(study: Study, tile: int) -> str:
-    """Say what is wrong with the files of a tile, nothing if all are as they were written."""
-    record = inventory.content(study.record(tile))
+    """Describe what is wrong with the files of a tile; return no text if all are as they were written."""
+    file = study.record(tile)
+    odd = inventory.fault(study.path, file.relative_to(study.path).as_posix(), None)
+    record = None if odd == "is no regular file" else store_names.content(file)
     if record is None or not isinstance(record.get("files"), dict):
-        inventory.fault(study.record(tile), None)
         return "its record cannot be read"
     if record.get("birth") != study.birth:
         return "its record is of another store"
-    for name, file in _files(study.path, study.dims, study.place(tile)):
-        relative = file.relative_to(study.path).as_posix()
+    for name, relative in _files(study.dims, study.place(tile)):
         # Earlier versions wrote fingerprints under the names of variables.
-        if reason := inventory.fault(file, record["files"].get(relative, record["files"].get(name))):
+        if reason := inventory.fault(study.path, relative, record["files"].get(relative, record["files"].get(name))):
             return f"{relative} {reason}"
     return ""
 
 
-def _files(path: Path, dims: Mapping[str, tuple[str, ...]], place: Mapping[str, int]) -> Iterator[tuple[str, Path]]:
+def _files(dims: Mapping[str, tuple[str, ...]], place: Mapping[str, int]) -> Iterator[tuple[str, str]]:
     """Name the chunk of every variable of a tile."""
     for name, along in dims.items():
-        yield name, chunk(path, name, (place.get(dim, 0) for dim in along))
+        yield name, chunk(name, (place.get(dim, 0) for dim in along))
 
 
 def write(tile: StudyTile, found: "Mapping[str, xr.Variable]", seconds: float) -> None:
-    """Write the variables of a tile, then its record.
+    """Write the variables of a tile, then its record; all are on disk when this returns.
 
     Args:
         tile: Which.
@@ -330,28 +315,30 @@ def write(tile: StudyTile, found: "Mapping[str, xr.Variable]", seconds: float) -
         OSError: If the store cannot be written, or is no longer the one that the tile is of.
     """
     _check_born(tile)
-    prints = {}
-    for name, file in _files(tile.path, tile.dims, tile.place):
-        content = encoded(_filled(name, found[name].values, tile.shapes[name]))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as part:
-            part.write_bytes(content)
-        prints[file.relative_to(tile.path).as_posix()] = inventory.fingerprint(content)
+    contents = {}
+    for name, file in _files(tile.dims, tile.place):
+        store_names.check_way(tile.path, file)
+        contents[file] = encoded(_filled(name, found[name].values, tile.shapes[name]))
     record = {
         "cells": tile.planned.count,
         "seconds": round(seconds, 3),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         **made_by(),
         "birth": tile.birth,
-        "files": prints,
+        "files": {file: inventory.fingerprint(content) for file, content in contents.items()},
     }
+    # No reader finds a status before the numbers that it is of.
+    stages: tuple[dict[Path, bytes], ...] = ({}, {})
+    for file, content in contents.items():
+        stages[file.startswith("status/")][tile.path / file] = content
+    replace_files(*stages, within=tile.path)
     _check_born(tile)
     write_json(record, _record(tile.path, tile.number))
 
 
 def _filled(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Fill a chunk of a variable, void where it reaches beyond the plane."""
-    chunk = np.full(shape, store_metadata.void(name, values.dtype), values.dtype)
+    chunk = np.full(shape, void(name, values.dtype), values.dtype)
     chunk[tuple(slice(size) for size in values.shape)] = values
     return chunk
 
@@ -364,4 +351,6 @@ def _check_born(tile: StudyTile) -> None:
     record does not fit is found and run again. But the next driver may have begun another plane there.
     """
     if _birth(tile.path) != tile.birth:
-        raise FileExistsError(f"{tile.path} is no longer the store that tile {tile.number} was run for")
+        raise FileExistsError(
+            f"{checks.shown_path(tile.path)} is no longer the store that tile {tile.number} was run for"
+        )

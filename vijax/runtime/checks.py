@@ -37,6 +37,12 @@ def shown(value: Any) -> str:
     return " ".join(text.split())
 
 
+def shown_path(path: str | Path) -> str:
+    """Return a path as an error shows it: as it is, or quoted with escapes where it cannot be printed on one line."""
+    text = str(path)
+    return text if text.isprintable() else repr(text)
+
+
 def _instance_of(module: str, kind: str, value: Any) -> bool:
     """Return whether the value is of a class of a heavy package; nothing is while that is not imported."""
     # While another thread is still importing the module, the class is not there yet.
@@ -198,7 +204,7 @@ def shapes(**arrays: Any) -> tuple[int, ...]:
 
 
 def joined(names: Iterable[str]) -> str:
-    """Join names in a sentence: d, kappa and r; none are an empty text."""
+    """Join names in a sentence: d, kappa and r; no names are no text."""
     *others, last = list(names) or [""]
     return f"{', '.join(others)} and {last}" if others else last
 
@@ -321,7 +327,7 @@ def fits(names: Iterable[str], size: float, what: str, hint: str = "") -> None:
 
 def gigabytes(size: float) -> str:
     """Put bytes in words."""
-    return f"{size / 1e9:,.3g} GB" if size < 1e14 else f"{size / 1e12:,.0f} TB"
+    return f"{size / 1e9:,.3g} GB" if size < 1e12 else f"{size / 1e12:,.0f} TB"
 
 
 @cache
