@@ -15,7 +15,20 @@ For every scenario the numbers of states, of those that `load` refused, and of t
 - a tile that is done is read as it was written, and what is not there has the status `not_run`;
 - the same call goes on without --overwrite, runs no tile again that was done, and ends in the same map.
 
-Exit code 1 if any is broken. Printout, 20 cells in 4 tiles:
+Exit code 1 if any is broken. Printout of `--most 40`, 20 cells in 4 tiles:
+
+    where the disk can exchange two names:
+        a study: 40 states, 4 refused, 0 broken
+        a study that mends damage: 40 states, 26 refused, 0 broken
+        a study that replaces another: 40 states, 0 refused, 0 broken
+        save: 40 states, 20 refused, 0 broken
+        save that replaces a map: 40 states, 0 refused, 0 broken
+    where the disk cannot exchange two names:
+        a study: 40 states, 4 refused, 0 broken
+        a study that mends damage: 40 states, 26 refused, 0 broken
+        a study that replaces another: 40 states, 0 refused, 0 broken
+        save: 40 states, 20 refused, 0 broken
+        save that replaces a map: 40 states, 0 refused, 0 broken
 """
 
 import argparse

@@ -16,10 +16,10 @@ from vijax.planes import store_folder
 from vijax.runtime import files
 
 STATES = {
-    "a study": 12,
-    "a study that mends damage": 6,
-    "a study that replaces another": 5,
-    "save that replaces a map": 5,
+    "a study": 8,
+    "a study that mends damage": 4,
+    "a study that replaces another": 4,
+    "save that replaces a map": 4,
 }
 
 

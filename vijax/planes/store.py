@@ -14,7 +14,7 @@ import numpy as np
 
 from vijax.model.records import Status
 from vijax.planes import inventory, store_names
-from vijax.planes.store_folder import alone, check_store, recover, replacing_store
+from vijax.planes.store_folder import check_store, exclusive_writer, recover, replacing_store
 from vijax.planes.store_names import LIST, METADATA, ArrayLayout
 from vijax.runtime import checks
 from vijax.runtime.files import create, make_folder, make_folders
@@ -55,7 +55,7 @@ def save(dataset: "xr.Dataset", path: str | Path, *, overwrite: bool = False) ->
         if not store_names.is_name(f"{variable}/{METADATA}"):
             raise ValueError(f"dataset must have variables that can name a folder; got {checks.shown(variable)}")
     target = check_store("path", path, checks.flag("overwrite", overwrite))
-    with alone("path", target), replacing_store("path", target, overwrite) as new:
+    with exclusive_writer("path", target), replacing_store("path", target, overwrite) as new:
         write(dataset, new)
 
 

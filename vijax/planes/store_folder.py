@@ -68,12 +68,12 @@ def _check_free(name: str, target: Path, overwrite: bool) -> None:
     """Raise FileExistsError unless nothing is there, or a store that may be replaced and holds nothing foreign."""
     if not os.path.lexists(target):
         return
-    if overwrite and target.is_dir() and (stranger := store_names.foreign(target, inventory.names(target))):
+    if overwrite and target.is_dir() and (foreign := store_names.foreign(target, inventory.names(target))):
         raise FileExistsError(
             see(
                 "studies",
                 f"{name} must not replace what vijax did not write; got {checks.shown_path(target)}, which holds "
-                f"{checks.shown_path(stranger)}; move it elsewhere, or take another name",
+                f"{checks.shown_path(foreign)}; move it elsewhere, or take another name",
             )
         )
     _check_replaceable(name, target, overwrite)
@@ -101,7 +101,7 @@ def lock(path: Path) -> Path:
 
 
 @contextmanager
-def alone(name: str, path: Path) -> Iterator[None]:
+def exclusive_writer(name: str, path: Path) -> Iterator[None]:
     """Be the only writer of a study; the lock ends with its process, however that ends. What is no study has no writer.
 
     Raises:
@@ -161,8 +161,8 @@ def replacing_store(name: str, path: Path, overwrite: bool) -> Iterator[Path]:
             raise
         # Where this fails the old store stays in the working folder, which the next call removes.
         flush([target.parent, folder])
-        if stranger := _clear(folder, target):
-            _LOG.warning("%s holds %s, which vijax did not write, and stays", checks.shown_path(folder), stranger)
+        if foreign := _clear(folder, target):
+            _LOG.warning("%s holds %s, which vijax did not write, and stays", checks.shown_path(folder), foreign)
 
 
 def _working_folder(target: Path, stack: ExitStack) -> Path:
@@ -207,7 +207,7 @@ def recover(path: Path) -> None:
 
 
 def _recover(folder: Path, target: Path) -> None:
-    if not stat.S_ISDIR(os.lstat(folder).st_mode) or _stranger(folder):
+    if not stat.S_ISDIR(os.lstat(folder).st_mode) or _foreign_file(folder):
         return
     with locked(folder / _LOCK) as own:
         if not own:
@@ -227,16 +227,16 @@ def _clear(folder: Path, target: Path) -> str | None:
     if (folder / _OLD).is_dir() and not os.path.lexists(target):
         rename(folder / _OLD, target)
         flush([target.parent, folder])
-    if (stranger := _stranger(folder)) is None:
+    if (foreign := _foreign_file(folder)) is None:
         for one in (_NEW, _OLD):
             _remove(folder / one)
         for path in (folder / _LOCK, folder):
             with suppress(OSError):
                 remove(path)
-    return stranger
+    return foreign
 
 
-def _stranger(folder: Path) -> str | None:
+def _foreign_file(folder: Path) -> str | None:
     """Find a file in a working folder that vijax did not write."""
     known = {one: inventory.names(folder / one) for one in (_NEW, _OLD)}
     for name, entry in store_names.entries(folder):

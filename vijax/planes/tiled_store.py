@@ -23,7 +23,7 @@ from vijax.planes import inventory, store_metadata, store_names, tile_size
 from vijax.planes.cells import Cells
 from vijax.planes.dataset import SweepPlan, made_by
 from vijax.planes.store import chunk, encoded, void, write_files
-from vijax.planes.store_folder import alone, check_place, check_store, lock, replacing_store
+from vijax.planes.store_folder import check_place, check_store, exclusive_writer, lock, replacing_store
 from vijax.runtime import checks
 from vijax.runtime.files import create, make_folder, make_folders, remove, remove_part, replace_files, write_json
 from vijax.runtime.pages import see
@@ -245,7 +245,7 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
                 "whole; allow overwriting, or take another name",
             )
         )
-    with alone("out", path):
+    with exclusive_writer("out", path):
         if (listed := inventory.read(path)) and "birth" in listed and listed["birth"] != _birth(path):
             lock(path).write_text(listed["birth"], encoding="utf-8")
         yield

@@ -292,10 +292,14 @@ def path(name: str, value: Any) -> Path:
     """Return the value as a path.
 
     Raises:
-        ValueError: No path.
+        ValueError: No path that a file can have.
         FileNotFoundError: A relative path in a working directory that was deleted.
     """
-    if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
+    try:
+        valid = isinstance(value, str | Path) and str(value) and b"\0" not in os.fsencode(value)
+    except UnicodeEncodeError:
+        valid = False
+    if not valid:
         raise ValueError(f"{name} must be a path, as text or a pathlib.Path; got {shown(value)}")
     found = Path(value)
     if not found.is_absolute():
