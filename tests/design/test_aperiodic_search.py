@@ -7,7 +7,7 @@ import pytest
 
 import vijax
 from vijax.design import multistart, off_design, optimise
-from vijax.design.aperiodic_search import search
+from vijax.design.aperiodic_search import PlaceCandidates, search
 from vijax.design.design_settings import DesignSettings
 from vijax.design.ensemble import Task
 from vijax.design.multistart import Effort
@@ -130,8 +130,8 @@ PROVING = {"confirm_balls": 16, "confirm_periods": 300, "limit_room": 0.01, "max
 def met():
     """What a survey met that is no orbit, and the bounds of what is tuned."""
     box = optimise.check([DEVICE], ("kappa",), {"kappa": (20.0, 30.0)}, "P", ())
-    _, unrest, _ = multistart.find([DEVICE], ("kappa",), box, "P", Effort(8, 4, 1, 100), orbits_alone=False)
-    return unrest, box
+    task = multistart.SurveyTask([DEVICE], ("kappa",), box, "P", Effort(8, 4, 1, 100))
+    return multistart.find(task, orbits_alone=False).others, box
 
 
 @pytest.mark.parametrize("name", CLIMBING)
@@ -142,7 +142,7 @@ def test_every_setting_of_the_ascent_is_read(met, name):
         task = Task([DEVICE], ("kappa",), box, "P", (), 1.0, DesignSettings(**(FEW | settings)))
         # An orbit that would give 2 % more leaves this chaos out only where it has to promise as much.
         known = np.log([1.02 * P]) if name == "min_chaos" else np.array([-np.inf])
-        places = search(task, unrest, known)
+        places = search(task, PlaceCandidates(task, unrest).take(known, True), known)
         return [(one.ensembles, one.best.tolist(), [height for _, height in one.path]) for one in places]
 
     assert told(**{name: CLIMBING[name]}) != told()

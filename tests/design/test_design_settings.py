@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 
 import vijax
-from vijax.design import multistart, optimise, optimum
+from vijax.design import candidates, multistart, optimise, optimum
 from vijax.design.ascent import Box, Look, ascend
 from vijax.design.design_settings import DesignSettings
+
+# Its motion is chaotic from kappa 22 to 23, periodic at most others.
+UNIT = vijax.Harvester(A=2.460536, omega=9.218106, r=0.854762)
+DEVICE = dataclasses.replace(UNIT, s=0.073195 * UNIT.length_unit)
+WIDE = dataclasses.replace(UNIT, s=3.0 * UNIT.length_unit)
 
 # Of each setting another value, and what else is set so that it matters.
 SURVEYED = {
@@ -21,6 +26,7 @@ SURVEYED = {
     "max_sure_impacts": (1, {"min_promise": 1.0}),
     "min_promise": (1e-6, {"max_sure_impacts": 1}),
     "survey_refinement": (1, {}),
+    "max_wide_starts": (1, {"device": WIDE}),
 }
 CLIMBED = {
     "max_step": (0.05, {}),
@@ -40,6 +46,8 @@ RIVALS = {
 CHANGED = SURVEYED | CLIMBED | RIVALS | {"active_margin": (0.9, {})}
 # Changed where designs of aperiodic motion are tested.
 ELSEWHERE = (
+    "max_turns",
+    "max_ascents",
     "min_chaos",
     "max_places",
     "places_apart",
@@ -56,18 +64,17 @@ ELSEWHERE = (
     "limit_room",
     "max_confirmations",
 )
-# Its motion is chaotic from kappa 22 to 23, periodic at most others.
-UNIT = vijax.Harvester(A=2.460536, omega=9.218106, r=0.854762)
-DEVICE = dataclasses.replace(UNIT, s=0.073195 * UNIT.length_unit)
 
 
 @cache
-def surveyed(tune=("kappa", "r"), points=64, orbits_alone=True, **settings):
+def surveyed(tune=("kappa", "r"), points=64, orbits_alone=True, device=DEVICE, **settings):
     """Where ascents begin."""
-    box = optimise.check([DEVICE], tune, {"kappa": (3.0, 400.0)}, "P", ())
+    box = optimise.check([device], tune, {"kappa": (3.0, 400.0)}, "P", ())
     far = optimise.effort(points, 1, 16)._replace(settings=DesignSettings(**({"survey_levels": 6} | settings)))
-    met, _, looked = multistart.find([DEVICE], tune, box, "P", far, orbits_alone=orbits_alone)
-    return met.z.tolist(), looked[0].orbits
+    task = multistart.SurveyTask([device], tune, box, "P", far)
+    found = multistart.find(task, orbits_alone=orbits_alone)
+    begun = candidates.OrbitCandidates(found, orbits_alone).take(None)
+    return begun and begun.z.tolist(), found.looked[0].orbits, found.looked[0].starts
 
 
 @cache

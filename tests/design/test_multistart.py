@@ -2,13 +2,16 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 
-from vijax.design import multistart, optimise
+from vijax.design import candidates, multistart, optimise
+from vijax.design.candidates import OrbitCandidates
 from vijax.design.design_settings import DesignSettings
-from vijax.design.multistart import Effort
+from vijax.design.multistart import Effort, SurveyTask
 from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
 
 
 def device(d, r, A, omega):
@@ -22,11 +25,17 @@ IN_CHAOS = device(0.073195, 0.854762, 2.460536, 9.218106)
 BEYOND = device(0.123487, 0.510445, 2.045754, 4.755139)
 
 
+def surveyed(devices, box, effort, orbits_alone=True):
+    """Where ascents along kappa begin, other motion, and what was met of each device."""
+    found = multistart.find(SurveyTask(devices, ("kappa",), box, "P", effort), orbits_alone=orbits_alone)
+    return OrbitCandidates(found, orbits_alone).take(None), found.others, found.looked
+
+
 def found(given, low, high, steps, balls, periods=200):
     """What `find` finds between two kappa: the starts, their kinds (period, more and fewer impacts), their kappa."""
     bounds = {"kappa": (low, high)}
     box = optimise.check([given], ("kappa",), bounds, "P", ())
-    met, _, looked = multistart.find([given], ("kappa",), box, "P", Effort(steps, balls, 16, periods))
+    met, _, looked = surveyed([given], box, Effort(steps, balls, 16, periods))
     left, right = ((met.flown.side == side).sum(axis=1) for side in (-1, 1))
     kinds = np.column_stack([met.flown.span / 2, np.maximum(left, right), np.minimum(left, right)]).astype(int)
     assert looked[0].orbits >= len(kinds)
@@ -55,14 +64,14 @@ def test_a_long_orbit_just_beyond_a_limit_is_climbed_from():
 def test_only_the_best_of_a_kind_within_reach_climbs(reach, chosen):
     kind = np.array([[0, 1], [0, 1], [0, 1], [0, 1], [0, 1], [0, 2], [1, 1]])
     step, score = np.array([0, 3, 4, 20, 20, 3, 3]), np.array([1.0, 3.0, 2.0, 5.0, 6.0, 0.0, 0.0])
-    np.testing.assert_array_equal(multistart.highest(kind, step, score, reach), chosen)
+    np.testing.assert_array_equal(candidates.highest(kind, step, score, reach), chosen)
 
 
 def test_giving_up_early_loses_no_start_that_may_win():
     def starts(**settings):
         box = optimise.check([BEYOND], ("kappa",), {"kappa": (2.0, 400.0)}, "P", ())
         far = Effort(128, 2, 16, 200)._replace(settings=DesignSettings(**settings))
-        begun, unrest, _ = multistart.find([BEYOND], ("kappa",), box, "P", far, orbits_alone=False)
+        begun, unrest, _ = surveyed([BEYOND], box, far, orbits_alone=False)
         return begun.z, np.asarray(unrest.ended.periods_run).sum()
 
     (soon, flown), (late, more) = starts(), starts(first_periods=200)
@@ -75,10 +84,11 @@ def test_a_survey_looks_along_the_first_quantity_at_values_of_the_others_that_li
     bounds = {"kappa": (3.0, 400.0), "d": (0.04, 0.25), "r": (0.2, 0.8)}
     box = optimise.check([BEYOND], names, bounds, "P", ())
     far = Effort(2, 1, 16, 10)._replace(settings=DesignSettings(survey_levels=count))
-    met, _ = multistart.every_start([BEYOND], names, box, far)
+    task = SurveyTask([BEYOND], names, box, "expected", far)
+    met, _ = multistart.every_start(task)
     low, high = box[0]
     places = np.unique(np.round((met.z - low) / (high - low), 9), axis=0)
-    assert len(places) == len(met.z) == 2 * count == multistart.balls(names, far)
+    assert len(places) == len(met.z) == 2 * count == task.cells
     others = np.unique(places[:, 1:], axis=0)
     assert len(others) == count
     # No motion may hide between two values, nor beyond the last one.
@@ -91,7 +101,7 @@ def test_starts_of_one_device_do_not_depend_on_the_others():
 
     def of(some):
         box = optimise.check(some, ("kappa",), {"kappa": (2.0, 400.0)}, "P", ())
-        met, _, looked = multistart.find(some, ("kappa",), box, "P", Effort(128, 2, 16, 200))
+        met, _, looked = surveyed(some, box, Effort(128, 2, 16, 200))
         return [
             (met.flown.pair.kappa[own], met.flown.knots[own], looked[i].orbits)
             for i in range(len(some))
@@ -103,3 +113,29 @@ def test_starts_of_one_device_do_not_depend_on_the_others():
     for device, beside in zip(devices, together, strict=True):
         for one, other in zip(of([device])[0], beside, strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_every_other_ball_in_a_wide_gap_is_as_fast_as_the_forcing_can_keep_it():
+    numbers = np.arange(40)
+    d = np.where(numbers < 20, 0.3, 4.0)
+    pair = ImpactPair(d, np.full(40, 50.0), np.full(40, 0.8), np.zeros(40))
+    starts = multistart._starts(pair, numbers, 64, 0)
+    speed = np.abs(starts.v)
+    assert speed[d < 1].max() <= 0.6
+    assert speed[(d > 1) & (numbers % 2 == 0)].max() <= 0.6
+    # From wall to wall the forcing adds 2/pi at most, and an impact takes a fifth.
+    assert 0.6 < speed[d > 1].max() <= 2 / np.pi / 0.2
+    assert (np.abs(starts.u) <= 0.49 * d).all()
+    # Further draws do not change the first ones.
+    more = multistart._starts(*jax.tree.map(lambda x: np.tile(x, 2), (pair, numbers)), 64, 0)
+    np.testing.assert_array_equal(more.v[:40], starts.v)
+
+
+def test_wide_gaps_take_more_starts_and_longer_flights():
+    devices = [device(d, 0.5, 2.0, 5.0) for d in (0.3, 1.3, 5.0, 40.0)]
+    box = optimise.check(devices, ("kappa",), {"kappa": (2.0, 400.0)}, "P", ())
+    task = SurveyTask(devices, ("kappa",), box, "P", Effort(128, 2, 16, 200))
+    np.testing.assert_array_equal(task.balls, 256 * np.array([1, 2, 8, 8]))
+    assert task.flown == 200 * 256 * (1 + 2 * 2 + 8 * 8 + 8 * 64)
+    asked = optimise.expected(task)
+    assert asked.cells == 256 * 19

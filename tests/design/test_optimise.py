@@ -17,12 +17,13 @@ import xarray as xr
 
 import vijax
 from scripts import design as script
-from vijax.design import objective, off_design, optimise
+from vijax.design import objective, off_design, optimise, turns
 from vijax.design import robustness as around
 from vijax.design.objective import Batch, Scene
 from vijax.design.report import describe
 from vijax.design.report_lines import lines, table
 from vijax.design.tolerance import Spread, Tolerance, nodes
+from vijax.design.turns import DeviceSearch
 from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.runtime.files import write_json
@@ -51,9 +52,9 @@ def test_devices_are_designed_in_groups_whose_balls_fit(monkeypatch):
     def sought(task, *_):
         assert len(task.box) == len(task.devices)
         groups.append([one.s for one in task.devices])
-        return [optimise._Found((), nothing, 0) for _ in task.devices]
+        return [DeviceSearch(nothing, 0.0) for _ in task.devices]
 
-    monkeypatch.setattr(optimise, "_sought", sought)
+    monkeypatch.setattr(turns, "search", sought)
     gaps = np.linspace(0.1, 0.2, 11).tolist()
     devices = [Harvester(s=s) for s in gaps]
     points = optimise._TOGETHER // (4 * 8)
@@ -63,6 +64,10 @@ def test_devices_are_designed_in_groups_whose_balls_fit(monkeypatch):
     groups.clear()
     optimise.optimise_all(devices[:3], survey_points=points // 8, starts=8, tune=("kappa", "d"))
     assert groups == [gaps[:2], gaps[2:3]]
+    # In a gap that is wide, one has eight times as many.
+    groups.clear()
+    optimise.optimise_all([*devices[:2], Harvester(s=50.0), devices[3]], survey_points=points // 2, starts=8)
+    assert groups == [gaps[:2], [50.0], gaps[3:4]]
 
 
 def test_the_small_fast_device(found):
@@ -274,6 +279,22 @@ def test_devices_that_cannot_be_designed_are_told():
         optimise.optimise(jax.tree.map(lambda x: np.full(2, x), FAST))
 
 
+# Of gaps that a ball takes periods to cross, with what a sweep of 200 values from 64 starts gives.
+SHAKER = Harvester(s=0.04, A=12.0, omega=36 * math.pi, m_b=0.005, R0=0.008, w0=0.0003, V=1500.0)
+WIDE = Harvester(
+    s=0.00671816, A=14.2558, omega=168.026, r=0.305025, m_b=0.00666067, R0=0.00669786, V=1532.13, r_b=0.004
+)
+
+
+@pytest.mark.parametrize(("device", "swept"), [(SHAKER, 27e-9), (WIDE, 21.6e-9)])
+def test_in_a_wide_gap_a_design_gives_more_than_a_sweep(device, swept):
+    # Most starts stay on slow aperiodic motion, which gives less the longer it lasts.
+    best = optimise.optimise(device, survey_points=32, max_impacts=2).best
+    assert swept < best.P
+    assert int(best.orbit.status[0]) == Status.OK
+    assert (best.state.energy <= best.state.work).all()
+
+
 def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
     nominal = found[0].best
     best = around.weighted(found[0], starts=16, points=5)
@@ -456,7 +477,7 @@ def test_where_no_motion_keeps_the_limits_the_report_says_which_stands(folder, c
 
 def test_what_a_survey_met_says_what_to_do():
     nothing = {"orbits": 0, "admissible": 0, "restless": 0, "P": 0.0, "values": {}, "held": 0.0, "silent": 0.0}
-    nothing |= {"limit": "", "excess": 0.0}
+    nothing |= {"limit": "", "excess": 0.0, "slow": 0.0}
     for met, says in (
         ({"orbits": 3, "limit": "penetration limit", "excess": 0.5}, "the penetration limit stands everywhere"),
         ({"orbits": 3}, "3 periodic orbits that break a constraint: widen the bounds or the penetration limit"),
@@ -464,6 +485,7 @@ def test_what_a_survey_met_says_what_to_do():
         ({"restless": 2}, "none of it admissible"),
         ({"held": 1.0}, "100 % of the starts on one wall for ever: raise A or lower beta"),
         ({"silent": 0.5}, "50 % of the starts without impacts"),
+        ({"slow": 0.25}, "25 % of the starts undecided"),
         ({}, "nothing that settles"),
     ):
         one = {"best": None, "survey": nothing | met}

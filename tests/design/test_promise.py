@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vijax.design.design_settings import DesignSettings
-from vijax.design.promise import Met, highest_promise, near_limits, promise
+from vijax.design.promise import Met, at_places, highest_promise, near_limits, promise
 
 
 class Given(NamedTuple):
@@ -43,3 +43,12 @@ def test_motion_beside_a_limit_is_near_it_and_so_is_what_lies_one_step_aside():
 def test_the_highest_promise_is_of_what_breaks_no_limit():
     most = highest_promise(3, met([1, 5], [0, -0.1], [0, 1], [0, 0]), met([3], [0], [0], [1]))
     np.testing.assert_allclose(most, [0.0, np.log(3), -np.inf])
+
+
+def test_a_place_promises_the_mean_of_its_motions_and_their_worst_margin():
+    some = met([4, 0, 1, 9], [0.2, 0.1, -0.5, 0.3], [0, 0, 1, 0], [0, 0, 0, 1])._replace(
+        z=np.array([[1.0], [1.0], [2.0], [1.0]])
+    )
+    hope = at_places(some).hope
+    np.testing.assert_allclose(np.exp(hope.value), [2, 2, 1, 9])
+    np.testing.assert_allclose(hope.lacks, [0, 0, -0.5, 0])

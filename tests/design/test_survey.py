@@ -9,7 +9,7 @@ import pytest
 
 import vijax
 from vijax.batch.simulate import Starts
-from vijax.design.survey import survey
+from vijax.design.survey import stretch, survey
 from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
 from vijax.orbits import grazing, orbit_properties, periodic
@@ -87,6 +87,25 @@ def test_what_is_no_orbit_has_the_averages_of_a_sweep(found):
     np.testing.assert_allclose(own, swept("P")[chaos - KAPPA.size * 9], rtol=0.2)
     assert abs(own.mean() / swept("P")[chaos - KAPPA.size * 9].mean() - 1) < 0.01
     assert (ran.ended.energy_ratio[chaos, 0] > 0).all()
+
+
+def test_flights_in_wide_gaps_take_as_many_more_periods_as_balls_take_to_cross():
+    np.testing.assert_array_equal(stretch([0.01, 1.19, 1.2, 2.3, 2.4, 9.7]), [1, 1, 2, 2, 4, 16])
+    count = 4
+    d, kappa = np.array([0.12, 3.0, 0.12, 3.0]), np.full(count, 200.0)
+    pair = ImpactPair(d, kappa, np.full(count, 0.5), np.zeros(count))
+    device = jax.tree.map(lambda x: np.full(count, x), vijax.Harvester(penetration_limit=0.0063))
+    starts = Starts(np.zeros(count), np.array([0.3, 0.3, 0.2, 1e-9]), np.zeros(count))
+    periods = 60 * stretch(d)
+    ran = survey(pair, device, starts, longest=4 * stretch(d), periods=periods)
+    np.testing.assert_array_equal(ran.longest, [4, 16, 4, 16])
+    one = survey(*jax.tree.map(lambda x: x[1:2], (pair, device, starts)), longest=16, periods=240)
+    np.testing.assert_array_equal(ran.ended.P[1], one.ended.P[0])
+    aperiodic = np.asarray(ran.ended.period) <= 0
+    assert (ran.ended.periods_run[aperiodic] >= periods[aperiodic]).all()
+    # A ball that has met no wall yet in a wide gap is one of those that are on no orbit.
+    assert ran.ended.status[3] == Status.NO_IMPACT
+    assert 3 in ran.restless(8)
 
 
 def test_clearances_are_those_of_the_motion_in_between(orbit):

@@ -118,9 +118,13 @@ def _asked(
 
 def _agree(asked: DesignRequest, yes: bool) -> None:
     from vijax.design import optimise
+    from vijax.design.multistart import SurveyTask
 
-    effort = optimise.effort(*(asked.search[name] for name in ("survey_points", "starts", "max_impacts")))
-    process.agree(optimise.expected(len(asked.devices), asked.search["tune"], effort), yes)
+    search = asked.search
+    effort = optimise.effort(*(search[name] for name in ("survey_points", "starts", "max_impacts")))
+    tune, objective = search["tune"], search["objective"]
+    box = optimise.check(asked.devices, tune, search["bounds"], objective, search["tolerances"])
+    process.agree(optimise.expected(SurveyTask(asked.devices, tune, box, objective, effort)), yes)
 
 
 def _run(asked: DesignRequest) -> "tuple[dict[str, Any], xr.Dataset | None, TolerancePlane | None, str]":

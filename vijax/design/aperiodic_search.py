@@ -15,8 +15,9 @@ import numpy as np
 
 from vijax.batch.simulate import Starts
 from vijax.design.ascent import Box, Look, ascend
+from vijax.design.candidates import KEPT
 from vijax.design.design_settings import DesignSettings
-from vijax.design.ensemble import AVERAGED, Ensemble, Task, alike, fly
+from vijax.design.ensemble import Ensemble, Task, alike, fly, moving
 from vijax.design.promise import Met
 from vijax.design.response_surface import Surface, fit, unknown
 from vijax.runtime import tiles
@@ -43,7 +44,7 @@ class Place:
         ahead: The logarithm of the objective that it promises to reach, less a price where limits stay broken.
         path: Centres and fitted objectives of the ensembles that were taken.
         ensembles: How many were flown.
-        going: Whether there is more to gain.
+        stopped: Why it climbs no more: "maximum", "noise", "refused" or "outdone"; "" while it climbs.
     """
 
     owner: int
@@ -55,7 +56,12 @@ class Place:
     ahead: float = -np.inf
     path: list[tuple[np.ndarray, float]] = dataclasses.field(default_factory=list)
     ensembles: int = 0
-    going: bool = True
+    stopped: str = ""
+
+    @property
+    def going(self) -> bool:
+        """Return whether there is more to gain."""
+        return not self.stopped
 
     @property
     def known(self) -> bool:
@@ -73,15 +79,15 @@ def _place(owner: int, z: np.ndarray, radius: float, starts: Starts) -> Place:
     return Place(owner, z, radius, starts, z, unknown(z.size))
 
 
-def search(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
-    """Climb from the most promising places of every device.
+def search(task: Task, places: list[Place], known: np.ndarray) -> list[Place]:
+    """Climb from the places of every device.
 
     Args:
         task: See there.
-        unrest: What surveys met that is no orbit to climb from; of "expected" all that they met.
-        known: Logarithm of the best objective of an orbit of each device, -inf where there is none.
+        places: Where to begin; see `PlaceCandidates`.
+        known: Logarithm of the best verified objective of every device, -inf where there is none.
     """
-    places = _begun(task, unrest, known)
+    places = list(places)
     for _ in range(task.settings.max_ensembles):
         going = [one for one in places if one.going]
         if not going:
@@ -93,40 +99,67 @@ def search(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
 # --- where to begin ---------------------------------------------------------------------------------------------------
 
 
-def _begun(task: Task, unrest: Met, known: np.ndarray) -> list[Place]:
-    """Choose the most promising places of every device, apart from each other."""
-    settings, places = task.settings, []
-    hope = unrest.hope
-    least = known + np.log(settings.min_chaos)
-    for owner in np.unique(unrest.owner).tolist():
-        own = np.flatnonzero(unrest.owner == owner)
-        z, which = np.unique(unrest.z[own], axis=0, return_inverse=True)
-        value, lacks = _told(task, which.ravel(), np.exp(hope.value[own]), hope.lacks[own])
-        score = value + settings.limit_price * lacks
-        score[lacks < -_FAR] = -np.inf
-        reach = settings.places_apart * settings.ensemble_radius * task.unit(owner)
-        chosen: list[int] = []
-        for row in np.argsort(-score, kind="stable").tolist():
-            if len(chosen) == settings.max_places or not score[row] > least[owner]:
-                break
-            if all((np.abs(z[row] - z[other]) > reach).any() for other in chosen):
-                chosen.append(row)
-        met = (unrest.found.some(own[which.ravel() == row]).end for row in chosen)
-        places += [_place(owner, z[row], settings.ensemble_radius, x) for row, x in zip(chosen, met, strict=True)]
-    return places
+class PlaceCandidates:
+    """Values of the tuned quantities at which other motion than an orbit is climbed, in turns.
+
+    Args:
+        task: See there.
+        others: What surveys met that is no orbit to climb from; of "expected" all that they met.
+    """
+
+    def __init__(self, task: Task, others: Met):
+        self._task, self._others = task, others
+        self._tried: dict[int, list[np.ndarray]] = {}
+
+    def take(self, known: np.ndarray, first: bool) -> list[Place]:
+        """Take the most promising places of every device, apart from each other and from those taken before.
+
+        Args:
+            known: Logarithm of the best verified objective of every device, -inf where there is none.
+            first: Whether this is the first turn; in later ones a place has to promise more than what is known.
+        """
+        settings, places, others = self._task.settings, [], self._others
+        least = known + (np.log(settings.min_chaos) if first else KEPT)
+        for owner in np.unique(others.owner).tolist():
+            own = np.flatnonzero(others.owner == owner)
+            z, which = np.unique(others.z[own], axis=0, return_inverse=True)
+            some = others.some(own)
+            value, lacks, error = _told(self._task, which.ravel(), some)
+            # In later turns a place that the noise of its starts alone puts above the best design is not worth it.
+            score = value + settings.limit_price * lacks - (0.0 if first else error)
+            score[lacks < -_FAR] = -np.inf
+            reach = settings.places_apart * settings.ensemble_radius * self._task.unit(owner)
+            tried, chosen = self._tried.setdefault(owner, []), 0
+            for row in np.argsort(-score, kind="stable").tolist():
+                if chosen == settings.max_places or not score[row] > least[owner]:
+                    break
+                if all((np.abs(z[row] - other) > reach).any() for other in tried):
+                    tried.append(z[row])
+                    chosen += 1
+                    found = others.found.some(own[which.ravel() == row])
+                    places.append(_place(owner, z[row], settings.ensemble_radius, found.some(moving(found)).end))
+        return places
 
 
-def _told(task: Task, which: np.ndarray, value: np.ndarray, lacks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Judge each value by the balls met at it: logarithm of their mean, and what lacks to the limits.
+def _told(task: Task, which: np.ndarray, met: Met) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Judge each value by the balls met at it: logarithm of their mean, what lacks to the limits, the mean's error.
 
     The worst of them, or of the share that counts, says how much room there is.
     """
     count = np.bincount(which)
-    with np.errstate(divide="ignore"):
-        mean = np.log(np.bincount(which, value) / count)
-    order = np.lexsort((lacks, which))
+    value = np.exp(met.hope.value)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = np.nan_to_num(met.ended.P_stderr[:, 0] / met.found.P, nan=1.0)
+        mean = np.bincount(which, value) / count
+        spread = np.bincount(which, (value - mean[which]) ** 2) / np.maximum(count - 1, 1)
+        # The error of one ball alone is that of its own flight.
+        square = np.where(count > 1, spread, np.bincount(which, (value * own) ** 2)) / count
+        error = np.nan_to_num(np.sqrt(square) / mean)
+    order = np.lexsort((met.hope.lacks, which))
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    return mean, lacks[order][first + np.floor((1 - task.reliability) * (count - 1)).astype(int)]
+    lacks = met.hope.lacks[order][first + np.floor((1 - task.reliability) * (count - 1)).astype(int)]
+    with np.errstate(divide="ignore"):
+        return np.log(mean), lacks, error
 
 
 # --- a round of ensembles ---------------------------------------------------------------------------------------------
@@ -165,9 +198,11 @@ def _judge(task: Task, place: Place, ensemble: Ensemble) -> None:
         enough = surface.worth(here, settings.limit_price) > place.surface.worth(here, settings.limit_price) - noise
     if not enough:
         place.radius, place.z = place.radius / 4, place.best
-        place.going = place.known and place.radius > 0.1 * settings.last_radius
+        if not place.known or place.radius <= 0.1 * settings.last_radius:
+            place.stopped = "refused"
         return
-    place.best, place.surface, place.starts = place.z, surface, some.found.end
+    # A ball that is without an impact for long is part of the average, but no more ensembles set out from it.
+    place.best, place.surface, place.starts = place.z, surface, some.found.some(moving(some.found)).end
     place.path.append((place.z, float(np.exp(surface.value))))
 
 
@@ -179,9 +214,11 @@ def _step(task: Task, place: Place, ahead: np.ndarray, best: float) -> None:
     if surface.margins.min() >= -settings.limit_room and short:
         noise = max(2 * float(surface.value_error), settings.min_gain)
         gain = surface.worth(step, 0.0) - float(surface.value)
-        place.going &= gain >= noise or place.radius > settings.last_radius
+        if gain < noise and place.radius <= settings.last_radius:
+            place.stopped = "maximum"
         place.radius = min(place.radius, settings.last_radius)
-    place.going &= place.ahead + _SURE * float(surface.value_error) > best - settings.min_gain
+    if not place.ahead + _SURE * float(surface.value_error) > best - settings.min_gain:
+        place.stopped = "outdone"
 
 
 def _windows(
@@ -190,8 +227,8 @@ def _windows(
     """Narrow windows: where a ball has left chaos for an orbit that gives more than the best of its device."""
     settings = task.settings
     new: dict[int, Place] = {}
-    for place, at, wide, (offsets, found, device) in zip(going, centre, radius, flown, strict=True):
-        good = (found.period > 0) & np.isin(found.status, AVERAGED) & (found.margins().min(axis=1) >= 0)
+    for place, at, wide, (offsets, found, device, _) in zip(going, centre, radius, flown, strict=True):
+        good = (found.period > 0) & moving(found) & (found.margins().min(axis=1) >= 0)
         if wide <= settings.last_radius or not good.any() or not place.known:
             continue
         value = np.where(good, found.value(task.objective, device), 0.0)

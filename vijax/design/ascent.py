@@ -22,9 +22,7 @@ from vijax.runtime.xla import once
 _CONVERGED = 1e-6  # At this weight of the barrier a maximum is right to six digits.
 _ARRIVED = 1e-8  # A step this short is the last.
 _STUCK = 1e-9  # So is a trial that is refused this near.
-_ROUNDED = (
-    1e-3  # A step that gains so small a part of the barrier's weight, and is refused all the same, meets rounding.
-)
+_ROUNDED = 1e-3  # If a step that gains so small a part of the barrier's weight is refused, rounding decided.
 
 
 class Look(NamedTuple):

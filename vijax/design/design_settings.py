@@ -35,6 +35,9 @@ _COUNTS = (
     "survey_levels",
     "max_hills",
     "max_sure_impacts",
+    "max_wide_starts",
+    "max_turns",
+    "max_ascents",
     "max_excess_steps",
     "first_periods",
     "survey_refinement",
@@ -57,8 +60,10 @@ class DesignSettings:
     Variables are logarithms of the tuned quantities (an inclination itself); heights are logarithms of the objective.
 
     Attributes:
-        max_period: Forcing periods of an orbit, at most, 8. Longer ones live in windows that few starts meet; each
-            period more is recorded of every chaotic motion.
+        max_period: Forcing periods of an orbit, at most, 8, in a wide gap as many times more as balls take to cross it.
+            Longer ones live in windows that few starts meet.
+        max_wide_starts: A survey takes up to so many times as many starts in a gap that is wide, 8: twice as many from
+            d = 1.2 on, four times from 2.4 on. More attractors coexist there, and each has fewer of the starts.
         survey_levels: Values of all tuned quantities but the first, taken together, at which a survey looks along the
             first, spread evenly over their bounds, 16. They multiply the cells of a survey. With 3, designs in
             (kappa, d) missed motions that live between them and beyond: of 12 random devices one lost a third of its P.
@@ -82,6 +87,9 @@ class DesignSettings:
             largest depths are not met, and less is given up; with more, that costs more.
         survey_refinement: Times as many cells as before about a step that is looked at closer, 8. With fewer, narrow
             windows of periodic motion in chaos are missed.
+        max_turns: Turns of a search, at most, 3. Each turn after the first takes the candidates that promise more than
+            the best design verified by then, where that is not what the turn before promised.
+        max_ascents: Orbits that such a turn climbs from, at most, 32, the most promising ones.
         max_step: Longest step of an ascent, 0.2. Longer ones leave the branch of their orbit, and are halved until they
             do not.
         max_approach: Share of the way to a constraint that one step may go, 0.95.
@@ -119,6 +127,7 @@ class DesignSettings:
     """
 
     max_period: int = 8
+    max_wide_starts: int = 8
     survey_levels: int = 16
     max_hills: int = 256
     max_sure_impacts: int = 8
@@ -128,6 +137,8 @@ class DesignSettings:
     max_excess_steps: int = 3
     first_periods: int = 40
     survey_refinement: int = 8
+    max_turns: int = 3
+    max_ascents: int = 32
     max_step: float = 0.2
     max_approach: float = 0.95
     curvature_pairs: int = 8

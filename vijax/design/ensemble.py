@@ -11,16 +11,15 @@ import numpy as np
 from vijax.batch.simulate import Starts
 from vijax.design.averages import Averages, averages
 from vijax.design.design_settings import DesignSettings
-from vijax.design.survey import survey
+from vijax.design.survey import stretch, survey
 from vijax.design.tolerance import Tolerance, drawn
 from vijax.model.device import Harvester
 from vijax.model.pair import ImpactPair
-from vijax.model.records import SETTLED, Status
+from vijax.model.records import Status
 from vijax.model.variables import LINEAR, cells, scattered
 from vijax.planes.basins import SPEED, spread
 from vijax.runtime import tiles
 
-AVERAGED = *SETTLED, Status.SLOW  # a ball that ended so has averages
 _TILES = (512, 4096, 32768)  # cells of one compiled call
 # Balls that set out from one state differ by this part of their velocity: as copies they would tell nothing new.
 _ASIDE = 1e-4
@@ -75,15 +74,23 @@ class Task(NamedTuple):
 
 
 class Ensemble(NamedTuple):
-    """Balls about one design: their offsets in the variables [ball, variable], what they gave, their devices."""
+    """Balls about one design.
+
+    Attributes:
+        offsets: Of the balls in the variables [ball, variable].
+        found, device: What they gave, and their devices.
+        periods: Forcing periods of the flight.
+    """
 
     offsets: np.ndarray
     found: Averages
     device: Harvester
+    periods: int = 0
 
     def some(self, index: np.ndarray) -> "Ensemble":
         """Pick those with the given indices."""
-        return Ensemble(self.offsets[index], self.found.some(index), jax.tree.map(lambda x: x[index], self.device))
+        device = jax.tree.map(lambda x: x[index], self.device)
+        return Ensemble(self.offsets[index], self.found.some(index), device, self.periods)
 
 
 def fly(
@@ -103,7 +110,7 @@ def fly(
         centre: Variables [centre, variable].
         radius: How far the balls are spread about each; 0 for all of them at the centre.
         starts: Balls on the motion that is meant, for each centre; unused where balls start anywhere.
-        periods: Forcing periods of every ball.
+        periods: Forcing periods of every ball; in a wide gap more, see `flown_periods`.
         balls: How many.
     """
     unit = np.array([task.unit(one) for one in owner])
@@ -118,9 +125,17 @@ def fly(
         device = scattered(device, names, [np.tile(x, len(owner)) for x in factors.T])
         device, pair = _cells(device, np.zeros((each.size, 0)), ())
     begun = _anywhere(pair.d, len(owner), balls) if task.expected else _joined([on_motion(x, balls) for x in starts])
-    found = averages(device, survey(pair, device, begun, longest=1, periods=periods).ended)
+    widest = np.asarray(pair.d).reshape(len(owner), balls).max(axis=1)
+    most = flown_periods(task.settings, widest, periods)
+    found = averages(device, survey(pair, device, begun, longest=1, periods=np.repeat(most, balls)).ended)
     whole = Ensemble((z - centre[:, None]).reshape(-1, len(task.tune)), found, device)
-    return [whole.some(np.arange(i * balls, (i + 1) * balls)) for i in range(len(owner))]
+    ensembles = (whole.some(np.arange(i * balls, (i + 1) * balls)) for i in range(len(owner)))
+    return [one._replace(periods=int(count)) for one, count in zip(ensembles, most, strict=True)]
+
+
+def flown_periods(settings: DesignSettings, d: Any, periods: int) -> np.ndarray:
+    """Return the forcing periods of flights in gaps d: more in wide ones, though no more than the last flight takes."""
+    return np.minimum(periods * stretch(d), max(periods, settings.confirm_periods))
 
 
 def _cells(device: Harvester, z: np.ndarray, names: tuple[str, ...]) -> tuple[Harvester, ImpactPair]:
@@ -157,8 +172,21 @@ def _joined(some: list[Starts]) -> Starts:
     return jax.tree.map(lambda *x: np.concatenate(x), *some)
 
 
+def moving(found: Averages) -> np.ndarray:
+    """Return which balls have averages of a motion with impacts."""
+    return np.isfinite(found.P) & (found.P > 0) & (found.status != Status.NO_IMPACT)
+
+
+def silent(found: Averages) -> np.ndarray:
+    """Return which balls met no wall in all that was flown. In a wide gap that is part of an aperiodic motion."""
+    return found.status == Status.NO_IMPACT
+
+
 def alike(found: Averages) -> np.ndarray:
-    """Say which balls are on the kind of motion that most of them are on; those of another would bend the surface."""
-    fine = np.isin(found.status, AVERAGED) & (found.P > 0)
-    restless, periodic = fine & (found.period <= 0), fine & (found.period > 0)
-    return restless if restless.sum() >= periodic.sum() else periodic
+    """Return which balls are on the kind of motion that most of them are on; those of another would bend the surface.
+
+    Balls without an impact count with those that are aperiodic.
+    """
+    fine = moving(found)
+    restless, periodic = (fine & (found.period <= 0)) | silent(found), fine & (found.period > 0)
+    return restless if fine[restless].any() and restless.sum() >= periodic.sum() else periodic

@@ -1,7 +1,7 @@
-"""Where designs set out from: attractors of a survey, of every kind the most promising.
+"""Surveys: which motions the devices of a design have, at values of the tuned quantities all over their bounds.
 
-`find` is the line: a coarse survey -> a closer one where chaos, or what has not settled, promises more than any orbit
-found, for narrow windows of periodic motion lie there -> the best of every kind.
+`find` is the line: a coarse survey -> a closer one where chaos, or motion that has not settled, promises more than any
+orbit found, for narrow windows of periodic motion lie there. `candidates` chooses from the result what is climbed.
 """
 
 import math
@@ -13,17 +13,18 @@ import numpy as np
 from vijax.batch.simulate import Starts
 from vijax.design.averages import LIMITS, averages
 from vijax.design.design_settings import DEFAULT, DesignSettings
-from vijax.design.promise import Met, highest_promise, near_limits, promise
-from vijax.design.survey import Flown, Survey, flown, survey
+from vijax.design.promise import Met, at_places, highest_promise, near_limits, promise
+from vijax.design.survey import Survey, stretch, survey
 from vijax.model.device import Harvester
+from vijax.model.pair import ImpactPair
 from vijax.model.records import Status
-from vijax.model.variables import LINEAR, cells, moving, values
+from vijax.model.variables import cells, moving, tuned, values
 from vijax.runtime import tiles
 from vijax.runtime.lattice import lattice
 
 _TILES = (512, 4096, 32768)  # cells of one compiled call
 _REACH = 0.49, 0.6  # a ball starts within this part of the gap, and with at most this velocity
-_HOPELESS = -1e3  # score of what breaks a constraint, before what it lacks
+_KICK = 2 / math.pi  # most that the forcing adds to the speed of a ball from one wall to the other
 
 
 class Effort(NamedTuple):
@@ -33,7 +34,7 @@ class Effort(NamedTuple):
         points: Values of the first quantity.
         starts: At each of them.
         max_impacts: Of an orbit that is wanted.
-        periods: Forcing periods that a start may take.
+        periods: Forcing periods that a start may take, in a gap that is not wide.
         settings: See there.
     """
 
@@ -45,18 +46,21 @@ class Effort(NamedTuple):
 
 
 class Looked(NamedTuple):
-    """What a survey of a device met.
+    """Motions that the survey of a device met.
 
     Attributes:
+        starts: How many were flown.
         orbits, admissible: Periodic attractors that can be climbed from; those that break no constraint.
-        restless: How many values of the tuned quantities have other motion: aperiodic, not settled, or too long.
-        P: Most that such motion harvests per half forcing period without breaking a constraint [J]; 0 if none does.
+        restless: Number of values of the tuned quantities with other motion: aperiodic, not settled, or too long.
+        P: Most that such motion harvests per half forcing period without breaking a constraint [J], the mean of the
+            starts at one value of the tuned quantities; 0 if none does.
         values: Of the tuned quantities where it does; none if none does.
         limit, excess: Which limit the motion breaks that is nearest to breaking none, and by what part; "" and 0 where
             one keeps both, or nothing was met.
-        held, silent: Shares of the starts that end on one wall for ever, and without a wall.
+        held, silent, slow: Shares of the starts that end on one wall for ever, without an impact, and undecided.
     """
 
+    starts: int
     orbits: int
     admissible: int
     restless: int
@@ -66,19 +70,152 @@ class Looked(NamedTuple):
     excess: float
     held: float
     silent: float
+    slow: float
 
 
-class Begun(NamedTuple):
-    """Where ascents begin, [start]: an orbit as it was flown, its device and variables, which of the devices it is."""
+class SurveyTask(NamedTuple):
+    """Devices to survey, names of the tuned quantities, their bounds [device, 2, variable], objective and effort."""
 
-    flown: Flown
-    device: Harvester
-    z: np.ndarray
-    owner: np.ndarray
+    devices: list[Harvester]
+    tune: tuple[str, ...]
+    box: np.ndarray
+    objective: str
+    effort: Effort
 
-    def some(self, index: np.ndarray) -> "Begun":
-        """Pick those with the given indices."""
-        return jax.tree.map(lambda x: x[index], self)
+    @property
+    def points(self) -> int:
+        """Return the number of values of the first quantity."""
+        return 1 if first_moving(self.tune) is None else self.effort.points
+
+    @property
+    def cells(self) -> int:
+        """Return the starts of a device with a narrow gap."""
+        return len(self.levels) * self.points * self.effort.starts
+
+    @property
+    def starts(self) -> np.ndarray:
+        """Return the starts of each device at every value: more in wide gaps, where more attractors coexist."""
+        return self.effort.starts * np.minimum(self._stretch, self.effort.settings.max_wide_starts)
+
+    @property
+    def balls(self) -> np.ndarray:
+        """Return the starts of each device in its first survey, the most of all."""
+        return len(self.levels) * self.points * self.starts
+
+    @property
+    def flown(self) -> int:
+        """Return the forcing periods that the starts of all devices take, at most."""
+        return int((self.balls * self._stretch).sum()) * self.effort.periods
+
+    @property
+    def _stretch(self) -> np.ndarray:
+        """Return how many times as many forcing periods flights of each device take, in the middle of its bounds."""
+        given = jax.tree.map(lambda *x: np.array(x, float), *self.devices)
+        own = jax.vmap(lambda one, z: tuned(one, self.tune, z))(given, self.box.mean(axis=1))
+        return np.broadcast_to(stretch(own.s / own.length_unit), len(self.devices))
+
+    @property
+    def levels(self) -> np.ndarray:
+        """Return values [level, quantity] of all quantities but the first, in parts of their bounds."""
+        return _levels(self.tune, self.effort)
+
+
+class SurveyResult(NamedTuple):
+    """Motions that surveys met: orbits to climb from, all other motion, and the summary of every device."""
+
+    task: SurveyTask
+    orbits: Met
+    others: Met
+    looked: list[Looked]
+
+
+def find(task: SurveyTask, *, orbits_alone: bool = True) -> SurveyResult:
+    """Find the motions of every device.
+
+    Args:
+        task: See there; starts for tolerances are those for P.
+        orbits_alone: Whether chaos is no answer, but a place where narrow windows may hide an orbit.
+    """
+    effort, devices = task.effort, len(task.devices)
+    seen = _first_look(task) if orbits_alone else _in_two_flights(task)
+    met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
+    if first_moving(task.tune) is not None:
+        most = highest_promise(devices, *((met,) if orbits_alone else (met, at_places(unrest))))
+        good = unrest.hope.total > most[unrest.owner] + math.log(effort.settings.min_promise)
+        # An orbit that keeps its limits may hide in chaos that is far beyond them; the best motion of all does not.
+        good &= orbits_alone | near_limits(unrest.some(good), unrest, effort.settings)
+        again = _closer(unrest.some(good), task)
+        if again.owner.size:
+            closer = _look(task, again, 1)
+            more = closer.orbits(effort.max_impacts), closer.restless(effort.max_impacts)
+            met, unrest = jax.tree.map(lambda *x: np.concatenate(x), (met, unrest), more)
+    return SurveyResult(task, met, unrest, _looked(task, met, unrest, seen))
+
+
+def every_start(task: SurveyTask) -> tuple[Met, list[Looked]]:
+    """Find what every start came to, where that is the answer, and what each device met."""
+    seen = _first_look(task)
+    met, unrest = seen.orbits(task.effort.max_impacts), seen.restless(task.effort.max_impacts)
+    return seen.every(), _looked(task, met, unrest, seen)
+
+
+def _first_look(task: SurveyTask) -> "_Seen":
+    """Survey coarsely: as many starts at every value."""
+    starts = task.starts
+    owner = np.repeat(np.arange(len(task.devices)), len(task.levels) * task.points * starts)
+    number = np.concatenate([np.arange(len(task.levels) * task.points * count) for count in starts])
+    level, step = np.divmod(number // starts[owner], task.points)
+    return _look(task, _Places(owner, level, step / max(task.points - 1, 1), number), 0)
+
+
+def _in_two_flights(task: SurveyTask) -> "_Seen":
+    """Survey coarsely, where any motion may win: what has not settled soon flies on where it may be the best."""
+    effort, devices = task.effort, len(task.devices)
+    short = min(effort.settings.first_periods, effort.periods)
+    seen = _first_look(task._replace(effort=effort._replace(periods=short)))
+    cells = seen.found.restless(effort.max_impacts)
+    met, unrest = seen.orbits(effort.max_impacts), seen.motions(cells)
+    most = highest_promise(devices, met, at_places(unrest))
+    good = unrest.hope.total > most[unrest.owner] + math.log(effort.settings.min_rival)
+    good = near_limits(unrest.some(good), unrest, effort.settings)
+    if short == effort.periods or not good.any():
+        return seen
+    periods = effort.periods * stretch(seen.found.pair.d)
+    return seen._replace(found=seen.found.onward(cells[good], seen.device, periods))
+
+
+def _looked(task: SurveyTask, met: Met, unrest: Met, seen: "_Seen") -> list[Looked]:
+    """Sum up what was met of every device, by the closer survey too."""
+    mean = at_places(unrest._replace(hope=promise(unrest.found, unrest.device, "P"))).hope
+    power = np.where(mean.lacks < 0, 0.0, np.exp(mean.value))
+    owner = np.concatenate([met.owner, unrest.owner])
+    every_room = np.concatenate([one.found.margins() for one in (met, unrest)])
+    every_status = seen.found.ended.status
+
+    def told(one: int) -> Looked:
+        orbits, others = met.owner == one, np.flatnonzero(unrest.owner == one)
+        highest = others[power[others].argmax()] if others.size else None
+        best = 0.0 if highest is None else float(power[highest])
+        where = np.asarray(values(task.tune, unrest.z[highest])).tolist() if best else []
+        room = every_room[owner == one]
+        nearest = room[np.nan_to_num(room, nan=-np.inf).min(axis=1).argmax()] if len(room) else np.zeros(2)
+        breaks = bool(nearest.min() < 0)
+        status = every_status[seen.places.owner == one]
+        return Looked(
+            starts=status.size,
+            orbits=int(orbits.sum()),
+            admissible=int((met.hope.lacks[orbits] >= 0).sum()),
+            restless=len(np.unique(unrest.z[others[unrest.found.P[others] > 0]], axis=0)),
+            P=best,
+            values=dict(zip(task.tune, where, strict=bool(best))),
+            limit=LIMITS[int(nearest.argmin())] if breaks else "",
+            excess=math.expm1(-float(nearest.min())) if breaks else 0.0,
+            held=float((status == Status.PERMANENT_CONTACT).mean()),
+            silent=float((status == Status.NO_IMPACT).mean()),
+            slow=float((status == Status.SLOW).mean()),
+        )
+
+    return [told(one) for one in range(len(task.devices))]
 
 
 class _Places(NamedTuple):
@@ -96,148 +233,14 @@ class _Places(NamedTuple):
     number: np.ndarray
 
 
-def find(
-    devices: list[Harvester],
-    tune: tuple[str, ...],
-    box: np.ndarray,
-    objective: str,
-    effort: Effort,
-    *,
-    orbits_alone: bool = True,
-) -> tuple[Begun, Met, list[Looked]]:
-    """Find the attractors to climb from, all motion that is no orbit to climb from, and what was met of every device.
-
-    Args:
-        devices: Where quantities that are not tuned are taken from.
-        tune: Names of the others.
-        box: Bounds of these, [device, 2, variable].
-        objective: Of `OBJECTIVES`; starts for tolerances are those for P.
-        effort: How far to look.
-        orbits_alone: Whether chaos is no answer, but a place where narrow windows may hide an orbit.
-    """
-    scene = _Scene(devices, tune, box, objective, effort)
-    seen = _first_look(scene) if orbits_alone else _in_two_flights(scene)
-    met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
-    if _first(tune) is not None:
-        most = highest_promise(len(devices), *((met,) if orbits_alone else (met, unrest)))
-        good = unrest.hope.total > most[unrest.owner] + math.log(effort.settings.min_promise)
-        # An orbit that keeps its limits may hide in chaos that is far beyond them; the best motion of all does not.
-        good &= orbits_alone | near_limits(unrest.some(good), unrest, effort.settings)
-        again = _closer(unrest.some(good), effort, scene.cells)
-        if again.owner.size:
-            closer = _look(scene, again, 1)
-            more = closer.orbits(effort.max_impacts), closer.restless(effort.max_impacts)
-            met, unrest = jax.tree.map(lambda *x: np.concatenate(x), (met, unrest), more)
-    looked = _looked(scene, met, unrest, seen)
-    chosen = met.some(_promising(met, len(devices), scene.points, effort.settings))
-    if not orbits_alone:
-        chosen = chosen.some(_rivals(chosen, unrest, scene))
-    flights = flown(chosen.pair, chosen.ended, effort.max_impacts)
-    return Begun(flights, chosen.device, chosen.z, chosen.owner), unrest, looked
-
-
-def every_start(
-    devices: list[Harvester], tune: tuple[str, ...], box: np.ndarray, effort: Effort
-) -> tuple[Met, list[Looked]]:
-    """Find what every start came to, where that is the answer, and what each device met; arguments as in `find`."""
-    scene = _Scene(devices, tune, box, "expected", effort)
-    seen = _first_look(scene)
-    met, unrest = seen.orbits(effort.max_impacts), seen.restless(effort.max_impacts)
-    return seen.every(), _looked(scene, met, unrest, seen)
-
-
-def _first_look(scene: "_Scene") -> "_Seen":
-    """Survey coarsely: as many balls at every value."""
-    levels = len(_levels(scene.tune, scene.effort))
-    shape = len(scene.devices), levels, scene.points, scene.effort.starts
-    owner, level, step, _ = (x.ravel() for x in np.indices(shape))
-    number = np.arange(owner.size) % scene.cells
-    return _look(scene, _Places(owner, level, step / max(scene.points - 1, 1), number), 0)
-
-
-def _in_two_flights(scene: "_Scene") -> "_Seen":
-    """Survey coarsely, where any motion may win: what has not settled soon flies on where it may be the best."""
-    effort, devices = scene.effort, len(scene.devices)
-    short = min(effort.settings.first_periods, effort.periods)
-    seen = _first_look(scene._replace(effort=effort._replace(periods=short)))
-    cells = seen.found.restless(effort.max_impacts)
-    met, unrest = seen.orbits(effort.max_impacts), seen.motions(cells)
-    most = highest_promise(devices, met, unrest)
-    good = unrest.hope.total > most[unrest.owner] + math.log(effort.settings.min_rival)
-    good = near_limits(unrest.some(good), unrest, effort.settings)
-    if short == effort.periods or not good.any():
-        return seen
-    return seen._replace(found=seen.found.onward(cells[good], seen.device, effort.periods))
-
-
-def _looked(scene: "_Scene", met: Met, unrest: Met, seen: "_Seen") -> list[Looked]:
-    """Sum up what was met of every device, by the closer survey too."""
-    power = np.where(unrest.hope.lacks < 0, 0.0, np.nan_to_num(unrest.found.P))
-    owner = np.concatenate([met.owner, unrest.owner])
-    every_room = np.concatenate([one.found.margins() for one in (met, unrest)])
-    every_status = seen.found.ended.status
-
-    def told(one: int) -> Looked:
-        orbits, others = met.owner == one, np.flatnonzero(unrest.owner == one)
-        highest = others[power[others].argmax()] if others.size else None
-        best = 0.0 if highest is None else float(power[highest])
-        where = np.asarray(values(scene.tune, unrest.z[highest])).tolist() if best else []
-        room = every_room[owner == one]
-        nearest = room[np.nan_to_num(room, nan=-np.inf).min(axis=1).argmax()] if len(room) else np.zeros(2)
-        breaks = bool(nearest.min() < 0)
-        status = every_status[seen.places.owner == one]
-        return Looked(
-            orbits=int(orbits.sum()),
-            admissible=int((met.hope.lacks[orbits] >= 0).sum()),
-            restless=len(np.unique(unrest.z[others], axis=0)),
-            P=best,
-            values=dict(zip(scene.tune, where, strict=bool(best))),
-            limit=LIMITS[int(nearest.argmin())] if breaks else "",
-            excess=math.expm1(-float(nearest.min())) if breaks else 0.0,
-            held=float((status == Status.PERMANENT_CONTACT).mean()),
-            silent=float((status == Status.NO_IMPACT).mean()),
-        )
-
-    return [told(one) for one in range(len(scene.devices))]
-
-
-class _Scene(NamedTuple):
-    """What `find` is told."""
-
-    devices: list[Harvester]
-    tune: tuple[str, ...]
-    box: np.ndarray
-    objective: str
-    effort: Effort
-
-    @property
-    def points(self) -> int:
-        """Count the values of the first quantity at which is looked."""
-        return _points(self.tune, self.effort)
-
-    @property
-    def cells(self) -> int:
-        """Count the balls of a device that are flown in a look, at most."""
-        return balls(self.tune, self.effort)
-
-
-def balls(tune: tuple[str, ...], effort: Effort) -> int:
-    """Count the balls of a device that are flown in a look, at most."""
-    return len(_levels(tune, effort)) * _points(tune, effort) * effort.starts
-
-
-def _points(tune: tuple[str, ...], effort: Effort) -> int:
-    return 1 if _first(tune) is None else effort.points
-
-
-def _first(tune: tuple[str, ...]) -> int | None:
+def first_moving(tune: tuple[str, ...]) -> int | None:
     """Find the first quantity that moves the ball, along which surveys look, by its index."""
     return next((i for i, name in enumerate(tune) if moving(name)), None)
 
 
 def _levels(tune: tuple[str, ...], effort: Effort) -> np.ndarray:
     """List values [level, quantity] of the others together, in parts of their bounds, over which they lie evenly."""
-    first = _first(tune)
+    first = first_moving(tune)
     others = [i for i, name in enumerate(tune) if i != first and moving(name)]
     count = effort.settings.survey_levels if others else 1
     parts = np.full((count, len(tune)), 0.5)
@@ -280,104 +283,56 @@ class _Seen(NamedTuple):
         return Met(found, hope, pair, ended, device, z, places.owner, places.level, step)
 
 
-def _look(scene: _Scene, places: _Places, seed: int) -> _Seen:
+def _look(task: SurveyTask, places: _Places, seed: int) -> _Seen:
     """Survey some places, the ball of each starting where the draw of its number says.
 
     Draws are the same for every device, whatever the others are: designs of one do not depend on them.
     """
-    devices, tune, box, objective, effort = scene
-    first, parts = _first(tune), _levels(tune, effort)[places.level]
+    devices, tune, box, objective, effort = task
+    first, parts = first_moving(tune), task.levels[places.level]
     if first is not None:
         parts[:, first] = places.part
     low, high = box[places.owner].swapaxes(0, 1)
     z = low + parts * (high - low)
     given = jax.tree.map(lambda *x: np.array(x, float)[places.owner], *devices)
     every, pair = tiles.map_tiles(lambda rows: cells(rows[0], rows[1], tune), (given, z), _TILES)
-    draw = np.random.default_rng(seed).uniform(-1, 1, (2, scene.cells))
-    u0, v0 = (reach * x[places.number] for reach, x in zip(_REACH, draw, strict=True))
-    starts = Starts(u0 * pair.d, v0, np.zeros_like(v0))
-    found = survey(pair, every, starts, longest=effort.settings.max_period, periods=effort.periods)
+    longest, periods = (count * stretch(pair.d) for count in (effort.settings.max_period, effort.periods))
+    starts = _starts(pair, places.number, task.cells, seed)
+    found = survey(pair, every, starts, longest=longest, periods=periods)
     step = np.round(places.part * (effort.points - 1)).astype(int)
     return _Seen(objective, found, every, z, places, step)
 
 
-def _closer(unrest: Met, effort: Effort, most_cells: int) -> _Places:
+def _starts(pair: ImpactPair, number: np.ndarray, cells: int, seed: int) -> Starts:
+    """Draw the start of every cell by its number; wide gaps use further draws, of as many cells each.
+
+    In a wide gap every other ball is as fast as the forcing can keep it: faster orbits harvest more, and a ball loses
+    speed from one impact to the next until it meets an orbit that holds it.
+    """
+    reach, speed = _REACH
+    draws = [
+        np.random.default_rng([seed, more] if more else seed).uniform(-1, 1, (2, cells))
+        for more in range(1 + int(number.max()) // cells)
+    ]
+    u0, v0 = np.concatenate(draws, axis=1)[:, number]
+    slowest = np.maximum(pair.at(1).r, pair.at(-1).r)
+    fast = np.minimum(pair.d, _KICK / np.maximum(1 - slowest, 0.1))
+    quick = np.where(number % 2 == 1, np.maximum(speed, fast), speed)
+    return Starts(reach * u0 * pair.d, quick * v0, np.zeros_like(v0))
+
+
+def _closer(unrest: Met, task: SurveyTask) -> _Places:
     """Choose places about the steps of motion that is no orbit.
 
     Cells of a device, so many at most, are spread evenly over these steps, and over each of them.
     """
+    effort = task.effort
     owner, level, step = np.unique(np.column_stack([unrest.owner, unrest.level, unrest.step]), axis=0).T
     places = [_Places(*np.zeros((4, 0), int))]
     for one in np.unique(owner):
         here = np.flatnonzero(owner == one)
-        number = np.arange(min(here.size * effort.settings.survey_refinement * effort.starts, most_cells))
+        number = np.arange(min(here.size * effort.settings.survey_refinement * effort.starts, task.cells))
         index, turn = here[number % here.size], number // here.size
         part = (step[index] + (turn + 0.5) / (turn.max() + 1) - 0.5) / (effort.points - 1)
         places.append(_Places(owner[index], level[index], np.clip(part, 0.0, 1.0), number))
     return jax.tree.map(lambda *x: np.concatenate(x), *places)
-
-
-def _promising(met: Met, devices: int, points: int, settings: DesignSettings) -> np.ndarray:
-    """Choose the attractors to climb from: the best of their kind as far as so many steps away.
-
-    A kind is given by span and impacts; the walls may change places where the tube is level.
-    """
-    hope = met.hope
-    score = np.where(hope.lacks < 0, _HOPELESS + hope.lacks, hope.value)
-    left, right = _impacts(met)
-    kind = np.column_stack([met.owner, met.level, met.ended.period, left, right])
-    found = highest(kind, met.step, score, max(1, points // settings.max_hills))
-    enough = hope.total > highest_promise(devices, met)[met.owner] + math.log(settings.min_promise)
-    return found[(enough | (left + right <= settings.max_sure_impacts))[found]]
-
-
-def highest(group: np.ndarray, step: np.ndarray, score: np.ndarray, reach: int) -> np.ndarray:
-    """Find the rows that none of their group beats within so many steps; of one step's rows the first best.
-
-    Args:
-        group: What rows of one group have in common, [row, ...].
-        step, score: Where and how high each stands.
-        reach: How many steps away a higher row beats it.
-    """
-    order = np.lexsort((-score, step, *group.T[::-1]))
-    place = np.column_stack([group, step])[order]
-    new = np.append(True, (np.diff(place, axis=0) != 0).any(axis=1))[: order.size]
-    best, place = order[new], place[new]
-    height, top = score[best], np.ones(best.size, bool)
-    for ahead in range(1, reach + 1):
-        apart = place[ahead:] - place[:-ahead]
-        near = (apart[:, :-1] == 0).all(axis=1) & (apart[:, -1] <= reach)
-        top[:-ahead] &= ~near | (height[:-ahead] >= height[ahead:])
-        top[ahead:] &= ~near | (height[ahead:] >= height[:-ahead])
-    return np.sort(best[top])
-
-
-def _impacts(met: Met) -> tuple[np.ndarray, np.ndarray]:
-    """Count left and right impacts of orbits; in a level tube the more and the fewer."""
-    left, right = met.ended.impacts_left, met.ended.impacts_right
-    swap = met.pair.symmetric & (right > left)
-    return np.where(swap, right, left), np.where(swap, left, right)
-
-
-def _rivals(met: Met, unrest: Met, scene: _Scene) -> np.ndarray:
-    """Choose the attractors that may lead to the best design, where any motion may win.
-
-    What promises too little, or exceeds a limit by far, never did.
-    """
-    settings, hope = scene.effort.settings, met.hope
-    most = highest_promise(len(scene.devices), met, unrest)
-    near = hope.lacks >= -_excess(scene)[met.owner]
-    return np.flatnonzero(near & (hope.total >= most[met.owner] + math.log(settings.min_rival)))
-
-
-def _excess(scene: _Scene) -> np.ndarray:
-    """Say by how much an orbit of every device may exceed a limit to be climbed from, as a logarithm.
-
-    Where the first quantity alone moves the ball, the survey has met the orbit nearer to where it keeps its limits.
-    """
-    first, settings = _first(scene.tune), scene.effort.settings
-    most = np.full(len(scene.devices), settings.max_excess)
-    if first is None or scene.tune[first] in LINEAR or len(_levels(scene.tune, scene.effort)) > 1:
-        return most
-    step = (scene.box[:, 1, first] - scene.box[:, 0, first]) / max(scene.points - 1, 1)
-    return np.minimum(most, settings.max_excess_steps * step)

@@ -11,7 +11,7 @@ import numpy as np
 from vijax.batch.simulate import Starts
 from vijax.design.averages import Averages
 from vijax.design.design_settings import DEFAULT
-from vijax.design.ensemble import AVERAGED, Ensemble, Task, fly
+from vijax.design.ensemble import Ensemble, Task, fly, moving, silent
 from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
 from vijax.design.tolerance import Spread, Tolerance, check_samples, check_tolerances
 from vijax.model.variables import LINEAR, variables
@@ -21,6 +21,7 @@ from vijax.runtime.context import door
 _FARTHEST = 0.1  # a quantity is looked at as far as this part of it; an inclination as far as this angle [rad]
 _FINEST = 1e-4 * _FARTHEST  # the first step, and how closely an end is found that is nearer than a hundredth
 _LONGER = 2.0  # a step that was fine is followed by one so much longer
+_BALLS = 8  # balls that follow an aperiodic motion: what one of them gives is a matter of chance
 _PERIODS = 400  # forcing periods that a ball is given to show what becomes of it
 _ARRIVING = 256, 2000  # balls that start anywhere, and the periods in which they may arrive
 _DEVICES = 256  # random devices that tolerances make
@@ -84,7 +85,8 @@ def extents(optimum: Optimum | AperiodicOptimum) -> tuple[Extent, ...]:
     """
     checks.instance("optimum", optimum, AnyOptimum, "vijax.optimise(...).best")
     names = tuple(optimum.values)
-    first = jax.tree.map(lambda x: x[:1], _starts(optimum))
+    balls = _BALLS if optimum.label == "aperiodic" else 1
+    first = jax.tree.map(lambda x: x[:balls], _starts(optimum))
     ways = [_Way(index, sign, first, optimum.P) for index in range(len(names)) for sign in (-1, 1)]
     while going := [way for way in ways if way.going]:
         _go_on(optimum, names, going)
@@ -94,12 +96,12 @@ def extents(optimum: Optimum | AperiodicOptimum) -> tuple[Extent, ...]:
 
 @dataclasses.dataclass
 class _Way:
-    """A ball that follows the motion of a design to one side.
+    """Balls that follow the motion of a design to one side: one of them on an orbit.
 
     Attributes:
         index, sign: Which tuned quantity, and whether it falls or rises.
-        starts: Where the ball is.
-        P: What it gives there [J].
+        starts: Where the balls are.
+        P: What they give there on average [J].
         off: How far it has come, in parts of the quantity.
         step: How much further it goes.
         side: What is there, or just beyond.
@@ -126,14 +128,17 @@ def _go_on(optimum: Optimum | AperiodicOptimum, names: tuple[str, ...], going: l
     for row, (way, off) in enumerate(zip(going, ahead, strict=True)):
         z[row, way.index] += way.sign * off if names[way.index] in LINEAR else np.log1p(way.sign * off)
     none = np.zeros(len(going))
-    flown = fly(_task(optimum, "P"), none.astype(int), z, none, [way.starts for way in going], _PERIODS, 1)
+    starts = [way.starts for way in going]
+    flown = fly(_task(optimum, "P"), none.astype(int), z, none, starts, _PERIODS, len(starts[0].v))
     for way, off, one in zip(going, ahead, flown, strict=True):
-        P, kept = float(one.found.P[0]), bool(one.found.margins().min() >= 0)
+        P, kept = float(np.nan_to_num(one.found.P).mean()), bool(one.found.margins().min() >= 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             # Beyond a fold another orbit may have the label; its P is another one.
             smooth = abs(np.log(P / way.P)) < _STEEPEST * (off - way.off) + _LEAST_JUMP
-        name = str(one.found.labels()[0])
-        if bool(_own(optimum, one.found)[0]) and smooth:
+        own = _own(optimum, one.found)
+        # If most balls are not on the motion any more, one that has left it says where it went.
+        name = str(one.found.labels()[int(own.argmin())])
+        if own.mean() >= 0.5 and smooth:
             way.off, way.P, way.starts, way.step = off, P, one.found.end, _LONGER * way.step
             way.side = Side(100 * off, off >= _FARTHEST, name, P, kept)
         else:
@@ -155,7 +160,7 @@ def arrival(optimum: Optimum | AperiodicOptimum) -> ArrivalStatistics:
         when = (float(np.median(ran)), float(np.quantile(ran, 0.9))) if ran.size else (math.nan, math.nan)
     else:
         when = (math.nan, math.nan)
-    return ArrivalStatistics(float(there.mean()), *when, periods)
+    return ArrivalStatistics(float(there.mean()), *when, one.periods)
 
 
 @door
@@ -197,7 +202,7 @@ def scattered(
 
 def _spread(one: Ensemble) -> Spread:
     """Sum up what the devices of an ensemble give."""
-    alive = np.isin(one.found.status, AVERAGED) & (one.found.P > 0)
+    alive = moving(one.found)
     kept = alive & (one.found.margins().min(axis=1) >= 0)
     P = np.where(alive, np.nan_to_num(one.found.P), 0.0)
     return Spread(
@@ -232,4 +237,6 @@ def _starts(optimum: Optimum | AperiodicOptimum) -> Starts:
 def _own(optimum: Optimum | AperiodicOptimum, found: Averages) -> np.ndarray:
     """Say which balls are on a motion of the design's label, mirror images alike."""
     turned = found._replace(left=found.right, right=found.left)
-    return (found.labels() == optimum.label) | (turned.labels() == optimum.label)
+    own = (found.labels() == optimum.label) | (turned.labels() == optimum.label)
+    # A ball may be without an impact for long on aperiodic motion in a wide gap.
+    return own | (silent(found) & (optimum.label == "aperiodic"))

@@ -5,24 +5,23 @@ Where a trial leaves its branch, loses stability or breaks a constraint, it is c
 """
 
 import logging
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vijax.design import aperiodic_search, long_flight, off_design, orbit_ascents
 from vijax.design import objective as aims
+from vijax.design import off_design, turns
 from vijax.design.design_settings import DEFAULT, DesignSettings, check_settings
 from vijax.design.ensemble import Task
-from vijax.design.multistart import Effort, Looked, balls, every_start, find
+from vijax.design.multistart import Effort, Looked, SurveyTask
 from vijax.design.objective import OBJECTIVES, Batch, Scene
-from vijax.design.optimum import AnyOptimum, AperiodicOptimum, Optimum
-from vijax.design.promise import Met
+from vijax.design.optimum import AnyOptimum, AperiodicOptimum, DroppedCandidate, Optimum
 from vijax.design.tolerance import Nodes, Spread, Tolerance, check_samples, check_tolerances, nodes
+from vijax.design.turns import DeviceSearch
 from vijax.model.choices import Motion, Objective
 from vijax.model.device import Harvester, one_device
 from vijax.model.sides import named
@@ -54,6 +53,9 @@ class Design:
         tolerances: Of the objective.
         looked: What the survey met, periodic and not.
         ascents: How many there were, one from each attractor chosen.
+        places: Values of the tuned quantities at which averages of other motion were climbed.
+        dropped: Candidates that promised more than the best design gives, and why each is none; the most promising
+            first.
     """
 
     optima: tuple[Optimum | AperiodicOptimum, ...]
@@ -63,6 +65,8 @@ class Design:
     tolerances: tuple[Tolerance, ...]
     looked: Looked
     ascents: int
+    places: int = 0
+    dropped: tuple[DroppedCandidate, ...] = ()
 
     @property
     def best(self) -> Optimum | AperiodicOptimum | None:
@@ -184,7 +188,7 @@ def optimise_all(
     max_evaluations = checks.whole("max_evaluations", max_evaluations, 2, _MOST_EVALUATIONS)
     far = effort(survey_points, starts, max_impacts, survey_periods)._replace(settings=check_settings(settings))
     box = check(devices, tune, bounds, objective, scatter)
-    if (asked := expected(len(devices), tune, far)).long:
+    if (asked := expected(SurveyTask(devices, tune, box, objective, far))).long:
         _LOG.warning("a long run begins: %s", asked)
     task = Task(devices, tune, box, objective, scatter if objective == "expected" else (), reliability, settings)
     alone = motion == "periodic" or objective in OVER_TOLERANCES
@@ -198,51 +202,31 @@ def optimise_all(
             tolerances=scatter,
             looked=one.looked,
             ascents=one.ascents,
+            places=one.places,
+            dropped=one.lost,
         )
         for one, limits in zip(found, box, strict=True)
     ]
 
 
-class _Found(NamedTuple):
-    """What was found for one device; see `Design`."""
-
-    optima: tuple[Optimum | AperiodicOptimum, ...]
-    looked: Looked
-    ascents: int
-
-
-def _in_groups(task: Task, far: Effort, cloud: Nodes, max_evaluations: int, orbits_alone: bool) -> list[_Found]:
+def _in_groups(task: Task, far: Effort, cloud: Nodes, max_evaluations: int, orbits_alone: bool) -> list[DeviceSearch]:
     """Design some devices after others, as many together as memory is meant for."""
-    size, found = max(_TOGETHER // balls(task.tune, far), 1), []
-    for first in range(0, len(task.devices), size):
-        some = slice(first, first + size)
+    found = []
+    for some in _groups(SurveyTask(task.devices, task.tune, task.box, task.objective, far).balls):
         own = task._replace(devices=task.devices[some], box=task.box[some])
-        found += _sought(own, far, cloud, max_evaluations, orbits_alone)
+        found += turns.search(own, far, cloud, max_evaluations, orbits_alone)
     return found
 
 
-def _sought(task: Task, far: Effort, cloud: Nodes, max_evaluations: int, orbits_alone: bool) -> list[_Found]:
-    """Survey, climb from what was met and look for better motions that are no orbits, unless orbits alone count."""
-    count = len(task.devices)
-    if task.expected:
-        met, looked = every_start(task.devices, task.tune, task.box, far)
-        orbits: list[list[Optimum]] = [[] for _ in task.devices]
-        ascents = [0] * count
-    else:
-        begun, met, looked = find(task.devices, task.tune, task.box, task.objective, far, orbits_alone=orbits_alone)
-        ascents = np.bincount(begun.owner, minlength=count).tolist()
-        orbits = orbit_ascents.search(task, begun, cloud, max_evaluations)
-    beyond = [None] * count if orbits_alone else _beyond(task, met, orbits)
-    return [
-        _Found(tuple(own) if other is None else (other, *own), *seen)
-        for other, own, seen in zip(beyond, orbits, zip(looked, ascents, strict=True), strict=True)
-    ]
-
-
-def _beyond(task: Task, met: Met, orbits: list[list[Optimum]]) -> list[AperiodicOptimum | None]:
-    """Find the best design of every device whose motion is no orbit, where it gives more than the best orbit does."""
-    known = np.array([math.log(some[0].height) if some else -math.inf for some in orbits])
-    return long_flight.prove(task, aperiodic_search.search(task, met, known), known)
+def _groups(balls: np.ndarray) -> list[slice]:
+    """Divide devices by their balls into groups with at most `_TOGETHER` of them, or with one device."""
+    groups, first, total = [], 0, 0
+    for index, own in enumerate(balls.tolist()):
+        if index > first and total + own > _TOGETHER:
+            groups.append(slice(first, index))
+            first, total = index, 0
+        total += own
+    return [*groups, slice(first, len(balls))]
 
 
 @door
@@ -281,16 +265,16 @@ def effort(survey_points: int, starts: int, max_impacts: int, survey_periods: in
     )
 
 
-def expected(devices: int, tune: tuple[str, ...], far: Effort) -> Estimate:
-    """Estimate what the survey of so many devices asks of the machine; ascents take less.
+def expected(task: SurveyTask) -> Estimate:
+    """Estimate what the first survey of some devices asks of the machine; ascents take less.
 
     Raises:
         ValueError: If the balls that are flown together do not fit in memory.
     """
-    own = balls(tune, far)
-    count, together = devices * own, min(devices * own, max(own, _TOGETHER))
+    balls = task.balls
+    count, together = int(balls.sum()), min(int(balls.sum()), max(int(balls.max()), _TOGETHER))
     checks.fits(("survey_points", "starts"), together * _BALL, f"{together:,} balls")
-    return estimate.of_recorded(count, far.periods, together * _BALL)
+    return estimate.of_recorded(count, task.flown // count, together * _BALL)
 
 
 @door

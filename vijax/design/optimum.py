@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.batch.simulate import Starts
+from vijax.design.candidates import Begun
 from vijax.design.design_settings import DesignSettings
-from vijax.design.multistart import Begun
 from vijax.design.objective import Scene
 from vijax.model.device import Harvester
 from vijax.model.records import Status
-from vijax.model.variables import tuned, values
+from vijax.model.variables import tuned, values, variables
 from vijax.orbits import orbit_properties, periodic
 from vijax.orbits.periodic import Orbit
 from vijax.orbits.steady import Steady, steady
@@ -59,6 +59,11 @@ class AnyOptimum:
     path: np.ndarray
     heights: np.ndarray
 
+    @property
+    def z(self) -> np.ndarray:
+        """Return the variables: the logarithm of each tuned quantity, or an inclination itself."""
+        return np.asarray(variables(tuple(self.values), list(self.values.values())))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Optimum(AnyOptimum):
@@ -91,13 +96,15 @@ class AperiodicOptimum(AnyOptimum):
         admissible: Share of the balls that broke no limit.
         shares: Of the balls that ended on each motion, by its label, the largest first.
         gradient_stderr: Standard errors of the gradient; both were fitted to the last ensemble.
+        predicted: The objective that the ensembles promised; what the last flight measured is the height.
         ensembles: How many were flown about it.
         flown: How many balls were flown at the end, and for how many forcing periods each.
         starts: Where these were at last.
 
     The label is n:m/pT where the motion turned out to be an orbit too long to be climbed from. `stopped` is "maximum",
-    where less is left to gain than the noise, or "ensembles", when these were spent. The path is that of the centres
-    of ensembles, with the objective fitted there.
+    where less is left to gain than the noise; "refused", where no ensemble was taken; "outdone", where other places
+    promised more; or "ensembles", when these were spent. The path is that of the centres of ensembles, with the
+    objective fitted there.
     """
 
     power: float
@@ -108,9 +115,28 @@ class AperiodicOptimum(AnyOptimum):
     admissible: float
     shares: dict[str, float]
     gradient_stderr: dict[str, float]
+    predicted: float
     ensembles: int
     flown: tuple[int, int]
     starts: Starts
+
+
+class DroppedCandidate(NamedTuple):
+    """A candidate for the best design that promised more than the best one gives, and is none.
+
+    Attributes:
+        values: The tuned quantities by name.
+        label: Of its motion.
+        predicted: The objective that it promised.
+        measured: The objective that was verified; NaN where none was.
+        reason: Why it was dropped.
+    """
+
+    values: dict[str, float]
+    label: str
+    predicted: float
+    measured: float
+    reason: str
 
 
 class End(NamedTuple):
@@ -128,6 +154,21 @@ class End(NamedTuple):
     heights: np.ndarray
 
 
+class VerifiedOptima(NamedTuple):
+    """The optima of every device, the best first, and the ends of ascents that are none."""
+
+    optima: list[list[Optimum]]
+    dropped: list[list[DroppedCandidate]]
+
+
+# What the exact map or the steady state says of an end that is no design.
+_FLAWS = {
+    Status.NO_ORBIT: "the exact map has no orbit there",
+    Status.VIRTUAL: "the ball would meet a wall in between",
+    Status.UNSTABLE: "the orbit repels",
+}
+
+
 def verified(
     scene: Scene,
     starts: Begun,
@@ -135,13 +176,13 @@ def verified(
     devices: list[Harvester],
     max_evaluations: int,
     settings: DesignSettings,
-) -> list[list[Optimum]]:
+) -> VerifiedOptima:
     """Verify what was reached for every device: admissible, by the exact map, each optimum once, the best first."""
     owner = starts.owner
     good = [i for i, end in enumerate(ends) if end.margins.min() >= 0 and np.isfinite(end.height)]
     good = [i for rows in apart(good, ends, owner, settings.same_optimum) for i in rows]
     if not good:
-        return [[] for _ in devices]
+        return VerifiedOptima([[] for _ in devices], [[] for _ in devices])
     own = [jax.tree.map(float, tuned(devices[owner[i]], scene.names, ends[i].z)) for i in good]
     many = jax.tree.map(lambda *x: jnp.array(x), *own)
     width = starts.flown.side.shape[1]
@@ -149,33 +190,41 @@ def verified(
     sequence = starts.some(np.array(good)).flown.sequence(width)
     found = periodic.solve(jax.vmap(lambda d: d.pair())(many), sequence, jnp.array(wide))
     seen = states(own, found)
-    # The ascent followed equations of an orbit. That the ball flies it, nothing in between met, and is drawn to it, is
-    # asked only now, of the few ends that are left.
-    attracts = np.array([found.status[row] == Status.OK == seen[row].status for row in range(len(own))])
+    # Ascents follow the equations of an orbit; that the ball flies it and is drawn to it is checked for the few ends.
+    flaws = [Status(int(max(found.status[row], seen[row].status))) for row in range(len(own))]
     names = orbit_properties.labels(found)
     optima: list[list[Optimum]] = [[] for _ in devices]
-    for row in np.flatnonzero(attracts):
+    dropped: list[list[DroppedCandidate]] = [[] for _ in devices]
+    for row, flaw in enumerate(flaws):
         end = ends[good[row]]
+        at = dict(zip(scene.names, np.asarray(values(scene.names, end.z)).tolist(), strict=True))
+        if flaw != Status.OK:
+            dropped[owner[good[row]]].append(_dropped(at, str(names[row]), end.height, flaw))
+            continue
         there = np.isfinite(end.heights)
-        optima[owner[good[row]]].append(
-            Optimum(
-                values=dict(zip(scene.names, np.asarray(values(scene.names, end.z)).tolist(), strict=True)),
-                device=own[row],
-                orbit=found[row : row + 1],
-                label=str(names[row]),
-                height=end.height,
-                P=float(seen[row].P),
-                P_stderr=0.0,
-                state=seen[row],
-                gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
-                active=_active(scene, end, sequence.side[row], settings.active_margin),
-                stopped=_reason(end, max_evaluations),
-                evaluations=end.evaluations,
-                path=np.asarray(values(scene.names, end.path[there])),
-                heights=np.exp(end.heights[there]),
-            )
+        one = Optimum(
+            values=at,
+            device=own[row],
+            orbit=found[row : row + 1],
+            label=str(names[row]),
+            height=end.height,
+            P=float(seen[row].P),
+            P_stderr=0.0,
+            state=seen[row],
+            gradient=dict(zip(scene.names, end.gradient.tolist(), strict=True)),
+            active=_active(scene, end, sequence.side[row], settings.active_margin),
+            stopped=_reason(end, max_evaluations),
+            evaluations=end.evaluations,
+            path=np.asarray(values(scene.names, end.path[there])),
+            heights=np.exp(end.heights[there]),
         )
-    return optima
+        optima[owner[good[row]]].append(one)
+    return VerifiedOptima(optima, dropped)
+
+
+def _dropped(at: dict[str, float], label: str, height: float, flaw: Status) -> DroppedCandidate:
+    """Return the record of an end that is no design because of a status."""
+    return DroppedCandidate(at, label, height, np.nan, _FLAWS.get(flaw, flaw.name.lower()))
 
 
 def _reason(end: End, max_evaluations: int) -> str:

@@ -9,11 +9,11 @@ import numpy as np
 
 from vijax.design import objective as aims
 from vijax.design.ascent import Box, Climb, ascend, converged
+from vijax.design.candidates import Begun
 from vijax.design.design_settings import DesignSettings
 from vijax.design.ensemble import Task
-from vijax.design.multistart import Begun
 from vijax.design.objective import Batch, Scene
-from vijax.design.optimum import End, Optimum, verified
+from vijax.design.optimum import End, VerifiedOptima, verified
 from vijax.design.tolerance import Nodes
 from vijax.runtime import context, tiles
 from vijax.runtime.programs import jitted
@@ -24,8 +24,8 @@ _WIDTHS = (4, 8)  # impacts that orbits are padded to, those of more to the most
 _TILE = 4
 
 
-def search(task: Task, starts: Begun, cloud: Nodes, max_evaluations: int) -> list[list[Optimum]]:
-    """Climb along the orbits of every device; give its optima, the best first."""
+def search(task: Task, starts: Begun, cloud: Nodes, max_evaluations: int) -> VerifiedOptima:
+    """Climb along the orbits of every device; give its optima, the best first, and ends that are none."""
     scene = Scene(jnp.asarray(cloud.factors), jnp.asarray(cloud.weights), task.tune, cloud.names, task.objective)
     ends = _climbed(scene, starts, task.box, max_evaluations, task.settings)
     return verified(scene, starts, ends, task.devices, max_evaluations, task.settings)

@@ -56,6 +56,33 @@ class Met(NamedTuple):
         return jax.tree.map(lambda x: x[index], self)
 
 
+def at_places(met: Met) -> Met:
+    """Return motions that each promise the mean of all of them at their values of the tuned quantities.
+
+    The average of a single start over a short flight is a matter of chance, and the highest of many promises too much.
+    """
+    which, count = _places(met)
+    with np.errstate(divide="ignore"):
+        mean = np.log(np.bincount(which, np.exp(met.hope.value)) / count)
+    least = np.full(count.size, np.inf)
+    np.minimum.at(least, which, met.hope.lacks)
+    return met._replace(hope=Promise(mean[which], least[which]))
+
+
+def beside(some: np.ndarray, met: Met) -> np.ndarray:
+    """Return which motions are at values of the tuned quantities where one of some, given by a mask, is."""
+    which, count = _places(met)
+    there = np.zeros(count.size, bool)
+    there[which[some]] = True
+    return there[which]
+
+
+def _places(met: Met) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of the place, device and tuned quantities, of each motion; the motions at each place."""
+    _, which, count = np.unique(np.column_stack([met.owner, met.z]), axis=0, return_inverse=True, return_counts=True)
+    return which.ravel(), count
+
+
 def highest_promise(devices: int, *met: Met) -> np.ndarray:
     """Find what the best motion of every device promises that breaks no limit; -inf where there is none."""
     most = np.full(devices, -np.inf)

@@ -49,7 +49,8 @@ def describe(
         plane: What bounds the best optimum in the plane of two of them: `vijax.design_plane`.
 
     Returns:
-        `best` (None if no admissible motion was found), `others`, and what was asked. With `diagram`, `highest`: the
+        `best` (None if no admissible motion was found), `others`, `dropped` (candidates that promised more than the
+        best design gives), and what was asked. With `diagram`, `highest`: the
         largest P it holds, admissible or not, which is what an optimiser without constraints would report.
     """
     checks.instance("design", design, Design, "vijax.optimise(...)")
@@ -69,6 +70,8 @@ def describe(
         "objective_means": OBJECTIVES[design.objective],
         "survey": design.looked._asdict(),
         "ascents": design.ascents,
+        "places": design.places,
+        "dropped": [one._asdict() for one in design.dropped],
         "best": optimum(design.best) if design.best else None,
         "others": [optimum(one) for one in design.optima[1:]],
         "surroundings": _surroundings(surroundings) if surroundings else None,
@@ -124,6 +127,7 @@ def _averaged(one: AperiodicOptimum) -> dict[str, Any]:
         "kept_limits": one.admissible,
         "shares": one.shares,
         "gradient_stderr": one.gradient_stderr,
+        "predicted": one.predicted,
         "balls": one.flown[0],
         "periods": one.flown[1],
         "ensembles": one.ensembles,

@@ -12,6 +12,7 @@ from vijax.runtime.pages import see
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15}
 _TIE = 1e-6  # optima whose objectives differ by less, relative, are a tie
 _MOST_ROWS = 12  # attractors, motions or optima that a report lists
+_LESS = 0.02  # part of the objective: a flight that measures so much less than was predicted says so
 _NARROW = 1.0  # percent: a motion that lasts for less of a quantity than this is called narrow
 _LOSSES = {"lost": "lose the motion", "inadmissible": "are inadmissible"}
 
@@ -35,19 +36,46 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
     checks.record("report", report, ("bounds", "objective", "best"), "vijax.design.report.describe")
     ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in report["bounds"].items())
     yield f"tuned: {ranges}; objective {report['objective']}, {report['objective_means']}"
-    yield f"survey: {report['survey']['orbits']:,} periodic attractors met, {report['ascents']:,} climbed"
+    yield _candidates(report)
     best = report["best"]
     if best is None:
         yield "no admissible motion was found; what the survey met instead:"
         yield from (f"  {what}" for what in _instead(report["survey"]))
+        yield from _dropped(report)
     else:
         yield from _best(best, report["objective"])
+        yield from _dropped(report)
         yield from _off_design(best, report["extents"], report["arrival"])
         yield from _around(best, report["surroundings"])
         yield from _in_plane(report["plane"])
         yield from _others(best, report["others"], report["objective"])
         yield from _off(report)
     yield from _unconstrained(report)
+
+
+def _candidates(report: dict[str, Any]) -> str:
+    """Count what the survey met and the candidates for the best design."""
+    survey = report["survey"]
+    others = f", and other motion at {report['places']:,} values" if report["places"] else ""
+    return (
+        f"survey: {survey['orbits']:,} periodic attractors met by {survey['starts']:,} starts, "
+        f"{report['ascents']:,} climbed{others}"
+    )
+
+
+def _dropped(report: dict[str, Any]) -> Iterator[str]:
+    """List the candidates that promised more than the best design gives."""
+    dropped, objective = report["dropped"], report["objective"]
+    if not dropped:
+        return
+    yield f"dropped, though more was predicted: {len(dropped):,}"
+    for one in dropped[:_MOST_ROWS]:
+        tuned = ", ".join(quantity(*item) for item in one["values"].items())
+        measured = f", measured {_objective(one['measured'], objective)}" if np.isfinite(one["measured"]) else ""
+        predicted = _objective(one["predicted"], objective)
+        yield f"  {tuned}: {one['label']}, predicted {predicted}{measured}: {one['reason']}"
+    if len(dropped) > _MOST_ROWS:
+        yield f"  and {len(dropped) - _MOST_ROWS:,} more"
 
 
 def _instead(survey: dict[str, Any]) -> Iterator[str]:
@@ -75,7 +103,9 @@ def _instead(survey: dict[str, Any]) -> Iterator[str]:
         yield f"{100 * survey['held']:.3g} % of the starts on one wall for ever: raise A or lower beta"
     if survey["silent"]:
         yield f"{100 * survey['silent']:.3g} % of the starts without impacts: narrow the gap"
-    if not any(survey[name] for name in ("orbits", "restless", "held", "silent")):
+    if survey["slow"]:
+        yield f"{100 * survey['slow']:.3g} % of the starts undecided: raise survey_periods"
+    if not any(survey[name] for name in ("orbits", "restless", "held", "silent", "slow")):
         yield "nothing that settles: look at more values, from more starts"
 
 
@@ -100,7 +130,7 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
         f"harvested at most {100 * max(best['energy_ratio']):.4g} % of the energy that an impact gives"
     )
     if "balls" in best:
-        yield from _flown(best)
+        yield from _flown(best, objective)
     else:
         yield from _regular(best)
     errors = best.get("gradient_stderr", {})
@@ -111,6 +141,8 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
     interior = best["stopped"] == "maximum"
     held = ", ".join(best["active"]) or ("nothing, an interior optimum" if interior else "nothing")
     why = {
+        "refused": "no ensemble about it was on one motion and as high",
+        "outdone": "other candidates promised more",
         "supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains",
         "ensembles": "all of them spent",
         "evaluations": "all of them spent",
@@ -123,10 +155,13 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
     yield f"  log-gradient at the end{smooth}: {gradient}"
 
 
-def _flown(best: dict[str, Any]) -> Iterator[str]:
+def _flown(best: dict[str, Any], objective: str) -> Iterator[str]:
     """Say what proves a motion that is no orbit."""
     exponent = f"; Lyapunov exponent {best['lyapunov']:.3g} a period" if np.isfinite(best["lyapunov"]) else ""
     yield f"  {best['balls']} balls flown for {best['periods']:,} periods each at exactly these values{exponent}"
+    if best["predicted"] > (1 + _LESS) * best["height"]:
+        predicted, measured = (_objective(best[name], objective) for name in ("predicted", "height"))
+        yield f"  predicted {predicted} by shorter flights; this one measures {measured}"
     if best["kept_limits"] < 1:
         yield f"  {100 * best['kept_limits']:.4g} % of them kept the limits"
     if len(best["shares"]) > 1:
@@ -204,7 +239,12 @@ def _edge(edge: dict[str, Any]) -> str:
 
 def _height(one: dict[str, Any], objective: str) -> str:
     """Write the objective there: worst 51.78932 uJ."""
-    return f"{objective} {amount(one['height'], {'power': 'W', 'speed': 'm/s'}.get(objective, 'J'))}"
+    return f"{objective} {_objective(one['height'], objective, 7)}"
+
+
+def _objective(value: float, objective: str, digits: int = 4) -> str:
+    """Write a value of an objective: 51.78932 uJ."""
+    return amount(value, {"power": "W", "speed": "m/s"}.get(objective, "J"), digits)
 
 
 def _others(best: dict[str, Any], others: list[dict[str, Any]], objective: str) -> Iterator[str]:

@@ -20,6 +20,7 @@ from vijax.runtime.tiles import padded, workers
 _SMALLEST_TILE, _LARGEST_TILE = 1024, 8192  # cells of a compiled call
 _SHARE = 512  # cells for which a core is worth it
 _SAME = 1e-6  # relative difference within which attractors of one pair are the same; see `basins`
+_CROSSED = 0.6  # width of a gap that a ball of a typical speed, 0.3, crosses in one forcing period
 
 
 class Flown(NamedTuple):
@@ -52,12 +53,12 @@ class Survey(NamedTuple):
     Attributes:
         pair: The cells.
         ended: A `Summary` of each.
-        longest: Most forcing periods of an orbit that is wanted.
+        longest: Most forcing periods of an orbit that is wanted, of every cell.
     """
 
     pair: ImpactPair
     ended: Any
-    longest: int
+    longest: np.ndarray
 
     def orbits(self, impacts: int) -> Flown:
         """Fly the periodic attractors of at most so many impacts, of mirror images on level ground one.
@@ -74,15 +75,25 @@ class Survey(NamedTuple):
         return some[_distinct(*jax.tree.map(lambda x: x[some], (self.pair, self.ended)))]
 
     def restless(self, impacts: int) -> np.ndarray:
-        """Find cells whose motion is no such orbit: chaos, not settled, or of too many periods or impacts."""
-        going = np.isin(self.ended.status, (*SETTLED, Status.SLOW)) & (self.ended.impacts_per_period > 0)
+        """Find cells whose motion is no such orbit: chaos, not settled, or of too many periods or impacts.
+
+        A cell without an impact counts too: in a wide gap the ball may fly for long before its next impact.
+        """
+        going = np.isfinite(self.ended.P[:, 0]) & (self.ended.status != Status.PERMANENT_CONTACT)
         return np.flatnonzero(going & ~self._closing(impacts))
 
-    def onward(self, cells: np.ndarray, device: Harvester, periods: int) -> "Survey":
-        """Run some cells on from where they were left, for so many periods; `device` are those of all cells."""
-        pair, own, ended = jax.tree.map(lambda x: x[cells], (self.pair, device, self.ended))
+    def onward(self, cells: np.ndarray, device: Harvester, periods: int | np.ndarray) -> "Survey":
+        """Run some cells on from where they were left.
+
+        Args:
+            cells: Which cells.
+            device: Devices of all cells.
+            periods: Forcing periods of all cells.
+        """
+        some = self.longest, np.broadcast_to(periods, self.longest.shape)
+        pair, own, ended, longest, most = jax.tree.map(lambda x: x[cells], (self.pair, device, self.ended, *some))
         left = ended.handover
-        again = survey(pair, own, Starts(left.u, left.v, left.t), longest=self.longest, periods=periods).ended
+        again = survey(pair, own, Starts(left.u, left.v, left.t), longest=longest, periods=most).ended
 
         def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:
             whole = np.array(old)
@@ -98,18 +109,37 @@ class Survey(NamedTuple):
         return np.isin(ended.status, SETTLED) & some
 
 
-def survey(pair: ImpactPair, device: Harvester, starts: Starts, *, longest: int, periods: int) -> Survey:
+def stretch(d: Any) -> np.ndarray:
+    """Return how many times as many forcing periods a flight takes in gaps d: 1, and from 1.2 on 2, 4, 8 ...
+
+    A ball needs longer to cross a wide gap, and so do its impacts to come, its attractor to be met, its orbit to close.
+    """
+    return np.exp2(np.floor(np.log2(np.maximum(np.asarray(d) / _CROSSED, 1.0)))).astype(int)
+
+
+def survey(
+    pair: ImpactPair, device: Harvester, starts: Starts, *, longest: int | np.ndarray, periods: int | np.ndarray
+) -> Survey:
     """Run soft cells until their attractors are certain.
 
     Args:
         pair: Cells [cell].
         device: Those that they are the nondimensional form of.
         starts: Where each starts.
-        longest: Most forcing periods of an orbit that will be wanted.
-        periods: Forcing periods that the search for an attractor may take.
+        longest: Most forcing periods of an orbit that will be wanted, of all cells or of each.
+        periods: Forcing periods that the search for an attractor may take, likewise.
     """
     pair, device, starts = jax.tree.map(np.asarray, (pair, device, starts))
-    return Survey(pair, _ended(pair, device, starts, longest, periods), longest)
+    longest, periods = (np.broadcast_to(x, np.shape(pair.d)) for x in (longest, periods))
+    parts, order = [], []
+    # A compiled call takes one number of periods.
+    for most in np.unique(periods):
+        rows = np.flatnonzero(periods == most)
+        own = jax.tree.map(lambda x, rows=rows: x[rows], (pair, device, starts))
+        parts.append(_ended(own[0], own[1], own[2], int(longest[rows].max()), int(most)))
+        order.append(rows)
+    back = np.argsort(np.concatenate(order))
+    return Survey(pair, jax.tree.map(lambda *x: np.concatenate(x)[back], *parts), longest)
 
 
 def flown(pair: ImpactPair, ended: Any, impacts: int) -> Flown:
