@@ -139,6 +139,27 @@ def test_balls_without_an_impact_are_part_of_an_aperiodic_motion_and_give_nothin
     assert found.shares == {"aperiodic": 0.75, "no impact": 0.25}
 
 
+@pytest.mark.parametrize(
+    ("slope", "error", "stopped"), [(0.3, 0.2, "maximum"), (-20.0, 42.0, "noise"), (-24.0, 0.2, "slope")]
+)
+def test_a_slope_that_noise_may_hide_is_no_maximum(monkeypatch, slope, error, stopped):
+    level = {"gradient": np.array([slope]), "gradient_error": np.array([error]), "slopes": np.zeros((2, 1))}
+    _, found, _ = proved(monkeypatch, lambda z: (1e-6, 1.0), margins=np.ones(2), **level)
+    assert found.stopped == stopped
+
+
+def test_a_design_near_a_bound_is_compared_with_the_bound_where_noise_hides_the_slope(monkeypatch):
+    level = {"margins": np.ones(2), "slopes": np.zeros((2, 1)), "gradient": np.array([0.0])}
+
+    def motion(z):
+        return (1.2e-6 if z <= -0.03 else 1e-6), 1.0
+
+    for error, at in ((10.0, -0.03), (0.01, 0.0)):
+        _, found, _ = proved(monkeypatch, motion, box=(-0.03, 1.0), gradient_error=np.array([error]), **level)
+        assert math.log(found.values["kappa"]) == pytest.approx(at, abs=DEFAULT.last_radius)
+    assert found.active == ()
+
+
 def test_balls_that_set_out_from_one_state_are_no_copies():
     known = Starts(*(np.array(x) for x in ([0.01, -0.02], [0.3, 0.2], [0.0, 0.0])))
     many = on_motion(known, 7)

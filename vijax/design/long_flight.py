@@ -21,8 +21,11 @@ from vijax.model.variables import tuned, values
 
 _RESERVE = 1.5  # room kept for extremes that a proof has not met, in parts of what its worst ball has less than most
 _TURNS = 1, 2, 4  # periods that every other ball, pair and four of a proof are ahead: they set out in 8, in turn
+_BOUND = 2  # a design that is nearer to a bound, in radii of the first ensemble, is compared with the bound
 _WINDOW = 0.1  # a flight that gives less than the best design by more than this, as a logarithm, is not in its window
 _BESIDE = 0.5  # part of the last radius by which a design first moves away from a window
+_SURE = 2  # standard errors of a slope
+_FLAT, _LEVEL = 0.1, 1.0  # a slope that is certainly steeper is no maximum; at one it is certainly not so steep
 _NEAR = 10  # a limit is told as active within so many times the room that is kept below it
 
 
@@ -122,6 +125,28 @@ def _take(task: Task, proof: _Proof, told: "_Told", bar: float, mixtures: bool) 
                 proof.dropped.append(lost)
             proof.best = told.optimum
             proof.close(task)
+            proof.places += _at_bounds(task, place, told)
+
+
+def _at_bounds(task: Task, place: Place, told: "_Told") -> list[Place]:
+    """Return places at the bounds near a proved design, if noise does not tell that it is higher than they are.
+
+    Each promises as much as the slope and its standard error allow there.
+    """
+    if told.optimum.stopped == "maximum":
+        return []
+    near, surface = _BOUND * task.settings.ensemble_radius * task.unit(place.owner), place.surface
+    found = []
+    for bound in task.box[place.owner]:
+        for i in np.flatnonzero((told.z != bound) & (np.abs(bound - told.z) <= near)):
+            z = told.z.copy()
+            z[i] = bound[i]
+            step = z[i] - told.z[i]
+            slope = surface.gradient[i] * step + _SURE * surface.gradient_error[i] * abs(step)
+            ahead = float(np.log(told.optimum.height) + slope)
+            one = dataclasses.replace(place, z=z, best=z, radius=0.0, starts=told.optimum.starts, ahead=ahead)
+            found.append(one)
+    return sorted(found, key=lambda one: one.ahead)
 
 
 def _leave(proof: _Proof, bar: float) -> None:
@@ -242,6 +267,7 @@ def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble, proves: b
     given = found.value(task.objective, device)
     own = jax.tree.map(float, tuned(task.devices[place.owner], task.tune, z))
     low, high = task.box[place.owner]
+    active = _active(task, z - low, high - z, room)
     P = float(found.P.mean())
     optimum = AperiodicOptimum(
         values=dict(zip(task.tune, np.asarray(values(task.tune, z)).tolist(), strict=True)),
@@ -259,8 +285,8 @@ def _told(task: Task, place: Place, z: np.ndarray, ensemble: Ensemble, proves: b
         shares={name: count / found.P.size for name, count in shares.most_common()},
         gradient=dict(zip(task.tune, place.surface.gradient.tolist(), strict=True)),
         gradient_stderr=dict(zip(task.tune, place.surface.gradient_error.tolist(), strict=True)),
-        active=_active(task, z - low, high - z, room),
-        stopped=place.stopped or "ensembles",
+        active=active,
+        stopped=_stopped(place, active),
         ensembles=place.ensembles,
         predicted=float(np.exp(place.ahead)),
         flown=(found.P.size, ensemble.periods),
@@ -280,3 +306,13 @@ def _active(task: Task, above: np.ndarray, below: np.ndarray, room: np.ndarray) 
         near = zip(task.tune, rooms, strict=True)
         words += [f"{side} bound of {name}" for name, left in near if left < settings.active_margin]
     return tuple(words)
+
+
+def _stopped(place: Place, active: tuple[str, ...]) -> str:
+    """Return why the search ended at a place: at a maximum only if its slopes are known to be small."""
+    if place.stopped != "maximum" or active:
+        return place.stopped or "ensembles"
+    slope, error = np.abs(place.surface.gradient), _SURE * place.surface.gradient_error
+    if (slope > error + _FLAT).any():
+        return "slope"
+    return "maximum" if (slope + error < _LEVEL).all() else "noise"

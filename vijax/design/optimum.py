@@ -102,8 +102,9 @@ class AperiodicOptimum(AnyOptimum):
         starts: Where these were at last.
 
     The label is n:m/pT where the motion turned out to be an orbit too long to be climbed from. `stopped` is "maximum",
-    where less is left to gain than the noise; "refused", where no ensemble was taken; "outdone", where other places
-    promised more; or "ensembles", when these were spent. The path is that of the centres of ensembles, with the
+    where the slopes are known to be small or a limit holds it; "noise", where the noise hides a slope; "slope", where
+    there is one, but no ensemble further along it was higher; "refused", where none was taken; "outdone", where other
+    places promised more; or "ensembles", when these were spent. The path is that of the centres of ensembles, with the
     objective fitted there.
     """
 

@@ -141,6 +141,8 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
     interior = best["stopped"] == "maximum"
     held = ", ".join(best["active"]) or ("nothing, an interior optimum" if interior else "nothing")
     why = {
+        "noise": "no step gains more than the standard error, which hides a slope",
+        "slope": "no ensemble further along the slope was higher",
         "refused": "no ensemble about it was on one motion and as high",
         "outdone": "other candidates promised more",
         "supremum": "the objective rises up to the end of the orbit: a supremum that no orbit attains",
