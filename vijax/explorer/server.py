@@ -61,11 +61,11 @@ def _on_end(document: Document, close: Callable[[], None], ended: Iterator[int])
     def destroyed(session: Any) -> None:
         close()
         collects = next(ended) % COLLECTED == 0
-        bokeh_document.gc = gc if collects else _NoCollector  # type: ignore[attr-defined]
+        bokeh_document.gc = gc if collects else _NoCollector  # type: ignore[assignment]
         try:
             destroy(session)
         finally:
-            bokeh_document.gc = gc  # type: ignore[attr-defined]
+            bokeh_document.gc = gc
 
     document.destroy = destroyed  # type: ignore[method-assign]
 
