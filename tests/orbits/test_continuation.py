@@ -19,6 +19,7 @@ from vijax.orbits import (
     parameter,
     periodic,
     switching,
+    symmetry,
 )
 from vijax.orbits.continuation_settings import ContinuationSettings
 from vijax.orbits.shooting import Sequence
@@ -232,6 +233,25 @@ def test_an_orbit_closed_half_way_folds_where_a_multiplier_passes_one():
     for test, kind in (("plus", "fold"), ("fold", "fold"), ("minus", "pitchfork")):
         event = events.BranchEvent(0, 0.0, test, y[0])
         assert events.kind_of(arc, event, np.repeat(y, 2, axis=0), ContinuationSettings()) == kind
+
+
+@pytest.mark.parametrize("r", [0.479, 0.48])
+def test_two_events_within_one_arclength_step_are_located_apart(r):
+    """The flip and the graze are closer than a step (2e-3). Unstable orbits lie between them."""
+    found = orbit_search.search(impact_pair(0.2, None, r), "RL", guesses=256)
+    start = found[np.flatnonzero(~symmetry.symmetric(found))][:1]
+    (branch,) = continuation.follow(start, "d", SPAN, direction="down")
+    flip, graze = branch.points
+    assert (flip.kind, graze.kind) == ("flip", "grazing flight")
+    assert 0 < flip.value - graze.value < 1e-3
+    between = (branch.values > graze.value) & (branch.values < flip.value)
+    assert between.any()
+    assert not branch.stable[between].any()
+    fine = ContinuationSettings(max_step=1e-4, first_step=1e-5)
+    (apart,) = continuation.follow(branch.orbit[np.flatnonzero(between)[:1]], "d", SPAN, settings=fine, points=300)
+    known = {point.kind: point.value for point in apart.points}
+    for point in (flip, graze):
+        assert point.value == pytest.approx(known[point.kind], abs=1e-12)
 
 
 def test_a_family_ends_where_its_orbit_fades():

@@ -21,6 +21,7 @@ from vijax.orbits import (
     curves,
     limits,
     map_borders,
+    map_curves,
     map_motions,
     multipliers,
     orbit_search,
@@ -307,6 +308,19 @@ def test_a_border_of_basins_is_told_from_one_of_a_bifurcation(d, basins):
     plane = dataclasses.replace(one, names=np.where(first, one.names, other.names), cells=cells)
     assert plane.names.tolist() == [["1:2", "1:2"], ["1:1", "1:1"]]
     np.testing.assert_array_equal(map_motions.both_attract(plane, map_borders.borders(plane)), [basins, basins])
+
+
+def test_first_cells_of_a_search_are_spread_over_the_map():
+    """Every periodic cell has one of them within a fifth of both axes, also if part of the map has no orbits."""
+    whole = map_borders.labelled_plane(made_map())
+    part = dataclasses.replace(whole, names=np.where(np.arange(9)[:, None] < 4, whole.names, ""))
+    for plane in (whole, part):
+        cells = map_curves._spread(plane)
+        assert (plane.names[tuple(cells.T)] != "").all()
+        assert len(np.unique(cells, axis=0)) == len(cells)
+        away = np.abs(np.argwhere(plane.names != "")[:, None] - cells) / np.array(plane.names.shape)
+        assert away.max(axis=2).min(axis=1).max() <= 0.2
+    assert len(map_curves._spread(whole)) == 25
 
 
 def test_a_search_without_time_says_what_is_left():

@@ -99,6 +99,21 @@ def test_reverse_is_forward_and_second_derivatives_are_differences_of_first(foun
     assert float(second) == pytest.approx(float(difference), rel=1e-7)
 
 
+@pytest.mark.long
+def test_what_pads_an_orbit_changes_nothing(found):
+    """Orbits of several widths are padded with NaN."""
+    guess, slope, slopes, state = found
+    padded = periodic.widened(guess, 4)
+    assert np.isnan(padded.knots[:, 2:]).all()
+    wide_slopes, wide_state = slope(padded.pair, padded)
+    for wide, narrow in zip(jax.tree.leaves(wide_slopes), jax.tree.leaves(slopes), strict=True):
+        np.testing.assert_allclose(wide, narrow, rtol=1e-12, atol=1e-18)
+    for name in ("P", "speed", "multiplier", "condition"):
+        np.testing.assert_allclose(getattr(wide_state, name), getattr(state, name), rtol=1e-12)
+    np.testing.assert_array_equal(wide_state.depth[:, 2:], 0)
+    assert np.isfinite(wide_state.knots).all()
+
+
 def test_where_no_orbit_attracts_nothing_is_said(found):
     guess, slope, _, _ = found
     every = orbit_search.search(impact_pair(0.2, 25.0, 0.5), "RL", guesses=64)

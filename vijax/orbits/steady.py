@@ -163,7 +163,7 @@ def _pair_of(moved: Moved, kind: Walls) -> ImpactPair:
 def _found(moved: Moved, about: tuple[Sequence, Knots], *, kind: Walls) -> Found:
     """Find the orbit near a guess."""
     (sequence, guess), pair = about, _pair_of(moved, kind)
-    return _judged(pair, sequence, *find(pair, sequence, jnp.where(sequence.real[:, None], guess, 0.0)))
+    return _judged(pair, sequence, *find(pair, sequence, guess))
 
 
 def _like_found(about: tuple[Sequence, Knots]) -> Found:
