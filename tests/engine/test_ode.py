@@ -1,6 +1,5 @@
 """Methods that step, through the same cases as the exact engine: accuracy, orders, events, seam, gradients."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,12 +7,10 @@ import pytest
 
 import vijax
 from benchmarks.yardstick import reference_trajectories
-from vijax.engine import dense_output, ode
 from vijax.engine.ode import Ode
 from vijax.engine.rk4 import Rk4
 from vijax.model import flow
-from vijax.model.membrane import Linear
-from vijax.model.pair import ImpactPair, impact_pair, membrane_pair
+from vijax.model.pair import ImpactPair, impact_pair
 from vijax.model.records import State, Status
 
 LANES, PERIODS, ROOM = 8, 6, 48  # the one shape in which trajectories are compiled
@@ -224,44 +221,6 @@ def test_what_is_not_asked_for_does_not_change_the_steps():
     _, plain = outcomes(FINE, case, 3, deep=False, tangent=False)
     _, rich = outcomes(FINE, case, 3, deep=False, tangent=True)
     assert [float(p.after.v) for p in plain] == [float(p.after.v) for p in rich]
-
-
-def test_both_scalings_are_one_motion():
-    pair = impact_pair(0.2, 20.0, 0.5, 0.1)
-    second = membrane_pair(pair)
-    per_length, per_time = float(second.length_unit), float(second.time_unit)
-    start, begin, span = (0.003, 0.35), 0.3, 0.1  # w and w' of a contact, its phase and how long it is followed
-    wall = Linear().wall(pair)
-    for mode in (0, 1, -1):
-        side = -1.0 if mode < 0 else 1.0
-        x, z = (jnp.asarray(value) for value in (start if mode else (0.02, 0.35)))
-        u, v = (side * (x + 0.1), side * z) if mode else (x, z)
-        solve = [diffrax.Dopri8(), None, None, None]
-        control = diffrax.PIDController(1e-11, 1e-13)
-        one = diffrax.diffeqsolve(
-            ode.equation_38,
-            solve[0],
-            begin,
-            begin + span,
-            1e-3,
-            dense_output.SolverState(x, z),
-            ode.FieldArguments(pair.gamma, jnp.int32(mode), wall),
-            stepsize_controller=control,
-        ).ys
-        speed = per_length / per_time
-        two = diffrax.diffeqsolve(
-            ode.equation_39,
-            solve[0],
-            begin / per_time,
-            (begin + span) / per_time,
-            1e-3,
-            dense_output.SolverState(u / per_length, v / speed),
-            (second, jnp.int32(mode)),
-            stepsize_controller=control,
-        ).ys
-        u, v = (side * (one.x + 0.1), side * one.z) if mode else (one.x, one.z)
-        assert np.allclose(two.x * per_length, u, rtol=0, atol=1e-10)
-        assert np.allclose(two.z * speed, v, rtol=0, atol=1e-9)
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------

@@ -146,7 +146,7 @@ def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, 
     assert moved.end == pytest.approx((float(flown.u[-1]), float(flown.v[-1])), abs=1e-9)
     if moved.orbit is not None:
         assert np.array_equal(np.asarray(made["orbit"].multipliers), np.asarray(moved.orbit.multipliers))
-    rows = dict(answers.cell_rows(plane, found, moved))
+    rows = dict(answers.cell_rows(found, moved))
     assert rows["P"].startswith(f"{float(made['found']['P']):.6g} J per half period")
     assert rows["power"] == f"{float(made['found']['power']):.6g} W"
     assert rows["penetration"].startswith(f"{1e3 * float(made['found']['max_penetration']):.6g} mm (limit 6.3 mm)")

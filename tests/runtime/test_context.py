@@ -19,8 +19,6 @@ import vijax
 from vijax.design import report, tolerance
 from vijax.model import device as devices
 from vijax.model import energy, restitution, variables
-from vijax.model import pair as pairs
-from vijax.model.pair import membrane_pair
 from vijax.orbits import motion, orbit_properties, orbit_search, parameter, periodic
 from vijax.runtime import context, tiles, xla
 
@@ -183,20 +181,16 @@ def test_a_platform_that_is_not_there_is_one_line(tmp_path):
 
 
 PAIR = vijax.impact_pair([0.2, 0.3], 40.0, [0.5, 0.7])
-MEMBRANE = membrane_pair(PAIR)
 DEVICES = jax.tree.map(lambda x: jax.device_put(np.array([x, 1.1 * x])), vijax.Harvester())
 NUMBERS = np.array([1e-3, 2e-3])
 CLOSED_FORMS = {
     "ImpactPair": lambda: (PAIR.mu, PAIR.zeta, PAIR.omega1),
     "Harvester": lambda: (DEVICES.k, DEVICES.length_unit, DEVICES.speed_unit, DEVICES.pair()),
-    "MembranePair": lambda: (MEMBRANE.length_unit, MEMBRANE.time_unit),
     "pair.impact_pair": lambda: vijax.impact_pair([0.1, 0.2], 40.0, 0.3),
     "restitution.damping_ratio": lambda: restitution.damping_ratio(NUMBERS),
     "device.with_pair": lambda: devices.with_pair(vijax.Harvester(), PAIR),
     "device.depth_unit": lambda: devices.depth_unit(DEVICES, vijax.impact_pair(0.2, None, 0.5)),
     "device.with_constants": lambda: devices.with_constants(vijax.Harvester(), k=NUMBERS),
-    "pair.membrane_pair": lambda: membrane_pair(PAIR),
-    "pair.from_membrane_pair": lambda: pairs.from_membrane_pair(MEMBRANE),
     "energy.stretch": lambda: energy.stretch(vijax.Harvester(), NUMBERS),
     "energy.capacitance": lambda: energy.capacitance(vijax.Harvester(), NUMBERS),
     "energy.harvested_energy": lambda: energy.harvested_energy(vijax.Harvester(), NUMBERS),

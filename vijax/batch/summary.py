@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from vijax.batch.cell import Cell, Harvest, Lane, Mask, Plan, Settings, batch_length
+from vijax.batch.cell import Cell, Harvest, Lane, Mask, Plan, Settings, Tally, batch_length
 from vijax.batch.cell_end import chaotic, failed, growth, last_period
 from vijax.batch.chain import Handover, hand_over
 from vijax.engine.impact import Ball
@@ -101,13 +101,10 @@ def _ended(plan: Plan, settings: Settings, cell: Cell) -> _End:
 
 
 def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
-    """Say what is kept of cells that are done."""
+    """Compute the summary of cells that are done."""
     t, e = cell.tally, _ended(plan, settings, cell)
     still, failed, hits = e.still, e.failed, t.left + t.right
     period, status, lyapunov = _kind(cell, e)
-
-    def per(total, number):
-        return jnp.where((number > 0) & ~still, total / jnp.where(number > 0, number, 1.0), jnp.nan)
 
     def measured(value):
         value = jnp.where(still, 0.0, value)
@@ -120,33 +117,45 @@ def unload(plan: Plan, settings: Settings, cell: Cell) -> Summary:
         each = jnp.where(still, 0.0, jnp.round(impacts * e.prime / e.span))
         return jnp.where(labelled, each, -1.0).astype(jnp.int32)
 
-    def depth(greatest):
-        return jnp.where(failed, jnp.nan, jnp.where(e.silent, 0.0, greatest))
+    def depth(value):
+        return jnp.where(failed, jnp.nan, jnp.where(e.silent, 0.0, value))
 
     power, error, ratio = _harvested(plan, settings, cell, e)
-    depths = {"deepest": t.deepest} | named("deepest", t.deepest_sides or Sides(None, None))
+    greatest = {"deepest": t.deepest} | named("deepest", t.deepest_sides or Sides(None, None))
+    depths: dict[str, Any] = {name: None if x is None else depth(x) for name, x in greatest.items()}
     ran = cell.ball.n + 0.5 * cell.ball.t
     return Summary(
         P=power,
         P_stderr=error,
         energy_ratio=ratio,
-        **{name: None if x is None else depth(x) for name, x in depths.items()},
+        **depths,
         fastest=measured(t.fastest),
-        asymmetry=None if t.momentum is None else per(t.momentum, hits * t.fastest),
         period=period.astype(jnp.int32),
         impacts_left=number(t.left),
         impacts_right=number(t.right),
         impacts_per_period=measured(hits / e.span),
-        restitution=per(t.rebound_left + t.rebound_right, hits),
-        restitution_left=per(t.rebound_left, t.left),
-        restitution_right=per(t.rebound_right, t.right),
-        contact_time=per(t.contact, hits),
+        **_means(t, hits, still),
         contact_fraction=jnp.where(e.permanent, 1.0, measured(t.contact / (2 * e.span))),
         lyapunov=lyapunov,
         periods_run=jnp.where(e.periodic, ran, jnp.where(failed | still, jnp.minimum(ran, e.end), e.end)),
         status=status.astype(jnp.int32),
         handover=hand_over(settings, cell, e.periodic, failed, e.end) if plan.chained else None,
     )
+
+
+def _means(t: Tally, hits: Lane, still: Mask) -> dict[str, Any]:
+    """Compute means over impacts; NaN for cells without impacts, and for those `still`."""
+
+    def per(total, number):
+        return jnp.where((number > 0) & ~still, total / jnp.where(number > 0, number, 1.0), jnp.nan)
+
+    return {
+        "asymmetry": None if t.momentum is None else per(t.momentum, hits * t.fastest),
+        "restitution": per(t.rebound_left + t.rebound_right, hits),
+        "restitution_left": per(t.rebound_left, t.left),
+        "restitution_right": per(t.rebound_right, t.right),
+        "contact_time": per(t.contact, hits),
+    }
 
 
 def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, "lane"], Lane | None]:

@@ -271,7 +271,7 @@ def _dask_options() -> list[click.Parameter]:
 
 
 def _output_options() -> list[click.Parameter]:
-    wanted = "variables wanted [all but asymmetry, lyapunov; for labels lyapunov too]"
+    wanted = "variables wanted [all but those on request; for labels lyapunov too]"
     some = "compute every 2^LEVELS-th cell along each axis, then those at borders; fill the others"
     shown = "what the picture shows: any variable, or label"
     drawn = "draw curves of bifurcations over the picture, and list what they meet"

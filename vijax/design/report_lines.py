@@ -45,8 +45,8 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
     else:
         yield from _best(best, report["objective"])
         yield from _dropped(report)
-        yield from _off_design(best, report["extents"], report["arrival"])
-        yield from _around(best, report["surroundings"])
+        yield from _off_design(report["extents"], report["arrival"])
+        yield from _around(report["surroundings"])
         yield from _in_plane(report["plane"])
         yield from _others(best, report["others"], report["objective"])
         yield from _off(report)
@@ -182,7 +182,7 @@ def _regular(best: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _off_design(best: dict[str, Any], extents: list[dict[str, Any]], arrival: dict[str, Any] | None) -> Iterator[str]:
+def _off_design(extents: list[dict[str, Any]], arrival: dict[str, Any] | None) -> Iterator[str]:
     """Say how far the motion lasts, what comes after it, and how balls arrive at it."""
     for one in extents:
         for way in ("below", "above"):
@@ -203,7 +203,7 @@ def _off_design(best: dict[str, Any], extents: list[dict[str, Any]], arrival: di
         yield f"  {100 * arrival['share']:.3g} % of the balls arrive there in {arrival['periods']:,} periods{when}"
 
 
-def _around(best: dict[str, Any], around: dict[str, Any] | None) -> Iterator[str]:
+def _around(around: dict[str, Any] | None) -> Iterator[str]:
     if around is None:
         return
     if around["below"]:

@@ -22,7 +22,7 @@ from vijax.engine.ode_events import FIRST_STEP, LONGEST, Landing, OdeCarry, Sigh
 from vijax.engine.ode_friction import Grip, grip, onward, rubbed
 from vijax.model.flow import PI
 from vijax.model.membrane import Wall
-from vijax.model.pair import ImpactPair, MembranePair, Real
+from vijax.model.pair import ImpactPair, Real
 from vijax.model.records import State
 from vijax.model.sides import Sides, at, named
 from vijax.model.waves import Waves, begun, later, pushing
@@ -65,17 +65,6 @@ def _field(t: Any, y: SolverState, spell: FieldArguments) -> SolverState:
 
 equation_38 = diffrax.ODETerm(_field)
 """Eq. (38) in one spell: x'' = side (cos(pi t) - gamma) + membrane(w, w'), for `SolverState` and `FieldArguments`."""
-
-
-def _field_39(t: Any, y: SolverState, args: tuple[MembranePair, Int[Array, ""]]) -> SolverState:
-    pair, mode = args
-    side = jnp.sign(mode).astype(y.x.dtype)
-    pull = jnp.where(mode == 0, 0.0, y.x - 0.5 * side + pair.c_star * y.z)
-    return SolverState(y.z, pair.A_star * jnp.cos(pair.omega_star * t) - pair.g_star - pull)
-
-
-equation_39 = diffrax.ODETerm(_field_39)
-"""Eq. (39), lengths in units of s, times in units of 1/omega0: for `SolverState` (x, x') and (`MembranePair`, mode)."""
 
 
 class Ode(Method[OdeCarry]):
@@ -171,7 +160,7 @@ class Ode(Method[OdeCarry]):
         # and has met it is taken as it is: what its dense output shows there is that same event.
         seen = trial.passes & sight.seen & ~shut & ~landing.crest
         seen, moved = decided((seen, trial.passes & ~seen))
-        y = meet(m, half, side, wall, trial, landing)
+        y = meet(half, side, wall, trial, landing)
         t = trial.t + landing.delay
         # The phase stays within one period: a time that only grew would lose digits as it does.
         over = decided(t >= 2)

@@ -144,7 +144,7 @@ def _ratio(change: Scalar, speed: Scalar) -> Scalar:
     return jnp.where(moving, change / jnp.where(moving, speed, 1.0), 0.0)
 
 
-def meet(m: OdeCarry, half: Scalar, side: Scalar, wall: Wall, trial: Trial, landing: Landing) -> SolverState:
+def meet(half: Scalar, side: Scalar, wall: Wall, trial: Trial, landing: Landing) -> SolverState:
     """Find the state at the event that a step has met (at its end, if none), in coordinates of the spell after it."""
     onset, exits, crest, delay, speed = landing.onset, landing.exits, landing.crest, landing.delay, landing.speed
     y = jax.tree.map(lambda value, slope: value + delay * slope, trial.y, trial.f)

@@ -26,7 +26,7 @@ def heading(found: CellMotion) -> str:
     return f"{found.name}, P = {amount(found.numbers['P'], 'J')}"
 
 
-def cell_rows(plane: ExploredPlane, cell: ExploredCell, found: CellMotion) -> Rows:
+def cell_rows(cell: ExploredCell, found: CellMotion) -> Rows:
     """Say of a cell where it is, what it yields, how far it keeps from its limits, and how it ended."""
     place = [[symbol(name), amount(value, unit_of(name))] for name, value in cell.arguments.items()]
     place += [

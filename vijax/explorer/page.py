@@ -206,7 +206,7 @@ class ExplorerPage:
         del self._trail[:-_TRAIL]
         self.drawing.visited(self._trail if self.view.follow else [])
         note = answers.disagreement(self.plane, dict(self.view.values), self.view.pick, found)
-        rows = answers.cell_rows(self.plane, self.cell, found)
+        rows = answers.cell_rows(self.cell, found)
         if not self.plane.differs(self.view.values):
             rows += answers.curves_row(self.laid, self.plane, self.view.pick)
         self.tell("cell", number=number, heading=answers.heading(found), rows=rows, note=note)

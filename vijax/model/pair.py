@@ -1,6 +1,5 @@
-"""The vibro-impact pair in its two nondimensional scalings, and the checks of what a user gives."""
+"""The vibro-impact pair in its nondimensional scaling, and the checks of its arguments."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import reduce
@@ -16,7 +15,7 @@ from jaxtyping import Float
 from vijax.model import units
 from vijax.model.choices import Walls
 from vijax.model.quantities import SIDES, check, whole
-from vijax.model.restitution import damped_frequency, damping_ratio, restitution
+from vijax.model.restitution import damped_frequency, damping_ratio
 from vijax.model.sides import Sides, apart, at, each, named
 from vijax.model.units import Given
 from vijax.runtime import checks
@@ -162,51 +161,6 @@ class ImpactPair(eqx.Module):
 WALLS: tuple[Walls, ...] = get_args(Walls)
 RIGID_ON = tuple(wall for wall in WALLS if wall.startswith("rigid_"))
 """Walls of which one alone is rigid."""
-
-
-class MembranePair(eqx.Module):
-    """The soft pair in the second scaling, Eq. (39): lengths in units of s, times in units of 1/omega0.
-
-    With x = U/s and t* = omega0 tau:  x'' = -g* + A* cos(omega* t*), and in contact -sign(x)(|x| - 1/2) - c* x' more.
-    It stays put while omega moves, where (d, kappa) follows a curve d kappa^2 = 1/A* = const.
-    """
-
-    g_star: Float[AnyArray, "..."]
-    A_star: Float[AnyArray, "..."]
-    omega_star: Float[AnyArray, "..."]
-    c_star: Float[AnyArray, "..."]
-
-    @property
-    @door
-    def length_unit(self) -> Float[AnyArray, "..."]:
-        """Give units of u per unit of x: d."""
-        return (self.omega_star / math.pi) ** 2 / self.A_star
-
-    @property
-    @door
-    def time_unit(self) -> Float[AnyArray, "..."]:
-        """Compute units of t per unit of t*: 1/kappa."""
-        return self.omega_star / math.pi
-
-
-@door
-def membrane_pair(pair: ImpactPair) -> MembranePair:
-    """Bring a soft pair into the scaling of Eq. (39).
-
-    A* = 1/(d kappa^2), g* = gamma A*, omega* = pi/kappa, c* = mu/kappa.
-    """
-    if pair.unequal:
-        raise ValueError("pair must have equal walls, as Eq. (39) measures time by their one omega0; got Sides")
-    kappa = pair._soft_kappa()
-    strength = 1 / (pair.d * kappa**2)
-    return MembranePair(pair.gamma * strength, strength, math.pi / kappa, 2 * damping_ratio(pair.r))
-
-
-@door
-def from_membrane_pair(pair: MembranePair) -> ImpactPair:
-    """Bring a soft pair into the scaling of Eqs. (37)-(38); the inverse of `membrane_pair` for 0 <= c* < 2."""
-    ratio = 0.5 * pair.c_star
-    return ImpactPair(pair.length_unit, 1 / pair.time_unit, restitution(ratio), pair.g_star / pair.A_star)
 
 
 def check_pair(pair: Any, *, of_orbit: bool = False) -> ImpactPair:

@@ -101,8 +101,8 @@ def sweep(
         friction: Of "ode": dry friction of ball and capsule, over the amplitude of the forcing as gamma is;
             `Harvester.friction` has that of a coefficient. The ball may stick. None unless given.
         steps: Of "rk4": steps per forcing period, 1000 unless given.
-        outputs: The variables wanted, of those on the page of outputs; all but `asymmetry` and `lyapunov`
-            unless given. What is not wanted is not computed. `status` always comes.
+        outputs: The variables wanted, of those on the page of outputs; all but those on request
+            (`vijax.planes.outputs.ON_REQUEST`) unless given. Others are not computed. `status` always comes.
         device: Constants of the device; Tables I and II unless given.
         dtype: "float64", or "float32" with tolerances to match.
         excitation: What shakes the capsule: `Harmonics`, a `Record`, a `Waveform`, `Noise`, or a sum of them; the sine
