@@ -192,7 +192,7 @@ REFUSED = [
     (lambda: Harvester(penetration_limit=0.0), "penetration_limit must be positive; got 0.0; "),
     (
         lambda: with_constants(Harvester(), mass=1.0),
-        "mass must be a constant of the device; got 'mass'; known are k, m_b, ",
+        "mass must be a constant of the device; got 'mass'; known are k, distance, m_b, ",
     ),
     (lambda: with_constants(Harvester(), k=1.0, omega0=2.0), "k and omega0 must not both be given"),
     (lambda: with_constants(Harvester(), k=-1.0), "k must be positive and finite; got -1.0; "),
