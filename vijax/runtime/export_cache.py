@@ -160,8 +160,9 @@ def _write(path: Path, known: _Traced) -> None:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with replacing(path) as part:
-            descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+            descriptor = os.open(part, os.O_WRONLY | os.O_NOFOLLOW)
             with open(descriptor, "wb") as file:
+                os.fchmod(descriptor, 0o600)
                 file.write(_signed(path, body) + body)
     except OSError:
         return
