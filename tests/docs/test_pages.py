@@ -157,7 +157,7 @@ def test_the_page_of_functions_is_in_public_names_says_nothing_twice_and_keeps_l
     assert len(said) == 1
     blocks = [html.unescape(re.sub(r"<[^>]+>", "", one)) for one in re.findall(r"<pre>(.*?)</pre>", text, re.S)]
     (example,) = [one for one in blocks if one.startswith("sweep(d=np.linspace")]
-    assert len(example.splitlines()) == 3
+    assert len(example.splitlines()) == 4
 
 
 @pytest.fixture

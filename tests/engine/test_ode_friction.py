@@ -218,7 +218,7 @@ def test_a_membrane_of_any_law_may_have_friction_beside_it():
 def test_the_friction_of_a_coefficient_is_that_of_the_weight_on_the_capsule():
     device = vijax.Harvester(beta=0.3, A=5.0)
     np.testing.assert_allclose(device.friction(0.1), 0.1 * 9.8 * np.cos(0.3) / 5.0, rtol=1e-14)
-    with pytest.raises(ValueError, match=r"coefficient must be a finite number of at least 0; got -0\.1"):
+    with pytest.raises(ValueError, match=r"coefficient must be finite and not negative; got -0\.1"):
         device.friction(-0.1)
 
 

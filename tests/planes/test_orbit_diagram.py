@@ -205,7 +205,7 @@ def test_progress_is_told():
         ({"d": 0.2}, "d must not be given twice"),
         ({"s": 0.2}, "d and s give the same quantity"),
         ({"values": 0.2}, "values must be a 1-D array of d; got 0.2"),
-        ({"values": [0.2, -0.1]}, "values must be positive .* at index 1; it is the gap"),
+        ({"values": [0.2, -0.1]}, "values must be positive .* at index 1; it is the free travel"),
         ({"periods": 0}, "periods must be a whole number of at least 1"),
         ({"recorded_periods": 30, "periods": 20}, "recorded_periods must be at most periods; got 30 of 20"),
         ({"direction": "left"}, 'direction must be "down" or "up" or "both"'),

@@ -135,7 +135,7 @@ class Harvester(eqx.Module):
     @property
     @door
     def distance(self) -> Real:
-        """Compute the distance of the membranes, s + 2 r_b [m]: the ball's free travel and its diameter."""
+        """Compute the distance of the membranes [m], the sum of the free travel s and the diameter of the ball."""
         return self.s + 2 * self.r_b
 
     @property

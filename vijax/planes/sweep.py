@@ -72,8 +72,8 @@ def sweep(
         sweep(d=0.2, kappa=np.geomspace(3, 400, 64), A=[1, 2, 5])                     # here A enters energies alone
         sweep(s=DataArray([0.01, 0.02], dims="device"), omega0=DataArray([90, 120], dims="device"))  # a list of devices
 
-    Axes that are `xarray.DataArray`s with one dimension share it: their values belong together, one by one. The
-    dimension keeps its labels.
+    Axes of the class `xarray.DataArray` that have the same single dimension share it: their values belong together, one
+    by one. The dimension keeps its labels.
 
     Dimensionless axes are d, kappa, r, gamma and the start u0, v0; physical ones omega [rad/s], s [m], omega0 [rad/s]
     or k [N/m], A [m/s^2], beta [rad]. d and s are one quantity, so are kappa, omega0 and k, gamma and beta: give one
