@@ -1,5 +1,6 @@
 """`vijax response`: what one device does under noise or a measured record."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,12 +56,13 @@ def _summary(dataset: "xr.Dataset") -> str:
     number = {name: float(dataset[name]) for name in dataset if not dataset[name].dims}
     last = dataset.isel(quantile=-1)
     deep, off = (1e3 * float(last[name]) for name in ("penetration_quantile", "penetration_quantile_stderr"))
+    spread = "(too few for an error)" if math.isnan(off) else f"+- {off:.1g}"
     lines = [
         f"excitation: {dataset.attrs['excitation']}",
         f"P: {number['P']:.6g} +- {number['P_stderr']:.1g} J per half period over "
         f"{how_many(dataset.sizes['realisation'], 'realisations')}",
         f"impacts: {number['impacts_per_period']:.4g} a period, up to {number['max_impact_speed']:.4g} m/s; one in a "
-        f"thousand deeper than {deep:.4g} +- {off:.1g} mm; past the limit {number['beyond_limit']:.2%}",
+        f"thousand deeper than {deep:.4g} {spread} mm; past the limit {number['beyond_limit']:.2%}",
     ]
     if "time_share" not in dataset:
         return "\n".join(lines)

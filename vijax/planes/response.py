@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 # Of the impacts of all realisations; the last one is exceeded by one impact in a thousand.
 _QUANTILES = (0.5, 0.9, 0.99, 0.999)
-# Realisations are left out in so many groups to find the error of a quantile.
-_GROUPS = 10
+# With fewer impacts above a quantile, or below it, its error is not known to a third.
+_FEWEST = 10
 _FAILED = Status.EVENT_BUDGET, Status.NONFINITE
 # Of an attractor's table: what is wanted of it besides the time that is spent there.
 _KEPT = {"label": "label", "period": "period", "P_attractor": "P", "admissible": "admissible"}
@@ -75,9 +75,10 @@ def response(
     Returns:
         A dataset of `P` [J per half period] and `power` [W] with `P_stderr` and `power_stderr`, and `P_realisation`;
         `impacts_per_period`; `speed_density` over `impact_speed` [m/s] and `penetration_density` over `penetration` [m]
-        (middles of bins) with errors; `speed_quantile`, `penetration_quantile` over `quantile` with errors;
-        `max_penetration`, `max_impact_speed` of all; `beyond_limit`, the part of impacts that pass the penetration
-        limit, with its error; `status` of every realisation, of which those that failed count nowhere.
+        (middles of bins) with errors; `speed_quantile`, `penetration_quantile` over `quantile` with errors, NaN where
+        fewer than 10 impacts lie beyond; `max_penetration`, `max_impact_speed` of all; `beyond_limit`, the part of
+        impacts that pass the penetration limit, with its error; `status` of every realisation, of which those that
+        failed count nowhere.
         Over `attractor`, the ones visited longest first: `label`, `period`, `P_attractor` [J per half period] and
         `admissible` of the noiseless motion; `time_share`, the part of the periods that begin in its basin, with its
         error; `losses`, how often it was left; `time_until_lost` [periods], the time there over that, with the
@@ -235,15 +236,23 @@ def _share(asked: _Asked, of: np.ndarray, hits: np.ndarray) -> tuple[np.ndarray,
 
 
 def _quantiles(asked: _Asked, of: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find quantiles, and their standard errors by leaving out groups of realisations in turn."""
-    none = np.full(len(_QUANTILES), np.nan)
-    groups = min(_GROUPS, asked.realisations)
-    rest = [values[of % groups != group] for group in range(groups)]
-    if not all(left.size for left in rest):
+    """Compute quantiles and their standard errors.
+
+    The share of the impacts above a quantile has a standard error e over the realisations. It is multiplied by the
+    slope of the quantile between the levels 2 e below and 2 e above. A quantile beyond which too few impacts lie has no
+    error, NaN.
+    """
+    if not values.size:
+        none = np.full(len(_QUANTILES), np.nan)
         return none, none
-    left_out = np.array([np.quantile(left, _QUANTILES) for left in rest])
-    spread = ((left_out - left_out.mean(axis=0)) ** 2).sum(axis=0)
-    return np.quantile(values, _QUANTILES), np.sqrt(spread * (groups - 1) / groups)
+    found = np.quantile(values, _QUANTILES)
+    beyond = values > found[:, None]
+    _, error = _share(asked, of, beyond)
+    levels = np.clip(np.array(_QUANTILES) + np.multiply.outer((-2.0, 2.0), error), 0, 1)
+    rise, run = np.diff(np.quantile(values, levels), axis=0)[0], np.diff(levels, axis=0)[0]
+    above = beyond.sum(axis=1)
+    known = np.minimum(above, values.size - above) >= _FEWEST
+    return found, np.where(known, error * rise / np.where(run > 0, run, 1.0), np.nan)
 
 
 def _visits(asked: _Asked, quiet: Excitation, flown: _Hits) -> dict[str, Any]:
