@@ -236,13 +236,18 @@ LONG = 9  # forcing periods of an orbit that counts as long
 FLOWN = 20_000  # forcing periods that a label must outlast
 
 
+def _drawn(draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw d, kappa and r of many cells."""
+    d, kappa = (np.exp(draw.uniform(np.log(low), np.log(high), 65536)) for low, high in ((0.03, 10), (2, 1000)))
+    return d, kappa, draw.uniform(0.2, 0.9, d.size)
+
+
 def long_periods(count: int) -> None:
     """Compare labels of long periods with the motion that the same starts have come to after many periods more."""
     draw, cells = np.random.default_rng(106), 0
     met: list[list[Any]] = []
     while sum(d.size for d, *_ in met) < count:
-        d, r = draw.uniform(0.02, 0.6, 65536), draw.uniform(0.2, 0.9, 65536)
-        kappa = np.exp(draw.uniform(np.log(2), np.log(1000), d.size))
+        d, kappa, r = _drawn(draw)
         found = _labelled(d, kappa, r, periods=400)
         some = np.flatnonzero(found.period >= LONG)
         struck = found.impacts_left + found.impacts_right
@@ -257,6 +262,8 @@ def long_periods(count: int) -> None:
         same = np.abs(later.fastest / fastest[of] - 1) < 1e-8
         kept[of] = same & (np.round(later.impacts_per_period * each) == hits[of])
     say("labels of long periods that a flight does not keep", 1 - kept.mean(), 5e-3, f"{count:,} of {cells:,} cells")
+    wide = d > 1
+    say("the same where d is above 1", 1 - kept[wide].mean(), 5e-3, f"{wide.sum():,} cells")
 
 
 def slow_cells(count: int) -> None:
@@ -264,8 +271,7 @@ def slow_cells(count: int) -> None:
     draw, cells, undecided = np.random.default_rng(107), 0, 0
     met: list[list[Any]] = []
     while sum(d.size for d, *_ in met) < count:
-        d, r = draw.uniform(0.02, 0.6, 65536), draw.uniform(0.2, 0.9, 65536)
-        kappa = np.exp(draw.uniform(np.log(2), np.log(1000), d.size))
+        d, kappa, r = _drawn(draw)
         gamma = draw.uniform(-0.5, 0.5, d.size) * (draw.random(d.size) < 0.5)
         found = _labelled(d, kappa, r, gamma, periods=400)
         some = np.flatnonzero(found.status == vijax.Status.CONVERGING)
@@ -284,6 +290,7 @@ def slow_cells(count: int) -> None:
     wrong = known & ~(same & (np.abs(later.fastest / fastest - 1) < 1e-6))
     say("slow cells whose label counts other turns of the same", (known & ~wrong & (later.period != period)).sum(), 20)
     say(f"slow cells with another motion by {FLOWN:,} periods", wrong.sum(), 0, f"{known.sum():,} of {cells:,} cells")
+    say("the same where d is above 1", (wrong & (d > 1)).sum(), 0, f"{(known & (d > 1)).sum():,} cells")
     say("cells undecided after 400 periods", undecided / cells, 1e-3)
 
 

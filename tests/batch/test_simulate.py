@@ -154,6 +154,67 @@ def test_longer_windows_have_smaller_errors(plane):
     np.testing.assert_allclose(longer.lyapunov, exponents, rtol=0.1, atol=0.03)
 
 
+def wide_cells(count):
+    """Level cells in whose gaps a slow ball flies for hundreds of periods from one impact to the next."""
+    draw = np.random.default_rng(3)
+    d, kappa, r = (
+        np.exp(draw.uniform(0, np.log(10), count)),
+        np.exp(draw.uniform(2.5, 6, count)),
+        draw.uniform(0.3, 0.9, count),
+    )
+    return [cell(*row, u0=0.0, v0=0.7) for row in zip(d, kappa, r, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def wide():
+    return summarise(wide_cells(240), 400, variants=ALONE)
+
+
+def test_a_cell_with_few_impacts_runs_on_as_a_longer_run_does(wide):
+    """Up to 16 times the periods, until the window has 200 impacts; with fewer than 100 the status says so."""
+    for periods in (1600, 6400):
+        some = np.flatnonzero(wide.periods_run == periods)
+        assert some.size > 20
+        longer = summarise([wide_cells(240)[i] for i in some], periods, variants=ALONE)
+        same = longer.periods_run == periods
+        assert same.sum() > 20
+        for name in ("P", "P_stderr", "lyapunov", "impacts_per_period"):
+            np.testing.assert_array_equal(getattr(wide, name)[some[same]], getattr(longer, name)[same])
+    hits = 0.75 * wide.periods_run * wide.impacts_per_period
+    chaos = wide.period == 0
+    assert (hits[chaos & (wide.periods_run < 6400)] > 199).all()
+    np.testing.assert_array_equal((wide.status == Status.FEW_IMPACTS)[chaos], hits[chaos] < 99.5)
+
+
+def test_errors_hold_where_flights_are_long(wide):
+    far = summarise(wide_cells(240), 25_600, variants=ALONE)
+    both = (wide.period == 0) & (wide.status == Status.OK) & (far.period == 0)
+    z = (wide.P - far.P)[both, 0] / np.hypot(wide.P_stderr, far.P_stderr)[both, 0]
+    assert z.size > 150
+    assert 0.7 < np.sqrt(np.mean(z**2)) < 1.3
+    assert np.mean(np.abs(z) > 3) < 0.03
+
+
+def test_the_error_of_a_window_counts_flights_that_it_has_not_met():
+    """Batch means and long flights, from the impacts of `trajectory`; too soon for chaos to part them."""
+    d, kappa, r, transient, periods = 0.776, 30.7, 0.3, 4, 48
+    told = {"until": "window", "transient": transient, "outputs": WINDOWED, "variants": ALONE}
+    found = summarise([cell(d, kappa, r, u0=0.0, v0=0.7)], periods, **told)
+    impacts = trajectory(ImpactPair(d, kappa, r, 0.0), 0.0, 0.7, transient + periods).impacts
+    impacts = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(impacts.side) != 0], impacts)
+    onset, stay, depth = 2 * impacts.n + impacts.t, impacts.duration, impacts.depth
+    flights = np.diff(onset - np.append(0, stay.cumsum()[:-1]), prepend=0.0)
+    flights = np.append(flights[onset >= 2 * transient], 2 * (transient + periods) - onset[-1] - stay[-1])
+    energies = np.asarray(harvested_energy(DEVICE, depth))[onset >= 2 * transient]
+    batch = ((onset[onset >= 2 * transient] / 2 - transient) / 2).astype(int)
+    means = np.bincount(batch, energies, 24) / 4
+    longest, window = flights.max(), 2 * periods
+    assert flights.size * longest**2 > 12 * (flights**2).sum()
+    unmet = 0.5 * (flights**2).sum() * np.sqrt(window / longest) / window**2
+    expected = np.hypot(means.std(ddof=1) / np.sqrt(24), means.mean() * np.sqrt(unmet))
+    assert found.P_stderr[0, 0] == pytest.approx(expected, rel=1e-6)
+
+
 def test_a_cells_result_does_not_depend_on_its_place_in_the_batch(plane):
     order = np.random.default_rng(3).permutation(len(PLANE))
     shuffled = summarise(PLANE, order=order)

@@ -5,8 +5,19 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vijax.batch.cell import Candidate, Cell, Lane, Mask, Plan, Settings, blank_tally
-from vijax.batch.cell_end import chaotic, failed
+from vijax.batch.cell import (
+    ENOUGH_IMPACTS,
+    LONGEST_RUN,
+    RUN_ON,
+    Candidate,
+    Cell,
+    Lane,
+    Mask,
+    Plan,
+    Settings,
+    blank_tally,
+)
+from vijax.batch.cell_end import chaotic, failed, last_period
 from vijax.batch.chain import depart
 from vijax.batch.recurrence import LATE_PERIOD, MAX_PERIOD, grain, late_recurrence, recurrence
 from vijax.batch.verdict import Correction, Verdict, correction, judge
@@ -45,6 +56,7 @@ def blank_candidate(settings: Settings, like: Lane, ball: Ball) -> Candidate:
         late=no,
         laps=zero,
         followed=no,
+        stretch=zero + 1,
     )
 
 
@@ -97,7 +109,9 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     cell = _back_to_search(plan, cell, verdict.bad, 10 * grain(settings))
     spent = stopped & ~start & ~judged & ~lost & _undecided(plan, cell)
     cell = _search_on(settings, cell, spent)
-    goes_on = start | verdict.again | verdict.follow | verdict.approached | verdict.bad | spent
+    few = stopped & ~start & ~judged & ~lost & ~spent & _lacks_impacts(plan, cell)
+    cell = _run_on(plan, settings, cell, few)
+    goes_on = start | verdict.again | verdict.follow | verdict.approached | verdict.bad | spent | few
     confirmed = verdict.good | verdict.follow
     return replace(
         cell,
@@ -183,6 +197,26 @@ def _undecided(plan: Plan, cell: Cell) -> Mask:
     """
     waits = ~present(cell.candidate).late & (cell.status == Status.OK) & ~chaotic(cell)
     return waits & (not plan.chained)
+
+
+def _lacks_impacts(plan: Plan, cell: Cell) -> Mask:
+    """Return which aperiodic cells have too few impacts in their window, and may run on."""
+    candidate, impacts = present(cell.candidate), cell.tally.left + cell.tally.right
+    lacks = (cell.status == Status.OK) & ~candidate.tracing & chaotic(cell) & (impacts < ENOUGH_IMPACTS)
+    return lacks & (candidate.stretch < LONGEST_RUN) & (not plan.chained)
+
+
+def _run_on(plan: Plan, settings: Settings, cell: Cell, few: Mask) -> Cell:
+    """Continue cells whose window has too few impacts: with a longer window, which begins where that one ends."""
+    candidate, zero = present(cell.candidate), jnp.zeros_like(cell.since)
+    return replace(
+        cell,
+        candidate=replace(candidate, stretch=jnp.where(few, RUN_ON * candidate.stretch, candidate.stretch)),
+        tally=choose(few, blank_tally(plan, zero), cell.tally),
+        since=jnp.where(few, last_period(plan, settings, cell), cell.since),
+        batch=jnp.where(few, -1.0, cell.batch),
+        running=cell.running | few,
+    )
 
 
 def _search_on(settings: Settings, cell: Cell, spent: Mask) -> Cell:

@@ -29,6 +29,13 @@ TRANSIENT_SHARE = 0.25
 # Batch means behind a standard error, which is itself uncertain by 1/sqrt(2 x 23), 15 %. With more of them a batch is
 # shorter, and motion that remembers for longer than a batch has too small an error.
 BATCHES = 24
+# An aperiodic cell whose window has fewer impacts than this runs on. Of 1,194 random cells with d from 0.03 to 10
+# averages are off by more than three standard errors in 6.8 % of the windows where none runs on, in 0.9 % where those
+# with fewer than 100 impacts do, in 0.5 % with 200.
+ENOUGH_IMPACTS = 200
+# It runs on by this factor: as the window leaves out a share of 1/4 of the run, the periods that were run become the
+# transient of the longer window. It does so until the run is so many times as long as `periods`.
+RUN_ON, LONGEST_RUN = 1 / TRANSIENT_SHARE, 16.0
 # The tangent map is kept between 1/TANGENT_SCALE and this, the rest in an exponent. A power of two, so that scaling
 # rounds nothing; products of two maps stay far from where float32 ends, 2**128.
 TANGENT_SCALE = 2.0**40
@@ -114,12 +121,14 @@ class Entry(eqx.Module):
 
 
 class Harvest(eqx.Module):
-    """What the variants of a cell have harvested."""
+    """The energies that the variants of a cell have harvested, and the flights between impacts, for their error."""
 
     batch: Float[AnyArray, "lane variant"]  # what the running batch has given so far
     past: Float[AnyArray, "lane variant"]  # what all full batches have given
     square: Float[AnyArray, "lane variant"]  # the squares of what each full batch has given, added up
     ratio: Float[AnyArray, "lane variant"] | None  # largest of harvested energy over what an impact gave
+    flights: Lane  # the squares of the durations of all flights, added up
+    longest: Lane  # duration of the longest flight
 
 
 class Tally(eqx.Module):
@@ -161,6 +170,7 @@ class Candidate(eqx.Module):
     late: Mask  # its periods are spent: the search goes on for a while, less sceptical of recurrences
     laps: Lane  # rounds that are flown before the next judgement
     followed: Mask  # the motion was seen to come nearer to the orbit that Newton's method found
+    stretch: Lane  # how many times as long as the plan's the run is: 1, or more where the window had too few impacts
 
 
 class Course(eqx.Module):
@@ -224,7 +234,7 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
     """Make sums of nothing yet."""
     zero = jnp.zeros_like(like)
     wide = jnp.zeros((*like.shape, plan.variants), like.dtype)
-    harvest = Harvest(wide, wide, wide, wide if plan.work else None) if plan.energies else None
+    harvest = Harvest(wide, wide, wide, wide if plan.work else None, zero, zero) if plan.energies else None
     stuck = jnp.zeros(like.shape, bool) if plan.rigid or plan.hard_wall else None
     deepest = zero if plan.deep else None
     sides = Sides(zero, zero) if plan.deep and plan.unequal else None
@@ -232,7 +242,7 @@ def blank_tally(plan: Plan, like: Lane) -> Tally:
     return Tally(zero, zero, zero, zero, zero, zero, momentum, deepest, sides, harvest, stuck)
 
 
-def batch_length(plan: Plan, settings: Settings) -> Float[Array, ""]:
-    """Give the periods of a batch behind the standard error."""
-    window = settings.periods * (1.0 if plan.until == "window" else 1 - TRANSIENT_SHARE)
+def batch_length(settings: Settings, candidate: Candidate | None) -> Lane | Float[Array, ""]:
+    """Compute the length of a batch, of which the standard error is made, in periods."""
+    window = settings.periods if candidate is None else (1 - TRANSIENT_SHARE) * settings.periods * candidate.stretch
     return jnp.maximum(jnp.floor(window / BATCHES), 1.0)

@@ -26,15 +26,17 @@ _CHAOS = 7.0
 
 
 def last_period(plan: Plan, settings: Settings, cell: Cell) -> Lane:
-    """Say where a cell's window ends.
+    """Return the last period of a cell's window.
 
-    One that a failed round made begin late is a share of the periods long too; one that stayed undecided goes on.
+    A window that a failed round delays is a share of the run long too. A cell that is undecided, or whose window had
+    too few impacts, runs on.
     """
-    since, share = cell.since, jnp.ceil(TRANSIENT_SHARE * settings.periods)
-    if plan.until == "window":
+    since, c = cell.since, cell.candidate
+    if c is None:
         return settings.periods + settings.transient + jnp.zeros_like(since)
-    late = 0.0 if cell.candidate is None else jnp.where(cell.candidate.late, _LATE_SHARE * settings.periods, 0.0)
-    return jnp.maximum(settings.periods + late, since + share)
+    late = jnp.where(c.late, _LATE_SHARE * settings.periods, 0.0)
+    periods = settings.periods * c.stretch
+    return jnp.maximum(periods + late, since + jnp.ceil(TRANSIENT_SHARE * periods))
 
 
 def ended(cell: Cell, event: Event, count: Lane, end: Lane) -> tuple[Int[AnyArray, "lane"], Mask]:

@@ -40,7 +40,7 @@ def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     count = cell.count + kept.astype(cell.count.dtype)
     status, stop = ended(cell, event, count, end)
     tangent, exponent = _extend_tangent(cell, impact, kept, counted)
-    batch = jnp.where(counted & ~tracing, _batch_of(plan, settings, cell, impact), cell.batch)
+    batch = jnp.where(counted & ~tracing, _batch_of(settings, cell, impact), cell.batch)
     # A batch that has ended is squared away before the first impact of the next is added.
     turned = counted & ~tracing & (batch != cell.batch) & (cell.batch >= 0)
     batch, turned = share((batch, turned))
@@ -64,8 +64,8 @@ def add_event(plan: Plan, settings: Settings, cell: Cell, event: Event) -> Cell:
     )
 
 
-def _batch_of(plan: Plan, settings: Settings, cell: Cell, impact: LaneImpact) -> Lane:
-    return jnp.floor((impact.onset_n - cell.since) / batch_length(plan, settings))
+def _batch_of(settings: Settings, cell: Cell, impact: LaneImpact) -> Lane:
+    return jnp.floor((impact.onset_n - cell.since) / batch_length(settings, cell.candidate))
 
 
 def _extend_tangent(cell: Cell, impact: LaneImpact, kept: Mask, counted: Mask):
@@ -141,9 +141,12 @@ def _harvested(
         speeds = cell.speed[:, None] * settings.speed_variant
         given = device.m_b * speeds * speeds * present(impact.work)[:, None]
         ratio = jnp.where(wide, jnp.maximum(ratio, energy.energy_ratio(got, given)), ratio)
+    flight = jnp.where(counted, impact.flight, 0.0)
     return Harvest(
         batch=jnp.where(ended, 0.0, old.batch) + jnp.where(wide, got, 0.0),
         past=jnp.where(ended, old.past + old.batch, old.past),
         square=jnp.where(ended, old.square + old.batch * old.batch, old.square),
         ratio=ratio,
+        flights=old.flights + flight * flight,
+        longest=jnp.maximum(old.longest, flight),
     )

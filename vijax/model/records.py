@@ -27,6 +27,7 @@ class Status(enum.IntEnum):
     UNSTABLE = 9  # the orbit repels, or is at a bifurcation
     NOT_RUN = 10  # the store is not finished, and nothing is known of the cell yet
     CONVERGING = 11  # as OK: its periods were spent before it arrived, and the orbit is the one that it approaches
+    FEW_IMPACTS = 12  # aperiodic, with averages over too few impacts for their standard error
 
     @property
     def advice(self) -> str:
@@ -49,6 +50,7 @@ _ADVICE = {
     Status.VIRTUAL: "search for orbits with other impacts: the ball would meet a wall in between",
     Status.UNSTABLE: "follow it as a branch, or look for what attracts by a sweep: no ball stays on this orbit",
     Status.CONVERGING: "use it: the motion is slow to arrive, and Newton's method found the orbit that it approaches",
+    Status.FEW_IMPACTS: "run more periods: the averages are over too few impacts for their standard error to hold",
     Status.NOT_RUN: "give the same command again: it goes on with what is left",
 }
 

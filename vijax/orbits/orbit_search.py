@@ -124,7 +124,7 @@ def search(
         excitation: As in `from_state`.
 
     Returns:
-        The distinct orbits, each once and at its least period. A search for a doubled label finds the simple orbit, too.
+        The distinct orbits, each once and at its least period. A search for a doubled label finds simple ones, too.
 
     Raises:
         ValueError: Neither a sequence nor a label, a period that does not agree with it, or an excitation that does

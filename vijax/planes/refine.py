@@ -204,7 +204,7 @@ class _Front:
 def _kind(found: Found, level_ground: np.ndarray, cells: Cells) -> np.ndarray:
     """Tell the kind of motion of cells: numbers along a last dimension, all equal where motions are alike."""
     period, left, right, status = (found[name][cells] for name in ("period", "impacts_left", "impacts_right", "status"))
-    status = np.where(status == Status.CONVERGING, Status.OK, status)
+    status = np.where(np.isin(status, (Status.CONVERGING, Status.FEW_IMPACTS)), Status.OK, status)
     few, many = ordered(left, right, level_ground[cells])
     return np.stack([period, few, many, status, found["P"][cells, 0] > 0], axis=-1)
 
