@@ -30,9 +30,9 @@ class Toy(NamedTuple):
     left: Lane
     hash: Lane
     careful: Lane
-    declined: Bool[Array, "lane"]
-    hard: Bool[Array, "lane"]
-    done: Bool[Array, "lane"]
+    declined: Bool[Array, " lane"]
+    hard: Bool[Array, " lane"]
+    done: Bool[Array, " lane"]
 
 
 def load(rows):
@@ -61,7 +61,7 @@ class Answer(NamedTuple):
     """What a second or a careful try makes of a lane."""
 
     hash: Lane
-    sure: Bool[Array, "lane"]
+    sure: Bool[Array, " lane"]
 
 
 def careful(toy):

@@ -51,7 +51,7 @@ def served(lanes: int) -> int:
 class Left(NamedTuple):
     """Cells that were not flown to their end: which (-1: none), and all that their lanes know of them, as rows."""
 
-    cell: Int[Array, "few"]
+    cell: Int[Array, " few"]
     lanes: Float[Array, "few column"]
 
 
@@ -113,7 +113,7 @@ def _turn(counted: Counted, width: int) -> Int[Array, ""]:
 
 
 def _serve(
-    program: Program, held: Hold, width: int, hard: Bool[Array, ""], cell: Int[Array, "lane"], carry: Any
+    program: Program, held: Hold, width: int, hard: Bool[Array, ""], cell: Int[Array, " lane"], carry: Any
 ) -> Any:
     """Give a batch of lanes a try: the first ones that ask for a hard one, or for an easy one."""
     easy_ones, hard_ones = asking(program, AtWork(cell, held.record(carry)))

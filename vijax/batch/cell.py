@@ -94,8 +94,8 @@ class Settings(eqx.Module):
     transient: Float[AnyArray, ""]
     device: Harvester
     method: Method | None
-    length_variant: Float[AnyArray, "variant"]
-    speed_variant: Float[AnyArray, "variant"]
+    length_variant: Float[AnyArray, " variant"]
+    speed_variant: Float[AnyArray, " variant"]
     recorded_periods: Float[AnyArray, ""] | None = None  # chained: periods at the end whose impacts are wanted
 
 
@@ -208,7 +208,7 @@ class Cell(eqx.Module):
     hard: Mask  # declined by sampling too
     arrival: Arrival | None  # the end of the flight as the last step found it
     done: Mask
-    status: Int[Array, "lane"]
+    status: Int[Array, " lane"]
     count: Lane  # impacts so far
     since: Lane  # first period of the window
     batch: Lane  # running batch of the window, -1 before it

@@ -39,7 +39,7 @@ def last_period(plan: Plan, settings: Settings, cell: Cell) -> Lane:
     return jnp.maximum(periods + late, since + jnp.ceil(TRANSIENT_SHARE * periods))
 
 
-def ended(cell: Cell, event: Event, count: Lane, end: Lane) -> tuple[Int[AnyArray, "lane"], Mask]:
+def ended(cell: Cell, event: Event, count: Lane, end: Lane) -> tuple[Int[AnyArray, " lane"], Mask]:
     """Say how cells end by an event, and which do.
 
     Args:
@@ -67,7 +67,7 @@ def chaotic(cell: Cell) -> Mask:
     return growth(cell) > _CHAOS
 
 
-def out_of_steps(cell: Cell, taken: Int[AnyArray, "lane"], end: Lane) -> Mask:
+def out_of_steps(cell: Cell, taken: Int[AnyArray, " lane"], end: Lane) -> Mask:
     """Say which cells have taken more steps than any motion needs."""
     return cell.running & (taken.astype(cell.count.dtype) > _STEPS * (end + 1))
 

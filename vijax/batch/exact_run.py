@@ -77,7 +77,7 @@ class _Reached(NamedTuple):
     """Where runs of the exact engine are, and which of them are over."""
 
     state: State
-    over: Bool[AnyArray, "row"]
+    over: Bool[AnyArray, " row"]
 
 
 def _set_out(pair: ImpactPair, u0, v0, t0) -> _Reached:

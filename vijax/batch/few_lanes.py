@@ -60,22 +60,22 @@ def chain(
     return lax.fori_loop(0, length, link, (rows[:, 0], results))[1][:chains]
 
 
-def _lane(count: Int[Array, ""]) -> Int[Array, "lane"]:
+def _lane(count: Int[Array, ""]) -> Int[Array, " lane"]:
     return jnp.arange(LANES, dtype=count.dtype)
 
 
-def _whole(rows: Float[Array, "row *column"]) -> Float[Array, "whole *column"]:
+def _whole(rows: Float[Array, " row *column"]) -> Float[Array, " whole *column"]:
     """Repeat the last row until all lanes have one."""
     more = -rows.shape[0] % LANES
     return jnp.pad(rows, ((0, more), *((0, 0),) * (rows.ndim - 1)), mode="edge") if more else rows
 
 
-def _unloaded(program: Program, there: Bool[Array, "lane"], end: Carry) -> Float[Array, "lane out"]:
+def _unloaded(program: Program, there: Bool[Array, " lane"], end: Carry) -> Float[Array, "lane out"]:
     found = program.kernel(program.unload)(end)
     return jnp.where(there[:, None], found, jnp.zeros_like(found))
 
 
-def _flown(program: Program, there: Bool[Array, "lane"], rows: Float[Array, "lane in"]) -> Carry:
+def _flown(program: Program, there: Bool[Array, " lane"], rows: Float[Array, "lane in"]) -> Carry:
     """Fly the cells of the lanes that have one to their end, in rounds as many lanes do: steps, answers, a review."""
     cell = jnp.where(there, 0, -1).astype(jnp.int32)
 
@@ -93,7 +93,7 @@ def _flown(program: Program, there: Bool[Array, "lane"], rows: Float[Array, "lan
     return lax.while_loop(lambda carry: (there & ~program.done(carry)).any(), advance, start)
 
 
-def _serve(program: Program, service: Service, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+def _serve(program: Program, service: Service, cell: Int[Array, " lane"], carry: Carry) -> Carry:
     """Give all easy lanes their second try; if there is none, a hard one the careful try."""
     easy, hard = asking(program, AtWork(cell, carry))
     turn, first = easy.any(), jnp.argmax(hard)

@@ -100,7 +100,7 @@ def _held_steps(program: Program, laid: registers.Layout, at: AtWork) -> registe
         at = up_to(partial(_step, program), _UNREVIEWED, lambda at: 2 * able(program, at) > half_of_them, at)
         return at._replace(carry=program.review(at.carry))
 
-    def all_steps(cell: Int[Array, "lane"], carry: Carry, _: registers.Each) -> Carry:
+    def all_steps(cell: Int[Array, " lane"], carry: Carry, _: registers.Each) -> Carry:
         at = AtWork(cell, carry)
         first = _moving(program, at)
         return up_to(some_steps, program.steps // _UNREVIEWED, lambda at: 2 * _moving(program, at) > first, at).carry
@@ -123,7 +123,7 @@ def _held_answer(
     """Do what `_answer` does, in one kernel."""
     service: Any = program.service
 
-    def answered(attempt: Any, lane: Int[Array, "lane"], some: Carry, on_single_lanes: registers.Each) -> Carry:
+    def answered(attempt: Any, lane: Int[Array, " lane"], some: Carry, on_single_lanes: registers.Each) -> Carry:
         answers = on_single_lanes(attempt, service.request(some))
         return service.settle(some, answers, jnp.ones(lane.shape, bool))
 

@@ -30,14 +30,14 @@ _TILES = (64, 512, 4096)  # balls of one compiled call: a few sizes, so that few
 class Next(eqx.Module):
     """The next impact of every ball; `real` is false where none comes or the contact never ends."""
 
-    t: Float[AnyArray, "ball"]  # onset, since phase 0 of the period in which the ball set out
-    side: Float[AnyArray, "ball"]
-    v_in: Float[AnyArray, "ball"]
-    v_out: Float[AnyArray, "ball"]
-    duration: Float[AnyArray, "ball"]
-    depth: Float[AnyArray, "ball"]
-    work: Float[AnyArray, "ball"]
-    real: Bool[AnyArray, "ball"]
+    t: Float[AnyArray, " ball"]  # onset, since phase 0 of the period in which the ball set out
+    side: Float[AnyArray, " ball"]
+    v_in: Float[AnyArray, " ball"]
+    v_out: Float[AnyArray, " ball"]
+    duration: Float[AnyArray, " ball"]
+    depth: Float[AnyArray, " ball"]
+    work: Float[AnyArray, " ball"]
+    real: Bool[AnyArray, " ball"]
 
 
 def _quick_answer(plan: Plan, request: advance.Request) -> advance.Answer:
@@ -64,7 +64,7 @@ def _careful_answer(plan: Plan, request: advance.Request) -> advance.Answer:
 
 @lru_cache(maxsize=16)
 def _compiled(answer: Callable, plan: Plan):
-    def work(request: advance.Request) -> tuple[Next, Bool[AnyArray, "ball"]]:
+    def work(request: advance.Request) -> tuple[Next, Bool[AnyArray, " ball"]]:
         given = answer(plan, request)
         impact, real = given.event.impact, given.event.real & ~given.event.permanent
         onset = 2 * impact.onset_n + impact.onset_t
@@ -85,9 +85,9 @@ def _answered(work: Callable, requests: advance.Request) -> tuple[Next, np.ndarr
 
 def next_impacts(
     pair: ImpactPair,
-    side: Float[AnyArray, "ball"],
-    speed: Float[AnyArray, "ball"],
-    t: Float[AnyArray, "ball"],
+    side: Float[AnyArray, " ball"],
+    speed: Float[AnyArray, " ball"],
+    t: Float[AnyArray, " ball"],
     *,
     ground: Ground,
 ) -> Next:

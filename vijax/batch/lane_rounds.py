@@ -40,12 +40,12 @@ class Service(NamedTuple):
         settle: Carry, an answer for every lane, which lanes were served -> carry; unsure answers mark the lane hard.
     """
 
-    declined: Callable[[Carry], Bool[Array, "lane"]]
-    hard: Callable[[Carry], Bool[Array, "lane"]]
+    declined: Callable[[Carry], Bool[Array, " lane"]]
+    hard: Callable[[Carry], Bool[Array, " lane"]]
     request: Callable[[Carry], Any]
     second: Callable[[Any], Any]
     careful: Callable[[Any], Any]
-    settle: Callable[[Carry, Any, Bool[Array, "lane"]], Carry]
+    settle: Callable[[Carry, Any, Bool[Array, " lane"]], Carry]
 
 
 class Program(NamedTuple):
@@ -68,8 +68,8 @@ class Program(NamedTuple):
     load: Callable[[Float[Array, "row in"]], Carry]
     step: Callable[[Carry], Carry]
     review: Callable[[Carry], Carry]
-    stopped: Callable[[Carry], Bool[Array, "lane"]]
-    done: Callable[[Carry], Bool[Array, "lane"]]
+    stopped: Callable[[Carry], Bool[Array, " lane"]]
+    done: Callable[[Carry], Bool[Array, " lane"]]
     unload: Callable[[Carry], Float[Array, "row out"]]
     service: Service | None = None
     steps: int = STEPS
@@ -85,19 +85,19 @@ class Program(NamedTuple):
 class LaneBatch(NamedTuple):
     """A few lanes of many: which they are, how many are real, and for every lane whether it is among them."""
 
-    members: Int[Array, "width"]
+    members: Int[Array, " width"]
     real: Int[Array, ""]
-    chosen: Bool[Array, "lane"]
+    chosen: Bool[Array, " lane"]
 
 
 @shared
-def batch_of(mask: Bool[Array, "lane"], width: int) -> LaneBatch:
+def batch_of(mask: Bool[Array, " lane"], width: int) -> LaneBatch:
     """Find the first `width` lanes of a mask."""
     members, chosen = first(mask, width)
     return LaneBatch(members, chosen.sum(dtype=jnp.int32), chosen)
 
 
-def take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
+def take(carry: Carry, rows: Int[Array, " width"]) -> Carry:
     """Take some lanes."""
     return jax.tree.map(lambda leaf: leaf[rows], carry)
 
@@ -105,11 +105,11 @@ def take(carry: Carry, rows: Int[Array, "width"]) -> Carry:
 class AtWork(NamedTuple):
     """The lanes: the cell each one works on (-1: idle), and where that cell is."""
 
-    cell: Int[Array, "lane"]
+    cell: Int[Array, " lane"]
     carry: Carry
 
 
-def declined(program: Program, at: AtWork) -> Bool[Array, "lane"]:
+def declined(program: Program, at: AtWork) -> Bool[Array, " lane"]:
     """Find the lanes that wait for an answer."""
     return program.service.declined(at.carry) & (at.cell >= 0) if program.service else jnp.zeros_like(at.cell, bool)
 
@@ -135,7 +135,7 @@ def run_round(program: Program, width: int, at: AtWork) -> Carry:
     return program.kernel(program.review)(carry)
 
 
-def steps(program: Program, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+def steps(program: Program, cell: Int[Array, " lane"], carry: Carry) -> Carry:
     """Take up to so many steps; fewer once half the lanes that set out wait for something else."""
 
     def some_steps(at: AtWork) -> AtWork:
@@ -152,21 +152,21 @@ def _goes_on(program: Program, at_first: Int[Array, ""], at: AtWork) -> Bool[Arr
     return 2 * able(program, at) > at_first
 
 
-def _service_due(program: Program, width: int, cell: Int[Array, "lane"], carry: Carry) -> Bool[Array, ""]:
+def _service_due(program: Program, width: int, cell: Int[Array, " lane"], carry: Carry) -> Bool[Array, ""]:
     """Say whether a batch of easy or of hard lanes is full, or half the lanes at work can go no further without one."""
     at = AtWork(cell, carry)
     easy, hard = (lanes.sum() for lanes in asking(program, at))
     return (easy >= width) | (hard >= width) | ((easy + hard > 0) & (easy + hard >= able(program, at)))
 
 
-def asking(program: Program, at: AtWork) -> tuple[Bool[Array, "lane"], Bool[Array, "lane"]]:
+def asking(program: Program, at: AtWork) -> tuple[Bool[Array, " lane"], Bool[Array, " lane"]]:
     """Find the lanes that wait for their second try, and those that wait for the careful one."""
     waits = declined(program, at)
     hard = program.service.hard(at.carry) if program.service else waits
     return waits & ~hard, waits & hard
 
 
-def _serve(program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry) -> Carry:
+def _serve(program: Program, service: Service, width: int, cell: Int[Array, " lane"], carry: Carry) -> Carry:
     """Give a batch of easy lanes their second try, or a batch of hard ones the careful try."""
     easy, batch, requests = program.kernel(partial(_ask, program, service, width))(cell, carry)
     answers = lax.cond(easy, program.kernel(service.second), program.kernel(service.careful), requests)
@@ -174,7 +174,7 @@ def _serve(program: Program, service: Service, width: int, cell: Int[Array, "lan
 
 
 def _ask(
-    program: Program, service: Service, width: int, cell: Int[Array, "lane"], carry: Carry
+    program: Program, service: Service, width: int, cell: Int[Array, " lane"], carry: Carry
 ) -> tuple[Bool[Array, ""], LaneBatch, Any]:
     """Say whose turn it is, easy lanes or hard ones, and what they request."""
     easy, hard = asking(program, AtWork(cell, carry))

@@ -132,7 +132,7 @@ def _refill(program: Program, table: _Table, width: int, queue: _Queue) -> _Queu
     return lax.while_loop(lambda queue: due(queue.at, queue.waiting), one_batch, queue)
 
 
-def _free(program: Program, table: _Table, at: AtWork, waiting: Int[Array, ""]) -> Bool[Array, "lane"]:
+def _free(program: Program, table: _Table, at: AtWork, waiting: Int[Array, ""]) -> Bool[Array, " lane"]:
     """Find the lanes whose cell is done, or that wait for their first."""
     return jnp.where(at.cell >= 0, program.done(at.carry), waiting < table.real)
 
@@ -171,7 +171,7 @@ class _Chains(NamedTuple):
     """The loop's state: lanes, the link of its chain that each one works on (-1: none is left), the results."""
 
     carry: Carry
-    link: Int[Array, "lane"]
+    link: Int[Array, " lane"]
     results: Float[Array, "lane link out"]
 
 

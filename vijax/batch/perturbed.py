@@ -28,8 +28,8 @@ from vijax.runtime import checks
 
 def averages(
     pair: ImpactPair,
-    start: tuple[Float[Array, "ball"], Float[Array, "ball"]],
-    length: Float[Array, "variant"],
+    start: tuple[Float[Array, " ball"], Float[Array, " ball"]],
+    length: Float[Array, " variant"],
     device: Harvester,
     count: Int[Array, ""],
     periods: Float[Array, ""],

@@ -59,7 +59,7 @@ def start_of(pair: ImpactPair, u0, v0, t0) -> State:
     return State(u0, v0, t, n.astype(jnp.int32), exact.start_mode(pair, u0, v0, t).astype(jnp.int32))
 
 
-def no_impact(filled: Int[AnyArray, "row"], states: State, periods: Int[AnyArray, ""]) -> Bool[AnyArray, "row"]:
+def no_impact(filled: Int[AnyArray, " row"], states: State, periods: Int[AnyArray, ""]) -> Bool[AnyArray, " row"]:
     """Return True for runs without an impact, unless the ball is in contact at the end of the last period.
 
     A contact that began before the run is no impact, but a ball that stays in it has met a wall.

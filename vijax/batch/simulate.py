@@ -37,10 +37,10 @@ class Scale(eqx.Module):
     kappa = 1, so its length is divided by kappa. Metres per second per unit of speed: likewise.
     """
 
-    length: Float[AnyArray, "cell"]
-    speed: Float[AnyArray, "cell"]
-    length_variant: Float[AnyArray, "variant"]
-    speed_variant: Float[AnyArray, "variant"]
+    length: Float[AnyArray, " cell"]
+    speed: Float[AnyArray, " cell"]
+    length_variant: Float[AnyArray, " variant"]
+    speed_variant: Float[AnyArray, " variant"]
 
 
 @lru_cache(maxsize=32)
@@ -86,8 +86,8 @@ def _check(pair: ImpactPair, device: Harvester, scale: Scale, starts: dict[str, 
 @door
 def summarise(
     pair: ImpactPair,
-    u0: Float[AnyArray, "cell"],
-    v0: Float[AnyArray, "cell"],
+    u0: Float[AnyArray, " cell"],
+    v0: Float[AnyArray, " cell"],
     scale: Scale,
     device: Harvester,
     *,

@@ -29,13 +29,13 @@ class _Recording(eqx.Module):
 
     carry: Any
     impacts: Impact
-    filled: Int[AnyArray, "lane"]
+    filled: Int[AnyArray, " lane"]
     states: State
     broken: Array
     lost: Array
 
 
-def _recording(room: Room, carry: Any, like: Float[AnyArray, "lane"]) -> _Recording:
+def _recording(room: Room, carry: Any, like: Float[AnyArray, " lane"]) -> _Recording:
     """Make empty records."""
     lanes = like.shape[0]
     whole = jnp.zeros(lanes, jnp.int32)
@@ -51,7 +51,7 @@ def _recording(room: Room, carry: Any, like: Float[AnyArray, "lane"]) -> _Record
     return _Recording(carry, impacts, whole, State(x, x, x, k, n), no, no)
 
 
-def _write(table: Any, row: Any, index: Int[AnyArray, "lane"], wanted: Array) -> Any:
+def _write(table: Any, row: Any, index: Int[AnyArray, " lane"], wanted: Array) -> Any:
     """Write a row into a table [lane, width] at each lane's index, where wanted."""
 
     def write(leaf, value):

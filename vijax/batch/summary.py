@@ -31,23 +31,23 @@ class Summary(eqx.Module):
     P: Float[AnyArray, "cell variant"] | None  # J per half period
     P_stderr: Float[AnyArray, "cell variant"] | None
     energy_ratio: Float[AnyArray, "cell variant"] | None  # largest E_j/W_j
-    deepest: Float[AnyArray, "cell"] | None
-    deepest_left: Float[AnyArray, "cell"] | None  # the greatest at the left wall; None where both walls are equal
-    deepest_right: Float[AnyArray, "cell"] | None
-    fastest: Float[AnyArray, "cell"]
-    asymmetry: Float[AnyArray, "cell"] | None  # mean of v_in over the greatest speed
-    period: Int[AnyArray, "cell"]
-    impacts_left: Int[AnyArray, "cell"]
-    impacts_right: Int[AnyArray, "cell"]
-    impacts_per_period: Float[AnyArray, "cell"]
-    restitution: Float[AnyArray, "cell"]
-    restitution_left: Float[AnyArray, "cell"]
-    restitution_right: Float[AnyArray, "cell"]
-    contact_time: Float[AnyArray, "cell"]
-    contact_fraction: Float[AnyArray, "cell"]
-    lyapunov: Float[AnyArray, "cell"] | None
-    periods_run: Float[AnyArray, "cell"]
-    status: Int[AnyArray, "cell"]
+    deepest: Float[AnyArray, " cell"] | None
+    deepest_left: Float[AnyArray, " cell"] | None  # the greatest at the left wall; None where both walls are equal
+    deepest_right: Float[AnyArray, " cell"] | None
+    fastest: Float[AnyArray, " cell"]
+    asymmetry: Float[AnyArray, " cell"] | None  # mean of v_in over the greatest speed
+    period: Int[AnyArray, " cell"]
+    impacts_left: Int[AnyArray, " cell"]
+    impacts_right: Int[AnyArray, " cell"]
+    impacts_per_period: Float[AnyArray, " cell"]
+    restitution: Float[AnyArray, " cell"]
+    restitution_left: Float[AnyArray, " cell"]
+    restitution_right: Float[AnyArray, " cell"]
+    contact_time: Float[AnyArray, " cell"]
+    contact_fraction: Float[AnyArray, " cell"]
+    lyapunov: Float[AnyArray, " cell"] | None
+    periods_run: Float[AnyArray, " cell"]
+    status: Int[AnyArray, " cell"]
     handover: Handover | None = None  # chained cells alone have one
 
 
@@ -167,7 +167,7 @@ def _means(t: Tally, hits: Lane, still: Mask) -> dict[str, Any]:
     }
 
 
-def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, "lane"], Lane | None]:
+def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, " lane"], Lane | None]:
     """Tell the period (0: chaos, -1: neither known), status and Lyapunov exponent."""
     attractor, none = cell.candidate is not None, e.still | e.failed
     period, lyapunov = jnp.where(e.periodic, e.prime, -1.0), None

@@ -37,11 +37,11 @@ class Look(NamedTuple):
         memory: What a look near here starts from; any arrays with a leading axis.
     """
 
-    value: Float[Array, "start"]
+    value: Float[Array, " start"]
     gradient: Float[Array, "start variable"]
     margins: Float[Array, "start constraint"]
     slopes: Float[Array, "start constraint variable"]
-    there: Bool[Array, "start"]
+    there: Bool[Array, " start"]
     memory: Any
 
 
@@ -70,12 +70,12 @@ class Climb(eqx.Module):
 
     z: Float[Array, "start variable"]
     seen: Look
-    weight: Float[Array, "start"]
+    weight: Float[Array, " start"]
     step: Float[Array, "start variable"]
-    pace: Float[Array, "start"]
-    going: Bool[Array, "start"]
-    lost: Bool[Array, "start"]
-    evaluations: Int[Array, "start"]
+    pace: Float[Array, " start"]
+    going: Bool[Array, " start"]
+    lost: Bool[Array, " start"]
+    evaluations: Int[Array, " start"]
     path: Float[Array, "evaluation start variable"]
     heights: Float[Array, "evaluation start"]
     iteration: Int[Array, ""]
@@ -177,7 +177,7 @@ def _advance(task: _Task, c: Climb) -> Climb:
     )
 
 
-def _lighter(settings: DesignSettings, weight: Float[Array, "start"]) -> Float[Array, "start"]:
+def _lighter(settings: DesignSettings, weight: Float[Array, " start"]) -> Float[Array, " start"]:
     """Give the next weight of the barrier: w <- min(0.1 w, w**1.5) by default, and not below the last."""
     falls = jnp.minimum(settings.barrier_factor * weight, weight**settings.barrier_power)
     return jnp.maximum(falls, settings.last_barrier)
@@ -193,17 +193,17 @@ def _view(task: _Task, z, near, memory) -> Look:
     )
 
 
-def _little(c: Climb) -> Bool[Array, "start"]:
+def _little(c: Climb) -> Bool[Array, " start"]:
     """Return which starts have converged for the weight of their barrier: the step promises less than it weighs."""
     return c.going & _inside(c.seen) & (c.pace * _promised(c) < c.weight)
 
 
-def _promised(c: Climb) -> Float[Array, "start"]:
+def _promised(c: Climb) -> Float[Array, " start"]:
     """Compute what the whole step gains by the slope."""
     return (c.step * _gradient(c.seen, c.weight)).sum(axis=1)
 
 
-def _turns(task: _Task, c: Climb, trial: Look, better: Bool[Array, "start"]) -> Bool[Array, "start"]:
+def _turns(task: _Task, c: Climb, trial: Look, better: Bool[Array, " start"]) -> Bool[Array, " start"]:
     """Return which starts have converged for the weight of their barrier although their trial is refused.
 
     There are two cases. Beyond an edge there is no point: the barrier may have pushed the start there, and with less of
@@ -229,16 +229,16 @@ def _aim(task: _Task, z, seen: Look, weight, state):
     return _shortened(task, -step, seen), after
 
 
-def converged(c: Climb) -> Bool[Array, "start"]:
+def converged(c: Climb) -> Bool[Array, " start"]:
     """Say which ended with a barrier that no longer matters; the others stalled, or lost their point."""
     return c.weight <= _CONVERGED
 
 
-def _inside(seen: Look) -> Bool[Array, "start"]:
+def _inside(seen: Look) -> Bool[Array, " start"]:
     return seen.margins.min(axis=1) > 0
 
 
-def _gradient(seen: Look, weight: Float[Array, "start"]) -> Float[Array, "start variable"]:
+def _gradient(seen: Look, weight: Float[Array, " start"]) -> Float[Array, "start variable"]:
     """Differentiate value and barrier; where a constraint is violated, the margin that lacks most."""
     safe = jnp.where(seen.margins > 0, seen.margins, 1.0)
     barrier = weight[:, None] * (seen.slopes / safe[..., None]).sum(axis=1)
@@ -247,7 +247,7 @@ def _gradient(seen: Look, weight: Float[Array, "start"]) -> Float[Array, "start 
     return jnp.nan_to_num(choose(_inside(seen), seen.gradient + barrier, least))
 
 
-def _higher(c: Climb, trial: Look) -> Bool[Array, "start"]:
+def _higher(c: Climb, trial: Look) -> Bool[Array, " start"]:
     """Say whether a trial is better: admissible and higher, or nearer to admissible where none is yet."""
     before, after = (seen.margins.min(axis=1) for seen in (c.seen, trial))
     gain = trial.value - c.seen.value

@@ -126,12 +126,12 @@ class _FlownBalls(NamedTuple):
 
     width: Float[Array, ""]
     x: Float[Array, "ball variable"]
-    real: Bool[Array, "ball"]
+    real: Bool[Array, " ball"]
     failed: Bool[Array, ""]
-    P: Float[Array, "ball"]
-    P_stderr: Float[Array, "ball"]
+    P: Float[Array, " ball"]
+    P_stderr: Float[Array, " ball"]
     fixed: Float[Array, "ball quantity"]
-    periodic: Bool[Array, "ball"]
+    periodic: Bool[Array, " ball"]
 
 
 @door

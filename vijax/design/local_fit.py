@@ -27,7 +27,7 @@ class LocalFit(NamedTuple):
 
 
 def local_fit(
-    x: Float[Array, "ball variable"], y: Float[Array, "ball column"], some: Bool[Array, "ball"], second: bool
+    x: Float[Array, "ball variable"], y: Float[Array, "ball column"], some: Bool[Array, " ball"], second: bool
 ) -> LocalFit:
     """Fit columns by polynomials of the offsets, over some of the balls."""
     terms = [jnp.ones_like(x[:, 0]), *x.T]

@@ -48,7 +48,7 @@ class Scene(eqx.Module):
     """What every start shares."""
 
     factors: Float[Array, "node constant"]
-    weights: Float[Array, "node"]
+    weights: Float[Array, " node"]
     names: tuple[str, ...] = eqx.field(static=True)
     scattered: tuple[str, ...] = eqx.field(static=True)
     objective: str = eqx.field(static=True)
@@ -62,7 +62,7 @@ class _SeenOrbit(NamedTuple):
     """Of one device: logarithm of the objective and of the margins, and the knots."""
 
     value: Float[Array, ""]
-    margins: Float[Array, "constraint"]
+    margins: Float[Array, " constraint"]
     knots: Float[Array, "impact 3"]
 
 

@@ -61,8 +61,8 @@ class Forcing(eqx.Module):
     """
 
     orders: tuple[int, ...] = eqx.field(static=True)
-    cosines: Float[AnyArray, "order"]
-    sines: Float[AnyArray, "order"]
+    cosines: Float[AnyArray, " order"]
+    sines: Float[AnyArray, " order"]
     samples: Float[AnyArray, "sample"] | None
     count: Values
     looped: bool = eqx.field(static=True)

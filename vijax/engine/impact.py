@@ -39,4 +39,4 @@ class Arrival(NamedTuple):
     flight: Lane
     speed: Lane
     side: Lane
-    sure: Bool[AnyArray, "lane"]
+    sure: Bool[AnyArray, " lane"]

@@ -118,7 +118,7 @@ def course(of: Contact, stay: Scalar, steps: int = STEPS, w: Scalar | float = 0.
     at, before, weights = jax.tree.map(partial(jnp.asarray, dtype=of.speed.dtype), _stages())
     x, h = jnp.linspace(0.0, 1.0, steps + 1, dtype=of.speed.dtype), 1 / steps
 
-    def moved(y: Held, weights: Float[Array, "stage"], rates: Held) -> Held:
+    def moved(y: Held, weights: Float[Array, " stage"], rates: Held) -> Held:
         return jax.tree.map(lambda y, rates: y + h * (weights * rates).sum(), y, rates)
 
     def one(y: Held, begin: Scalar) -> tuple[Held, Held]:

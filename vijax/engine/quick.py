@@ -31,8 +31,8 @@ class Quick(NamedTuple):
 
     impact: LaneImpact
     arrival: Arrival
-    sure: Bool[Array, "lane"]  # whether all of the impact is certain
-    never: Bool[Array, "lane"]  # will meet no wall again
+    sure: Bool[Array, " lane"]  # whether all of the impact is certain
+    never: Bool[Array, " lane"]  # will meet no wall again
 
 
 class _Onset(NamedTuple):
@@ -54,7 +54,7 @@ class _Exit(NamedTuple):
     depth: Lane | None
     work: Lane | None
     contact: tuple[Lane, Lane, Lane, Lane]
-    sure: Bool[Array, "lane"]
+    sure: Bool[Array, " lane"]
 
 
 def _rebound(wall: RigidWall, flight: Flight, onset: _Onset, deep: bool, work: bool) -> _Exit:

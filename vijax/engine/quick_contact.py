@@ -43,7 +43,7 @@ class Exit(eqx.Module):
 class _Guess(eqx.Module):
     """Where to look for crest and exit of a contact that ends long before pi/omega1."""
 
-    short: Bool[Array, "lane"]
+    short: Bool[Array, " lane"]
     hop: Lane
     rise: Lane
 
@@ -73,7 +73,7 @@ def _guess(wall: SoftWall, entry: ContactEntry) -> _Guess:
 @shared
 def touch(
     wall: SoftWall, flight: Flight, deep: bool, work: bool, begins: Lane
-) -> tuple[Exit, Lane | None, Bool[Array, "lane"]]:
+) -> tuple[Exit, Lane | None, Bool[Array, " lane"]]:
     """Find the exit, the greatest depth if asked for, and whether w rises once and falls once until then for certain.
 
     The exit is sought from pi/omega1, where the free contact ends and exp(-zeta pi/omega1) = r by calibration, so that
@@ -128,7 +128,7 @@ def touch(
     return Exit(duration, out, turned_sine, turned_cosine, decay, drive), depth, sure
 
 
-def free_reference(wall: SoftWall, short: Bool[Array, "lane"]) -> Reference:
+def free_reference(wall: SoftWall, short: Bool[Array, " lane"]) -> Reference:
     """Describe where the free contact ends, or its half where the contact is short: no sine is needed there."""
     none = jnp.zeros_like(wall.span)
     middle = Reference(0.5 * wall.span, wall.cos_middle, wall.sin_middle, none, none + 1, wall.root_r)
@@ -151,7 +151,7 @@ def _turned(entry: ContactEntry, at: ContactState, turn: Lane) -> tuple[Lane, La
 @shared
 def _rough_exit(
     wall: SoftWall, entry: ContactEntry, guess: _Guess, course: ContactCourse
-) -> tuple[Lane, Bool[Array, "lane"]]:
+) -> tuple[Lane, Bool[Array, " lane"]]:
     """Find the exit from the course's reference in single precision, and whether the polynomials held on the way.
 
     One step from the reference, one from there. What that misses its Taylor polynomial tells, without another sine. On

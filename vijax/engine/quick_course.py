@@ -80,7 +80,7 @@ def at_reference(wall: SoftWall, course: ContactCourse) -> ContactState:
     return _derivatives(wall, w, rate, course.force_cos, -PI * course.force_sin, zero, one, course.decay)
 
 
-def in_reach(wall: SoftWall, s: Lane) -> Bool[Array, "lane"]:
+def in_reach(wall: SoftWall, s: Lane) -> Bool[Array, " lane"]:
     """Say whether the polynomials of `motion` hold at s."""
     return (jnp.maximum(wall.omega1, PI) * jnp.abs(s) < REACH) & (wall.zeta * jnp.abs(s) < EXP_REACH)
 

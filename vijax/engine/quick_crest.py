@@ -41,9 +41,9 @@ class FirstCrest(eqx.Module):
     s: Lane  # The time, counted from that of the free contact's crest.
     push: Lane  # w'' there,
     jerk: Lane  # and w'''.
-    first: Bool[Array, "lane"]  # It is found, and w rises until then.
-    only: Bool[Array, "lane"]  # w has no other extremum before the exit.
-    highest: Bool[Array, "lane"] | None  # w does not come back to this height; None where that is not needed.
+    first: Bool[Array, " lane"]  # It is found, and w rises until then.
+    only: Bool[Array, " lane"]  # w has no other extremum before the exit.
+    highest: Bool[Array, " lane"] | None  # w does not come back to this height; None where that is not needed.
 
 
 class _Place(eqx.Module):
@@ -55,10 +55,10 @@ class _Place(eqx.Module):
     push: Lane  # w'',
     jerk: Lane  # w''',
     drive: Lane  # and the derivative of the forcing.
-    converged: Bool[Array, "lane"]
+    converged: Bool[Array, " lane"]
 
 
-def _stays_below(wall: SoftWall, at: _Place) -> Bool[Array, "lane"]:
+def _stays_below(wall: SoftWall, at: _Place) -> Bool[Array, " lane"]:
     """Say whether w stays below its first crest as long as its steady response S ebbs, however often it swings.
 
     Call w - S the swing, of the envelope a at the crest, where its rate is -S'. A time y later S has gained S' y at
@@ -94,7 +94,7 @@ def _stays_below(wall: SoftWall, at: _Place) -> Bool[Array, "lane"]:
     return falls & (swing > (1 + DOUBT) * higher)
 
 
-def _rough_place(wall: SoftWall, course: ContactCourse, hop: tuple[Bool[Array, "lane"], Lane], rounds: int) -> _Place:
+def _rough_place(wall: SoftWall, course: ContactCourse, hop: tuple[Bool[Array, " lane"], Lane], rounds: int) -> _Place:
     """Find where w' is zero, from the free contact's crest or that of a hop; 0 where the polynomials do not hold.
 
     As `quick_contact` finds the exit, in so many rounds; the contact at the crest is that of Taylor polynomials, too.
@@ -134,7 +134,11 @@ def _toward(wall: SoftWall, at: ContactState) -> Lane:
 
 @shared
 def rough_crest(
-    wall: SoftWall, entry: ContactEntry, hop: tuple[Bool[Array, "lane"], Lane], end: tuple[Lane, Lane, Lane], deep: bool
+    wall: SoftWall,
+    entry: ContactEntry,
+    hop: tuple[Bool[Array, " lane"], Lane],
+    end: tuple[Lane, Lane, Lane],
+    deep: bool,
 ) -> FirstCrest:
     """Find when w is largest, from the free contact's time, and whether it has no other extremum before the exit.
 
@@ -190,7 +194,7 @@ def rough_crest(
     return FirstCrest(at.s, at.push, at.jerk, first, only & inside, highest)
 
 
-def deepest(wall: SoftWall, entry: ContactEntry, crest: FirstCrest) -> tuple[Lane, Bool[Array, "lane"]]:
+def deepest(wall: SoftWall, entry: ContactEntry, crest: FirstCrest) -> tuple[Lane, Bool[Array, " lane"]]:
     """Find the greatest depth, and whether the rough time of the crest was close enough for it.
 
     The depth is stationary: with Newton's step h to the crest, w + h w'/2 misses it by terms of h^3 alone.

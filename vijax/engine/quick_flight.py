@@ -47,16 +47,16 @@ class Flight(eqx.Module):
     wall: Lane  # +-1 in the frame
     sine: Lane
     cosine: Lane
-    sure: Bool[Array, "lane"]
-    never: Bool[Array, "lane"]
+    sure: Bool[Array, " lane"]
+    never: Bool[Array, " lane"]
 
 
 class _Stretch(NamedTuple):
     """The monotone stretch of a flight that ends at a wall, in the frame where the ball starts downwards."""
 
-    up: Bool[Array, "lane"]  # whether it ends at the upper wall
+    up: Bool[Array, " lane"]  # whether it ends at the upper wall
     periods: Lane  # before it begins
-    doubt: Bool[Array, "lane"]  # an extremum on the way may be a graze or a miss
+    doubt: Bool[Array, " lane"]  # an extremum on the way may be a graze or a miss
 
 
 def _stretch(half: Lane, u: Lane, p: Lane, ahead: Lane, cosine: Lane) -> _Stretch:

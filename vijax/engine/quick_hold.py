@@ -28,17 +28,17 @@ class Lasting(eqx.Module):
         pull: w'' is not below -pull from then on.
     """
 
-    ebbs: Bool[Array, "lane"]
-    dips: Bool[Array, "lane"]
+    ebbs: Bool[Array, " lane"]
+    dips: Bool[Array, " lane"]
     since: Lane
     pull: Lane
 
     @property
-    def long(self) -> Bool[Array, "lane"]:
+    def long(self) -> Bool[Array, " lane"]:
         """Say whether it outlasts the free one."""
         return self.ebbs | self.dips
 
-    def ends(self, duration: Lane, out: Lane) -> Bool[Array, "lane"]:
+    def ends(self, duration: Lane, out: Lane) -> Bool[Array, " lane"]:
         """Say whether a zero of w, met at a speed, is the first: by Taylor's formula w is positive before it."""
         way = duration - self.since
         return (self.dips | (way > 0)) & (2 * out > self.pull * way)

@@ -64,7 +64,7 @@ class SoftWall(eqx.Module):
     steep: Lane  # The least speed at which w' is sure to have its first zero near the free crest.
     lift: Lane  # The least -w'' at the crest, per bound of f', that keeps w' negative until the exit.
     long_lift: Lane | None  # Likewise for a longer way; None on level ground.
-    usable: Bool[AnyArray, "lane"]
+    usable: Bool[AnyArray, " lane"]
     incline: Incline | None  # None on level ground.
     ebb: Ebb | None  # None where contacts that outlast the free one by far are not looked for.
 

@@ -131,7 +131,7 @@ def _in_units(device: Harvester, names: tuple[str, ...], wall: Walls, z: Array, 
 def _guessed(
     device: Harvester,
     shaking: Shaking,
-    z: Float[Array, "unknown"],
+    z: Float[Array, " unknown"],
     rows: Intervals,
     *,
     names: tuple[str, ...],
@@ -150,7 +150,7 @@ def _guessed(
 def _said(
     device: Harvester,
     shaking: Shaking,
-    z: Float[Array, "unknown"],
+    z: Float[Array, " unknown"],
     rows: tuple[Intervals, Motion],
     *,
     names: tuple[str, ...],

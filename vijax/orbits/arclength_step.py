@@ -31,8 +31,8 @@ _ASTRAY = 1.0  # A correction of half a period, or of a whole side of the plane,
 class PathEquations(NamedTuple):
     """The equations of a path: what is missing to an orbit and to what holds besides, with all derivatives."""
 
-    gap: Float[Array, "equation"]
-    condition: Float[Array, "condition"]
+    gap: Float[Array, " equation"]
+    condition: Float[Array, " condition"]
     ring: Ring
 
 
@@ -81,8 +81,8 @@ class _Corrected(NamedTuple):
     And whether the point is on the path.
     """
 
-    y: Float[Array, "unknown"]
-    tangent: Float[Array, "unknown"]
+    y: Float[Array, " unknown"]
+    tangent: Float[Array, " unknown"]
     size: Float[Array, ""]
     corrections: Int[Array, ""]
     arrived: Bool[Array, ""]

@@ -146,7 +146,7 @@ class CurvePath(eqx.Module):
         rise, v = flights.flown(pair, leave.t, -leave.side * leave.speed, y[-3])
         return jnp.stack([0.5 * (leave.side - self.touch.wall) * pair.d + rise, v])
 
-    def _loads(self, device: Harvester, z, pair: ImpactPair, knots) -> Float[Array, "impact"]:
+    def _loads(self, device: Harvester, z, pair: ImpactPair, knots) -> Float[Array, " impact"]:
         """Compute penetrations over their limit, or harvested energies over those given to the membrane."""
         x = self.places(z)
         own = {name: x[index] for index, name in enumerate(self.along) if name in ("A", "omega")}

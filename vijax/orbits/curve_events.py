@@ -122,7 +122,9 @@ def curve_events(
 
 
 @jitted
-def _coefficients(pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]) -> Float[Array, "orbit"]:
+def _coefficients(
+    pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]
+) -> Float[Array, " orbit"]:
     return jax.vmap(cubic_coefficient)(pair, sequence, knots)
 
 

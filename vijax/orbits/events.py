@@ -166,7 +166,7 @@ def kind_of(arc: Arc, event: BranchEvent, neighbours: np.ndarray, settings: Cont
     return "fold"
 
 
-def _repeats(orbit: Orbit, tolerance: float) -> Bool[np.ndarray, "orbit"]:
+def _repeats(orbit: Orbit, tolerance: float) -> Bool[np.ndarray, " orbit"]:
     """Return True for orbits that consist of several turns."""
     return repetition.turns(orbit.sequence, orbit.knots, tolerance) > 1
 

@@ -26,7 +26,7 @@ class Between(NamedTuple):
     """What happens between the onsets: the clearances, and when each contact on a soft wall is deepest (else NaN)."""
 
     clearance: Clearance
-    deepest: Float[Array, "impact"]
+    deepest: Float[Array, " impact"]
 
 
 def _contacts(pair: ImpactPair, departure: shooting.Departure, knots: Knots, real):
@@ -44,8 +44,8 @@ def between(
     knots: Knots,
     departure: shooting.Departure | None = None,
     /,
-    touch: Float[Array, "impact"] | None = None,
-    split: Float[Array, "impact"] | None = None,
+    touch: Float[Array, " impact"] | None = None,
+    split: Float[Array, " impact"] | None = None,
 ) -> Between:
     """Find the motion of an orbit between its onsets; clearances are the least of all impacts, NaN if not known.
 
@@ -108,9 +108,9 @@ class NearTurns(NamedTuple):
     The room is inf where there is no impact.
     """
 
-    room: Float[Array, "impact"]
-    when: Float[Array, "impact"]
-    wall: Float[Array, "impact"]
+    room: Float[Array, " impact"]
+    when: Float[Array, " impact"]
+    wall: Float[Array, " impact"]
 
 
 def flight_turns(pair: ImpactPair, sequence: Sequence, knots: Knots) -> NearTurns:

@@ -120,7 +120,7 @@ def multiplier_conditions(pair: ImpactPair, sequence: Sequence, knots: Knots) ->
     return MultiplierConditions(weight * (1 + product) - trace, weight * (1 + product) + trace)
 
 
-def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, "orbit"]) -> Complex[Array, "orbit 2"]:
+def floquet(around: Float[Array, "orbit 2 2"], mirrored: Bool[Array, " orbit"]) -> Complex[Array, "orbit 2"]:
     """Find the eigenvalues of monodromy matrices, the larger modulus first; squared where an orbit closes half way.
 
     The smaller of two real ones is the determinant over the larger: their difference would cancel.

@@ -27,9 +27,9 @@ from vijax.runtime.programs import jitted
 class Counts(NamedTuple):
     """Label of orbits: impacts on the left, on the right, per forcing periods; n:m/pT."""
 
-    left: Int[np.ndarray, "orbit"]
-    right: Int[np.ndarray, "orbit"]
-    period: Int[np.ndarray, "orbit"]
+    left: Int[np.ndarray, " orbit"]
+    right: Int[np.ndarray, " orbit"]
+    period: Int[np.ndarray, " orbit"]
 
 
 @door
@@ -75,7 +75,7 @@ def _hits(full: Orbit) -> Impact:
 
 
 @door
-def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, "orbit"]:
+def power(orbit: Orbit, device: Harvester) -> Float[AnyArray, " orbit"]:
     """Compute the energy harvested per half forcing period [J]; NaN unless the orbit's status is OK.
 
     Args:

@@ -54,11 +54,11 @@ class Orbit(WithStatus):
     depth: Float[AnyArray, "orbit impact"]
     work: Float[AnyArray, "orbit impact"]
     multipliers: Complex[AnyArray, "orbit 2"]
-    residual: Float[AnyArray, "orbit"]
-    status: Int[AnyArray, "orbit"]
+    residual: Float[AnyArray, " orbit"]
+    status: Int[AnyArray, " orbit"]
 
     @property
-    def count(self) -> Int[AnyArray, "orbit"]:
+    def count(self) -> Int[AnyArray, " orbit"]:
         """Count the impacts until it closes (half of all where it closes onto its mirror image)."""
         return self.sequence.real.sum(axis=-1, dtype=jnp.int32)
 
@@ -176,7 +176,7 @@ def to_least_period(orbit: Orbit) -> Orbit:
     return tiles.arrays(jax.tree.map(lambda old, new: tiles.replaced(rows[same], old, new[same]), host, turn))
 
 
-def mean_turn(orbit: Orbit, number: Int[np.ndarray, "orbit"]) -> Orbit:
+def mean_turn(orbit: Orbit, number: Int[np.ndarray, " orbit"]) -> Orbit:
     """Solve for one turn of orbits that consist of so many equal turns, from the mean of these."""
     host = jax.tree.map(np.asarray, orbit)
     sequence, guess = guessed(*repetition.mean_turn(host.sequence, host.knots, number))
@@ -223,7 +223,7 @@ class Claim(NamedTuple):
     """Knots that are to be an orbit's, and where the ball is to fly from the end of every contact."""
 
     knots: Float[AnyArray, "orbit impact 3"]
-    residual: Float[AnyArray, "orbit"]
+    residual: Float[AnyArray, " orbit"]
     multipliers: Complex[AnyArray, "orbit 2"]
     departure: shooting.Departure
     phase: Float[AnyArray, "orbit impact"]
@@ -243,7 +243,7 @@ def _measured(pair: ImpactPair, sequence: Sequence, knots: Float[AnyArray, "orbi
 
 
 def _claim(
-    pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, "orbit"], departure: shooting.Departure
+    pair: ImpactPair, sequence: Sequence, knots, residual: Float[AnyArray, " orbit"], departure: shooting.Departure
 ) -> Claim:
     around = jax.vmap(multipliers.monodromy)(pair, sequence, knots)
     return Claim(

@@ -26,7 +26,7 @@ _STEPS_APART = 6.0
 _CUBIC_APART = 4.0
 
 
-def turns(sequence: Sequence, knots: Any, tolerance: float | Float[np.ndarray, "orbit"]) -> Int[np.ndarray, "orbit"]:
+def turns(sequence: Sequence, knots: Any, tolerance: float | Float[np.ndarray, " orbit"]) -> Int[np.ndarray, " orbit"]:
     """Count the turns of each orbit: the largest number of equal parts that agree to a tolerance.
 
     A turn lasts whole forcing periods. Of an orbit closed onto its mirror image it lasts an odd number of half periods,
@@ -59,7 +59,7 @@ def turns(sequence: Sequence, knots: Any, tolerance: float | Float[np.ndarray, "
 
 
 def mean_turn(
-    sequence: Sequence, knots: Any, number: Int[np.ndarray, "orbit"]
+    sequence: Sequence, knots: Any, number: Int[np.ndarray, " orbit"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return side, span, mirrored and knots of the mean turn of orbits that consist of so many.
 
@@ -82,14 +82,14 @@ def mean_turn(
     return np.where(first, side, 0)[:, :width], span / number, mirrored, mean[:, :width]
 
 
-def most_apart(residual: Float[np.ndarray, "orbit"]) -> Float[np.ndarray, "orbit"]:
+def most_apart(residual: Float[np.ndarray, " orbit"]) -> Float[np.ndarray, " orbit"]:
     """Bound the difference between two turns that are one by the residual alone, whatever the multipliers are."""
     return _CUBIC_APART * np.cbrt(np.maximum(residual, _EPS))
 
 
 def apart(
-    pair: ImpactPair, sequence: Sequence, knots: Any, residual: Float[np.ndarray, "orbit"]
-) -> Float[np.ndarray, "orbit"]:
+    pair: ImpactPair, sequence: Sequence, knots: Any, residual: Float[np.ndarray, " orbit"]
+) -> Float[np.ndarray, " orbit"]:
     """Bound the difference between two turns that are one by the accuracy to which Newton has found the orbit.
 
     The accuracy is the residual times the norm of the inverse Jacobian. Beside a flip, where the multiplier is

@@ -56,9 +56,9 @@ class LinearisedEquations(NamedTuple):
     With w' at the end of every contact, which they hold, and its derivatives in the knot.
     """
 
-    gap: Float[Array, "equation"]
+    gap: Float[Array, " equation"]
     ring: Ring
-    rate: Float[Array, "impact"]
+    rate: Float[Array, " impact"]
     rate_slope: Float[Array, "impact 3"]
 
     @property
@@ -128,7 +128,7 @@ def joined_knots(sequence: Sequence, knots: Knots, onward: Knots | None = None):
     return side, jnp.where(real, wall, -1).astype(knots.dtype), jnp.where(real[:, None], joined, blank)
 
 
-def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None = None) -> Float[Array, "3*impact"]:
+def gap(pair: ImpactPair, sequence: Sequence, knots: Knots, onward: Knots | None = None) -> Float[Array, " 3*impact"]:
     """Compute what is missing to an orbit: zero at one, and where there is no impact.
 
     Args:
@@ -177,13 +177,13 @@ def linearise(pair: ImpactPair, sequence: Sequence, knots: Knots, *moved: Impact
 class Departure(NamedTuple):
     """The end of each contact and the impact that is to follow it."""
 
-    side: Float[AnyArray, "impact"]
-    speed: Float[Array, "impact"]  # away from the wall
-    t: Float[Array, "impact"]
-    next_side: Float[Array, "impact"]
-    next_t: Float[Array, "impact"]
-    next_speed: Float[Array, "impact"]
-    next_stay: Float[Array, "impact"]
+    side: Float[AnyArray, " impact"]
+    speed: Float[Array, " impact"]  # away from the wall
+    t: Float[Array, " impact"]
+    next_side: Float[Array, " impact"]
+    next_t: Float[Array, " impact"]
+    next_speed: Float[Array, " impact"]
+    next_stay: Float[Array, " impact"]
 
 
 def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
@@ -193,7 +193,7 @@ def departures(pair: ImpactPair, sequence: Sequence, knots: Knots) -> Departure:
     return _departure(sequence, knots, rate)
 
 
-def _departure(sequence: Sequence, knots: Knots, rate: Float[Array, "impact"]) -> Departure:
+def _departure(sequence: Sequence, knots: Knots, rate: Float[Array, " impact"]) -> Departure:
     side, wall, joined = joined_knots(sequence, knots)
     t, _, stay, next_t, next_speed = joined.T
     return Departure(side, -rate, t + stay, wall, next_t, next_speed, knots[_following(sequence)[0], 2])
@@ -201,7 +201,7 @@ def _departure(sequence: Sequence, knots: Knots, rate: Float[Array, "impact"]) -
 
 def measured(
     pair: ImpactPair, sequence: Sequence, knots: Float[Array, "orbit impact 3"]
-) -> tuple[Float[Array, "orbit"], Departure]:
+) -> tuple[Float[Array, " orbit"], Departure]:
     """Find the largest violation of the equations by each of a batch, and how its contacts end.
 
     Where the ends of contacts are uncertain by more than the violation, it is that.
@@ -245,21 +245,21 @@ class _Descent(eqx.Module):
 
     knots: Float[Array, "orbit impact 3"]
     step: Float[Array, "orbit impact 3"]
-    missing: Float[Array, "orbit"]
+    missing: Float[Array, " orbit"]
     rate: Float[Array, "orbit impact"]
-    pace: Float[Array, "orbit"]
-    going: Bool[Array, "orbit"]
-    arrived: Bool[Array, "orbit"]
+    pace: Float[Array, " orbit"]
+    going: Bool[Array, " orbit"]
+    arrived: Bool[Array, " orbit"]
     iteration: Int[Array, ""]
 
     @property
-    def arrives(self) -> Bool[Array, "orbit"]:
+    def arrives(self) -> Bool[Array, " orbit"]:
         """Say of which searches the last step is to be taken."""
         close = (self.missing < jnp.inf) & ((_size(self.step) <= _LAST_STEP) | (self.missing < _FLOOR))
         return ~self.going & ~self.arrived & close
 
 
-def _size(step: Float[Array, "orbit impact 3"]) -> Float[Array, "orbit"]:
+def _size(step: Float[Array, "orbit impact 3"]) -> Float[Array, " orbit"]:
     return jnp.abs(step).max(axis=(1, 2))
 
 
@@ -279,7 +279,7 @@ class Solution(NamedTuple):
     """
 
     knots: Float[Array, "orbit impact 3"]
-    residual: Float[Array, "orbit"]
+    residual: Float[Array, " orbit"]
     departure: Departure
 
 

@@ -58,9 +58,9 @@ class Steady(WithStatus):
     P: Float[Array, ""]
     power: Float[Array, ""]
     speed: Float[Array, ""]
-    depth: Float[Array, "impact"]
-    energy: Float[Array, "impact"]
-    work: Float[Array, "impact"]
+    depth: Float[Array, " impact"]
+    energy: Float[Array, " impact"]
+    work: Float[Array, " impact"]
     multiplier: Float[Array, ""]
     condition: Float[Array, ""]
     clearance: Clearance
@@ -301,7 +301,7 @@ def yields(device: Harvester, pair: ImpactPair, sequence: Sequence, knots: Knots
     return depth, energy.harvested_energy(device.at(side), depth), work
 
 
-def image_energy(device: Harvester, sequence: Sequence, depth, harvested) -> Float[Array, "impact"]:
+def image_energy(device: Harvester, sequence: Sequence, depth, harvested) -> Float[Array, " impact"]:
     """Compute what the mirror image of each impact of an orbit closed half way harvests, at the other wall.
 
     Of orbits closed in full, which have no images, it is what the impact itself does.

@@ -14,7 +14,7 @@ from vijax.runtime.context import door
 
 
 @door
-def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, "orbit"]:
+def symmetric(orbit: Orbit, tolerance: float = 1e-9) -> Bool[np.ndarray, " orbit"]:
     """Say whether each orbit, run through once, is its own mirror image half a span later."""
     host, tolerance = jax.tree.map(np.asarray, check_orbit(orbit)), checks.positive("tolerance", tolerance)
     count = host.count
@@ -75,7 +75,7 @@ def unfolded(orbit: Orbit) -> Orbit:
     return _unfolded(orbit, mirrored) if mirrored.any() else orbit
 
 
-def _unfolded(orbit: Orbit, twice: Bool[np.ndarray, "orbit"]) -> Orbit:
+def _unfolded(orbit: Orbit, twice: Bool[np.ndarray, " orbit"]) -> Orbit:
     """Append the second turn to the first where asked."""
     host = jax.tree.map(np.asarray, orbit)
     count, width = host.count[:, None], host.knots.shape[1]

@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 
-def solve(matrix: Float[Array, "row row"], right: Float[Array, "row *side"]) -> Float[Array, "row *side"]:
+def solve(matrix: Float[Array, "row row"], right: Float[Array, " row *side"]) -> Float[Array, " row *side"]:
     """Solve matrix x = right for one right side, or a column each; differentiable in both, every order, both ways.
 
     Gauss and Jordan's elimination with partial pivoting; not finite where the matrix is singular.
@@ -22,7 +22,7 @@ def solve(matrix: Float[Array, "row row"], right: Float[Array, "row *side"]) -> 
     )
 
 
-def _eliminated(matrix: Float[Array, "row row"], right: Float[Array, "row *side"]) -> Float[Array, "row *side"]:
+def _eliminated(matrix: Float[Array, "row row"], right: Float[Array, " row *side"]) -> Float[Array, " row *side"]:
     size = right.shape[0]
     index = jnp.arange(size, dtype=jnp.int32)
     wide = jnp.concatenate([matrix, right.reshape(size, -1)], axis=1)

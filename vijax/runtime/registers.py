@@ -91,9 +91,9 @@ def unpack(laid: Layout, tables: Tables) -> Any:
 
 
 def stay(
-    work: Callable[[Int[Array, "lane"], T, Each], T],
+    work: Callable[[Int[Array, " lane"], T, Each], T],
     laid: Layout,
-    number: Int[Array, "lane"],
+    number: Int[Array, " lane"],
     tables: Tables,
     real: Int[Array, ""] | None = None,
     *,

@@ -28,7 +28,7 @@ class Ring(NamedTuple):
 
     here: Float[Array, "block row row"]
     there: Float[Array, "block row row"]
-    closes: Bool[Array, "block"]
+    closes: Bool[Array, " block"]
     beside: Float[Array, "block row border"]
     below: Float[Array, "equation block row"]
     corner: Float[Array, "equation border"]

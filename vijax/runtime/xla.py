@@ -224,7 +224,7 @@ def each(work: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-def first(mask: Bool[Array, "lane"], width: int) -> tuple[Int[Array, "width"], Bool[Array, "lane"]]:
+def first(mask: Bool[Array, " lane"], width: int) -> tuple[Int[Array, " width"], Bool[Array, " lane"]]:
     """Find the first `width` lanes of a mask, any others where there are fewer; and for every lane whether it is one.
 
     By rank. On the CPU that is summed by doubling, ten times faster than XLA's, and looked up by binary search, as no
@@ -241,7 +241,7 @@ def first(mask: Bool[Array, "lane"], width: int) -> tuple[Int[Array, "width"], B
     return jnp.zeros(width, jnp.int32).at[place].set(lane, mode="drop", unique_indices=True), chosen
 
 
-def _summed(count: Int[Array, "lane"]) -> Int[Array, "lane"]:
+def _summed(count: Int[Array, " lane"]) -> Int[Array, " lane"]:
     reach = 1
     while reach < count.size:
         count = count + jnp.pad(count[:-reach], (reach, 0))
@@ -263,7 +263,7 @@ def in_blocks(work: Callable[[T], T], lanes: T) -> T:
     return jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[2:]), lax.map(work, blocks))
 
 
-def put(lanes: T, part: T, rows: Int[Array, "row"], count: Int[Array, ""]) -> T:
+def put(lanes: T, part: T, rows: Int[Array, " row"], count: Int[Array, ""]) -> T:
     """Replace the first `count` of these rows of `lanes` by those of `part`.
 
     On the CPU one after another: a scatter cannot be in a kernel, and what is merged otherwise is read in every lane.
