@@ -92,4 +92,4 @@ def test_a_plane_of_parameters_counts_attractors(folder, capsys):
 
 def test_what_only_looks_like_an_attractor_says_for_how_long(folder, capsys):
     assert script.main(["--d", "0.3", "--kappa", "3", "--periods", "200", "--v0=-0.6:0.6:5", "--out", "a.zarr"]) == 0
-    assert re.search(r"^aperiodic .* looked for 200 periods$", capsys.readouterr().out, re.MULTILINE)
+    assert re.search(r"^aperiodic .* looked for (200|800|3200) periods$", capsys.readouterr().out, re.MULTILINE)

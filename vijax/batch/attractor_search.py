@@ -17,7 +17,7 @@ from vijax.batch.cell import (
     Settings,
     blank_tally,
 )
-from vijax.batch.cell_end import chaotic, failed, last_period
+from vijax.batch.cell_end import chaotic, failed, few_impacts, last_period
 from vijax.batch.chain import depart
 from vijax.batch.recurrence import LATE_PERIOD, MAX_PERIOD, grain, late_recurrence, recurrence
 from vijax.batch.verdict import Correction, Verdict, correction, judge
@@ -109,7 +109,7 @@ def review(plan: Plan, settings: Settings, cell: Cell) -> Cell:
     cell = _back_to_search(plan, cell, verdict.bad, 10 * grain(settings))
     spent = stopped & ~start & ~judged & ~lost & _undecided(plan, cell)
     cell = _search_on(settings, cell, spent)
-    few = stopped & ~start & ~judged & ~lost & ~spent & _lacks_impacts(plan, cell)
+    few = stopped & ~start & ~judged & ~lost & ~spent & _lacks_impacts(plan, settings, cell)
     cell = _run_on(plan, settings, cell, few)
     goes_on = start | verdict.again | verdict.follow | verdict.approached | verdict.bad | spent | few
     confirmed = verdict.good | verdict.follow
@@ -199,10 +199,11 @@ def _undecided(plan: Plan, cell: Cell) -> Mask:
     return waits & (not plan.chained)
 
 
-def _lacks_impacts(plan: Plan, cell: Cell) -> Mask:
+def _lacks_impacts(plan: Plan, settings: Settings, cell: Cell) -> Mask:
     """Return which aperiodic cells have too few impacts in their window, and may run on."""
-    candidate, impacts = present(cell.candidate), cell.tally.left + cell.tally.right
-    lacks = (cell.status == Status.OK) & ~candidate.tracing & chaotic(cell) & (impacts < ENOUGH_IMPACTS)
+    candidate, window = present(cell.candidate), last_period(plan, settings, cell) - cell.since
+    few = few_impacts(cell, window, ENOUGH_IMPACTS)
+    lacks = (cell.status == Status.OK) & ~candidate.tracing & chaotic(cell) & few
     return lacks & (candidate.stretch < LONGEST_RUN) & (not plan.chained)
 
 

@@ -31,8 +31,8 @@ TRANSIENT_SHARE = 0.25
 BATCHES = 24
 # An aperiodic cell whose window has fewer impacts than this runs on. Of 1,194 random cells with d from 0.03 to 10
 # averages are off by more than three standard errors in 6.8 % of the windows where none runs on, in 0.9 % where those
-# with fewer than 100 impacts do, in 0.5 % with 200.
-ENOUGH_IMPACTS = 200
+# with fewer than 100 impacts do, in 0.5 % with 200. Their windows have 300 periods, as `periods` is 400 by default.
+ENOUGH_IMPACTS, FULL_WINDOW = 200, 300.0
 # It runs on by this factor: as the window leaves out a share of 1/4 of the run, the periods that were run become the
 # transient of the longer window. It does so until the run is so many times as long as `periods`.
 RUN_ON, LONGEST_RUN = 1 / TRANSIENT_SHARE, 16.0

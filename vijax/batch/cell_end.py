@@ -8,7 +8,7 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Int
 
-from vijax.batch.cell import TANGENT_SCALE, TRANSIENT_SHARE, Cell, Event, Lane, Mask, Plan, Settings
+from vijax.batch.cell import FULL_WINDOW, TANGENT_SCALE, TRANSIENT_SHARE, Cell, Event, Lane, Mask, Plan, Settings
 from vijax.model.records import Status
 from vijax.runtime.arrays import AnyArray, present
 
@@ -37,6 +37,17 @@ def last_period(plan: Plan, settings: Settings, cell: Cell) -> Lane:
     late = jnp.where(c.late, _LATE_SHARE * settings.periods, 0.0)
     periods = settings.periods * c.stretch
     return jnp.maximum(periods + late, since + jnp.ceil(TRANSIENT_SHARE * periods))
+
+
+def few_impacts(cell: Cell, window: Lane, enough: int) -> Mask:
+    """Return which cells have fewer than `enough` impacts in their window, or in shorter ones a share of those.
+
+    Args:
+        cell: Lanes.
+        window: Its length in periods.
+        enough: How many impacts a window of `FULL_WINDOW` periods, or more, must have.
+    """
+    return cell.tally.left + cell.tally.right < enough * jnp.minimum(window / FULL_WINDOW, 1.0)
 
 
 def ended(cell: Cell, event: Event, count: Lane, end: Lane) -> tuple[Int[AnyArray, " lane"], Mask]:

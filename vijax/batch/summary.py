@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from vijax.batch.cell import Cell, Harvest, Lane, Mask, Plan, Settings, Tally, batch_length
-from vijax.batch.cell_end import chaotic, failed, growth, last_period
+from vijax.batch.cell_end import chaotic, failed, few_impacts, growth, last_period
 from vijax.batch.chain import Handover, hand_over
 from vijax.engine.impact import Ball
 from vijax.model.records import Status
@@ -21,7 +21,7 @@ _LONG_FLIGHT = 12.0
 # Part of the expected variance by long flights that is added to the one of batch means, which has some of it: with
 # 0.25, 0.5 and 1 the differences of averages over their standard errors have a root mean square of 0.99, 0.86 and 0.73.
 _UNMET_SHARE = 0.5
-# An aperiodic cell with fewer impacts in its window has the status FEW_IMPACTS.
+# An aperiodic cell with fewer impacts in its window has the status FEW_IMPACTS; see `few_impacts`.
 _FEWEST_IMPACTS = 100
 
 
@@ -178,7 +178,7 @@ def _kind(cell: Cell, e: _End) -> tuple[Lane, Int[AnyArray, " lane"], Lane | Non
         if attractor:
             chaos = chaotic(cell)
             period = jnp.where(e.periodic, e.prime, jnp.where(chaos, 0.0, -1.0))
-            few = cell.tally.left + cell.tally.right < _FEWEST_IMPACTS
+            few = few_impacts(cell, e.window, _FEWEST_IMPACTS)
             status = jnp.where(few & ~e.periodic & ~none, Status.FEW_IMPACTS, status)
             status = jnp.where(~e.periodic & ~chaos & ~none, Status.SLOW, status)
             status = jnp.where(e.periodic & present(cell.candidate).late, Status.CONVERGING, status)

@@ -161,7 +161,7 @@ def average(
         device: Constants, one number each; those under differentiation traced.
         balls: How many fly, even, 32 to 1,048,576. Programs are compiled for powers of two.
         periods: Forcing periods of a ball that settles on no orbit; the first quarter is left out of its averages. A
-            ball with fewer than 200 impacts runs on, to 4 or 16 times as many.
+            ball with fewer than 200 impacts, or two in three periods, runs on, to 4 or 16 times as many.
         spread: How far balls are spread to either side, in logarithms (gamma: as it is), 0.2 at most. Errors of slopes
             fall as it grows, what the quadratic leaves out grows with its square, and with it what windows it meets.
         seed: Of offsets and starts drawn at random; unless given they lie on lattices, which are more even.

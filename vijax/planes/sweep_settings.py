@@ -39,7 +39,8 @@ class SweepSettings:
         periods: Forcing periods to run, 400: at most (until="attractor"), or after the transient (until="window").
             A cell without a verdict then goes on for up to three times as many, less sceptical of what recurs, and if
             that finds its orbit its status is CONVERGING; else SLOW. An aperiodic cell with fewer than 200 impacts in
-            its window runs on, to 4 or 16 times as many periods; with fewer than 100 then it has FEW_IMPACTS.
+            its window (below 300 periods: two in three periods) runs on, to 4 or 16 times as many periods; with fewer
+            than half of that then it has FEW_IMPACTS.
         until: "attractor" stops when the attractor is certain and measures over whole periods of it; "window" drops
             `transient` periods and measures over the next `periods`.
         transient: Forcing periods to drop before a window, 0. The search for an attractor begins at once and takes
