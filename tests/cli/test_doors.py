@@ -162,6 +162,17 @@ def test_the_next_estimate_is_by_the_pace_of_the_last_run(kept, watched):
     assert estimate.of(inclined).seconds == pytest.approx(5e-7 * 400 * 10**6)
 
 
+def test_a_run_of_few_cells_leaves_no_pace(kept, monkeypatch):
+    """It takes as long as its slowest cell: 25 cells of an inclined device made a map of 128 x 128 take four days."""
+    clock = iter([0.0, 1.0, 20.0])
+    monkeypatch.setattr(estimate.time, "perf_counter", lambda: next(clock))
+    watch = estimate.Watch(lambda *_: None)
+    for done in (0, 13, 25):
+        watch(done, 25)
+    watch.keep(planned(5))
+    assert not (kept / "paces.json").exists()
+
+
 def test_a_run_is_not_lost_with_its_pace(kept, watched):
     (kept / "closed").touch()
     jax.config.update("jax_compilation_cache_dir", str(kept / "closed"))

@@ -26,8 +26,9 @@ _SLOW = {"exact level": 2e-7, "exact inclined": 5e-7, "ode": 2e-5, "rk4": 2e-6}
 # The same where the excitation is not the sine, of 64 samples a period.
 _DRIVEN = 4e-6
 _RECORDED = 1e-5  # The same where the impacts of cells are recorded.
-# Seconds that a run lasts for its pace to be kept: a shorter one says little of a long one.
-_LEAST_TIMED = 2.0
+# Seconds that a run lasts, and cells that it has, for its pace to be kept: a shorter one says little of a long one, and
+# few cells take as long as the slowest of them.
+_LEAST_TIMED, _LEAST_CELLS = 2.0, 256
 _UNITS = (("days", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
 _FILE = "paces.json"
 
@@ -92,7 +93,7 @@ class Watch:
         # In the first entry nothing is done yet, and programs are compiled until the second.
         (first, began), (last, ended) = self._seen[1], self._seen[-1]
         file = _file()
-        if file is not None and ended - began >= _LEAST_TIMED:
+        if file is not None and ended - began >= _LEAST_TIMED and last - first >= _LEAST_CELLS:
             pace = (ended - began) / ((last - first) * planned.starts * _periods(planned))
             with suppress(OSError):  # a folder may be closed or full; what was run is worth more than how fast it ran
                 file.parent.mkdir(parents=True, exist_ok=True)
