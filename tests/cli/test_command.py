@@ -287,6 +287,7 @@ def completed(monkeypatch, capsys):
                 "design",
                 "explore",
                 "docs",
+                "doctor",
             ],
         ),
         ("vijax b", ["basins", "branch"]),

@@ -23,6 +23,7 @@ _PAGES = {
     "design": "design",
     "explore": "explore",
     "docs": "docs",
+    "doctor": "doctor",
 }
 
 

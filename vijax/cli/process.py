@@ -57,14 +57,14 @@ def import_beside(module: str) -> None:
 def run(command: click.Command, arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code, with which `leave` ends the process.
 
-    It is 0; 1 if what is to be written could not be; 2 after bad input, when nothing was run; 130 after Ctrl-C and 143
-    after SIGTERM.
+    It is 0; 1 if what is to be written could not be, or `doctor` found a wrong number; 2 after bad input, when nothing
+    was run; 130 after Ctrl-C and 143 after SIGTERM.
     """
     _open_streams()
     with signals.handled():
         try:
             with _compiler_told(), _warnings_told():
-                command.main(arguments, standalone_mode=False)
+                return command.main(arguments, standalone_mode=False) or 0
         except click.ClickException as error:
             click.echo(f"error: {error.format_message()}", err=True)
             return 2
@@ -76,7 +76,6 @@ def run(command: click.Command, arguments: list[str] | None = None) -> int:
             where = f" ({error.filename})" if error.filename else ""
             click.echo(f"error: {error.strerror or error}{where}; {_kept(error)}", err=True)
             return 1
-        return 0
 
 
 def stop(note: str) -> NoReturn:

@@ -129,6 +129,12 @@ def trim(folder: Path, most: int) -> None:
         left -= size
 
 
+def content(folder: Path) -> tuple[int, int]:
+    """Return how many files of programs a folder holds, and how many bytes they have together."""
+    sizes = [about.st_size for _, about in _programs(folder)]
+    return len(sizes), sum(sizes)
+
+
 def _programs(folder: Path) -> list[tuple[Path, os.stat_result]]:
     """List the entries of a folder that have names of programs, with what the disk says of each, links as links."""
     found = []
