@@ -264,7 +264,7 @@ class _Seen(NamedTuple):
 
     def orbits(self, impacts: int) -> Met:
         """Find the periodic attractors of at most so many impacts."""
-        return self.motions(self.found.closing(impacts))
+        return self.motions(self.found.closing(impacts, self.places.owner))
 
     def restless(self, impacts: int) -> Met:
         """Find what was met that is no such orbit."""

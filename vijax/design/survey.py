@@ -69,10 +69,17 @@ class Survey(NamedTuple):
         pair, ended = jax.tree.map(lambda x: x[some], (self.pair, self.ended))
         return flown(pair, ended, impacts)._replace(cell=some)
 
-    def closing(self, impacts: int) -> np.ndarray:
-        """Find the cells that met such an attractor first."""
+    def closing(self, impacts: int, owner: np.ndarray | int = 0) -> np.ndarray:
+        """Find the cells that met such an attractor first.
+
+        Args:
+            impacts: The most impacts of an attractor.
+            owner: Index of the device of every cell. Devices of equal pairs differ in their limits or their energies,
+                so each of them has its own attractors.
+        """
         some = np.flatnonzero(self._closing(impacts))
-        return some[_distinct(*jax.tree.map(lambda x: x[some], (self.pair, self.ended)))]
+        owners = np.broadcast_to(owner, self.longest.shape)
+        return some[_distinct(*jax.tree.map(lambda x: x[some], (owners, self.pair, self.ended)))]
 
     def restless(self, impacts: int) -> np.ndarray:
         """Find cells whose motion is no such orbit: chaos, not settled, or of too many periods or impacts.
@@ -170,13 +177,14 @@ def _ended(pair: ImpactPair, device: Harvester, starts: Starts, longest: int, pe
     return jax.tree.map(lambda *x: np.concatenate(x)[order], *parts)
 
 
-def _distinct(pair: ImpactPair, ended: Any) -> np.ndarray:
-    """Find the cells that met an attractor of their pair first; by impacts, greatest speed and depth."""
+def _distinct(owner: np.ndarray, pair: ImpactPair, ended: Any) -> np.ndarray:
+    """Find the cells that met an attractor of their device and pair first; by impacts, greatest speed and depth."""
     left, right = ended.impacts_left, ended.impacts_right
     swap = pair.symmetric & (right > left)
     measures = [np.round(np.log(x) / _SAME) for x in (ended.fastest, ended.deepest)]
     counts = ended.period, np.where(swap, right, left), np.where(swap, left, right)
-    _, first = np.unique(np.column_stack([*jax.tree.leaves(pair), *counts, *measures]), axis=0, return_index=True)
+    marks = np.column_stack([owner, *jax.tree.leaves(pair), *counts, *measures])
+    _, first = np.unique(marks, axis=0, return_index=True)
     return np.sort(first)
 
 
