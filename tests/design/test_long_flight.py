@@ -78,7 +78,7 @@ def proved(monkeypatch, motion, known=-math.inf, ahead=(1e-6,), box=(-np.inf, np
         state = np.resize(status[0], balls) if status else zero
         given = np.where(state == Status.NO_IMPACT, 0.0, P * one)
         still = np.where(state == Status.NO_IMPACT, 1, 0)
-        found = Averages(given, one, depth, left, 0.1 * one, one, still, zero, zero, state, one, end)
+        found = Averages(given, one, depth, left, 0.1 * one, 10 * one, one, still, zero, zero, state, one, end)
         return [Ensemble(np.zeros((balls, 1)), found, device)]
 
     monkeypatch.setattr(long_flight, "fly", flown)

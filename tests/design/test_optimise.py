@@ -31,6 +31,7 @@ from vijax.runtime.files import write_json
 FAST = Harvester(A=3.0, omega=10 * math.pi, V=1700.0)
 FAST = dataclasses.replace(FAST, s=0.2 * FAST.length_unit)
 PAPER = Harvester(s=0.2)
+CAREFUL = Harvester(s=0.2, energy_ratio_limit=0.05)
 # Of the small fast device, by the reference.
 KAPPA, ENERGY, DEPTH = 4.00713, 57.75761e-6, 6.026e-3
 
@@ -41,8 +42,8 @@ def kappa(optimum):
 
 @pytest.fixture(scope="module")
 def found():
-    """Both devices in one call; with `max_impacts` as low as here little is compiled."""
-    return optimise.optimise_all([FAST, PAPER], survey_points=128, starts=2, max_impacts=2, motion="periodic")
+    """The devices in one call; with `max_impacts` as low as here little is compiled."""
+    return optimise.optimise_all([FAST, PAPER, CAREFUL], survey_points=128, starts=2, max_impacts=2, motion="periodic")
 
 
 def test_devices_are_designed_in_groups_whose_balls_fit(monkeypatch):
@@ -108,6 +109,17 @@ def test_the_papers_device_is_held_by_the_penetration_limit(found):
     assert "penetration limit" in best.active[0]
     # It would gain by breaking it.
     assert best.gradient["omega0"] < -1
+
+
+def test_the_energy_ratio_limit_is_a_constraint_of_a_design(found):
+    best, state = found[2].best, found[2].best.state
+    assert float((state.energy / state.work).max()) == pytest.approx(CAREFUL.energy_ratio_limit, rel=1e-6)
+    assert (state.energy <= CAREFUL.energy_ratio_limit * state.work).all()
+    assert "energy ratio limit" in best.active[0]
+    assert best.height < found[1].best.height
+    said = "\n".join(lines(describe(found[2])))
+    assert "harvested at most 5 % of the energy that an impact gives, of 5 % allowed" in said
+    assert "held by: energy ratio limit" in said
 
 
 def test_every_optimum_is_admissible_attracting_and_what_a_simulation_says(found):
@@ -181,7 +193,7 @@ def test_tolerances_of_a_design(found):
 
 
 def test_optima_are_ranked_by_what_their_devices_give_whatever_their_motion(found):
-    fast, _ = found
+    fast = found[0]
     ranking = off_design.ranked(fast.optima, [Tolerance("omega0", 0.05)])
     means = [spread.mean for _, spread in ranking]
     assert means == sorted(means, reverse=True)
@@ -215,7 +227,7 @@ def test_a_report_says_which_devices_count_in_mean_and_worst(found):
 @pytest.mark.parametrize(
     ("depth", "ratio", "says"),
     [
-        (0.00593, 0.155, "beyond your penetration limit: P alone would choose s = 0.1 m"),
+        (0.00593, 0.155, "beyond your limits: P alone would choose s = 0.1 m"),
         (0.00593, 1.5, "not physical: P alone"),
         (0.007, 0.155, "not physical: P alone"),
     ],
@@ -480,7 +492,7 @@ def test_what_a_survey_met_says_what_to_do():
     nothing |= {"limit": "", "excess": 0.0, "slow": 0.0}
     for met, says in (
         ({"orbits": 3, "limit": "penetration limit", "excess": 0.5}, "the penetration limit stands everywhere"),
-        ({"orbits": 3}, "3 periodic orbits that break a constraint: widen the bounds or the penetration limit"),
+        ({"orbits": 3}, "3 periodic orbits that break a constraint: widen the bounds or the limits"),
         ({"orbits": 3, "admissible": 3}, "3 admissible orbits that led to no optimum"),
         ({"restless": 2}, "none of it admissible"),
         ({"held": 1.0}, "100 % of the starts on one wall for ever: raise A or lower beta"),

@@ -368,6 +368,8 @@ def test_admissibility_is_both_limits_at_once():
     assert not np.any(admissible(DEVICE, energy, work, depth * (1 + 1e-15)))
     np.testing.assert_array_equal(energy_ratio(energy, work), [1.0, 1.0, 1.1, 0.0, 1.0, jnp.nan])
     assert float(energy_ratio(1.0, -1.0)) == math.inf  # a rounded W below zero admits nothing
+    halved = dataclasses.replace(DEVICE, energy_ratio_limit=0.5)
+    np.testing.assert_array_equal(admissible(halved, jnp.array([0.5, 0.51]), jnp.ones(2), depth), [True, False])
 
 
 def test_single_precision_stays_single():

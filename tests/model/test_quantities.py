@@ -13,7 +13,7 @@ import pytest
 from vijax import HuntCrossley, Hyperelastic, sweep
 from vijax.cli import main as command
 from vijax.model import quantities, variables
-from vijax.model.device import Harvester, with_constants
+from vijax.model.device import LIMITS, Harvester, with_constants
 from vijax.model.pair import ImpactPair
 from vijax.orbits.parameter import MOVED
 from vijax.planes.axes import Axes, Parameters, parse_axis
@@ -34,7 +34,7 @@ def test_every_axis_and_every_constant_of_the_device_is_in_the_table():
     assert of_walls < set(AXES)
     assert set(QUANTITIES) == set(AXES) | set(CONSTANTS)
     given_only = {name for name, one in QUANTITIES.items() if one.given_only}
-    assert set(variables.NAMES) == set(QUANTITIES) - set(quantities.STARTS) - {"penetration_limit"} - given_only
+    assert set(variables.NAMES) == set(QUANTITIES) - set(quantities.STARTS) - set(LIMITS) - given_only
     assert set(MOVED) == set(PARAMETERS) - given_only
     assert all(name == one.name for name, one in QUANTITIES.items())
     with pytest.raises(TypeError, match=f"the axes are {', '.join(AXES)}"):
@@ -121,6 +121,7 @@ EDGES = {
     "gamma": ([0, -3.0, 1e30, np.int32(-7)], [np.inf, -np.inf, np.nan]),
     "C_T": ([0, 1e-9], [-1e-12, np.inf, np.nan]),
     "penetration_limit": ([1e-9, np.inf], [0, -1, np.nan]),
+    "energy_ratio_limit": ([1e-9, 1], [0, 1.0001, np.inf, np.nan]),
     "u0": ([0, -0.2], [np.inf, np.nan]),
 }
 

@@ -157,6 +157,12 @@ def test_from_the_command_line(tmp_path, monkeypatch, capsys):
     device = asked[0].planned.device
     assert (float(device.penetration_limit), float(device.V)) == (pytest.approx(0.004), 1700)
     np.testing.assert_allclose(asked[0].planned.cells.given["omega"], np.array([2, 6, 10]) * HZ, rtol=1e-14)
+    with pytest.raises(_StopError):
+        diagram_script.main(["--along", "d=0.1:0.2:3", "--penetration-limit", "4mm", "--energy-ratio-limit", "0.1"])
+    device = asked[1].planned.device
+    assert (float(device.penetration_limit), device.energy_ratio_limit) == (pytest.approx(0.004), 0.1)
+    assert diagram_script.main(["--energy-ratio-limit", "2"]) == 2
+    assert "energy_ratio_limit must lie in (0, 1]; got 2.0; 1 admits all energy" in capsys.readouterr().err
     assert diagram_script.main(["--set", "V=2mm"]) == 2
     assert "V must be in V" in capsys.readouterr().err
     with pytest.raises(_StopError):

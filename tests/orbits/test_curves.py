@@ -425,7 +425,7 @@ def test_impacts_at_a_limit_are_flown_as_deep(limited):
 @pytest.mark.long
 def test_a_limit_of_energy_holds_on_soft_walls_as_the_device_changes():
     """Along omega units of length and energy change as well; the impact map flies what is on the curve."""
-    device = Harvester(omega0=60.0, s=0.2)
+    device = Harvester(omega0=60.0, s=0.2, energy_ratio_limit=0.5)
     orbit = orbit_search.search(device.pair(), "RL", guesses=64)
     branches = switching.family(orbit[:1], "omega0", (20.0, 400.0), device=device, max_switches=0)
     points = [point for point in vijax.limit_points(branches, device=device) if point.kind == "energy limit"]

@@ -14,7 +14,7 @@ import xarray as xr
 
 from tests.helpers import stand_in
 from vijax.batch import simulate
-from vijax.model.device import Harvester
+from vijax.model.device import Harvester, told_device
 from vijax.model.laws import HuntCrossley
 from vijax.model.records import Status
 from vijax.planes import dataset, store_folder
@@ -300,6 +300,15 @@ def test_admissible_asks_for_energy_and_depth(monkeypatch):
         plan, {"energy_ratio": ratio, "deepest": np.array([0.0062, 0.001, 0.0064, 0.001]), "status": np.zeros(4, int)}
     )
     assert found["admissible"].values.tolist() == [True, False, False, False]
+
+
+def test_the_energy_ratio_limit_is_a_constraint_of_a_map_and_recorded(engine):
+    device = Harvester(energy_ratio_limit=0.2, penetration_limit=math.inf)
+    found = sweep(d=[0.1, 0.2, 0.3], kappa=1e-3, u0=0.0, device=device, outputs=["energy_ratio", "admissible"])
+    assert (found["energy_ratio"] > 0.2).values.tolist() == [False, True, True]
+    assert found["admissible"].values.tolist() == [True, False, False]
+    assert found.attrs["harvester_energy_ratio_limit"] == 0.2
+    assert told_device(found.attrs).energy_ratio_limit == 0.2
 
 
 def test_ctrl_c_drops_the_waiting_tiles(engine, monkeypatch):

@@ -12,8 +12,9 @@ from typing import Any, get_args
 import click
 
 from vijax.cli.kinds import Choice, NewFile
+from vijax.cli.page import ConstantOption
 from vijax.model.choices import Motion, Objective
-from vijax.model.quantities import AXES, Quantity, of_both_walls, synonyms
+from vijax.model.quantities import AXES, QUANTITIES, Quantity, of_both_walls, synonyms
 from vijax.planes.sweep_settings import SweepSettings, choices
 
 VALUES = (
@@ -54,9 +55,13 @@ def _help(axis: Quantity, default: str) -> str:
 
 
 def device_options() -> list[click.Parameter]:
-    """Make the option for constants of the device that are no axes."""
+    """Make the options for what the device has besides axes: the limits of admissible impacts, and any constant."""
+    limits = [
+        ConstantOption([f"--{name.replace('_', '-')}"], metavar="VALUE", help=_help(QUANTITIES[name], default))
+        for name, default in (("penetration_limit", "R0"), ("energy_ratio_limit", "1"))
+    ]
     text = "any other constant of the device"
-    return [click.Option(["--set", "constants"], multiple=True, metavar="NAME=VALUE", help=text)]
+    return [*limits, click.Option(["--set", "constants"], multiple=True, metavar="NAME=VALUE", help=text)]
 
 
 def setting(name: str, text: str, kind: Any = None, of: type[SweepSettings] = SweepSettings) -> click.Parameter:

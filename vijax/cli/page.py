@@ -2,11 +2,16 @@
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import click
 
 Sections = Mapping[str, Sequence[click.Parameter]]
 """Options under the title that help shows them by."""
+
+
+class ConstantOption(click.Option):
+    """An option that gives one field of the device: `--energy-ratio-limit 0.1` is `--set energy_ratio_limit=0.1`."""
 
 
 class Page(click.Command):
@@ -30,6 +35,13 @@ class Page(click.Command):
             help=inspect.getdoc(callback),
             epilog=epilog,
         )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; what options of single constants give is added to the constants of --set."""
+        for option in self.params:
+            if isinstance(option, ConstantOption) and (value := ctx.params.pop(str(option.name))) is not None:
+                ctx.params["constants"] += (f"{option.name}={value}",)
+        return super().invoke(ctx)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write a section for each title; the last has --help too."""

@@ -11,7 +11,9 @@ from vijax.model.device import Harvester
 from vijax.model.label import label
 from vijax.model.sides import named
 
-LIMITS = "penetration limit", "energy given to the membrane"
+LIMITS = "penetration limit", "energy ratio limit"
+"""Limits of admissible impacts, in the order of margins."""
+
 _MOST = 20.0  # logarithms of margins end here: no contact, no voltage
 
 
@@ -24,6 +26,7 @@ class Averages(NamedTuple):
         depth: Largest penetration [m].
         room: The penetration limit over that; of walls with limits of their own the less of both.
         ratio: Largest ratio of harvested energy to energy given to the membrane.
+        energy_room: The energy ratio limit over that.
         lyapunov: Largest Lyapunov exponent per forcing period.
         period, left, right, status: Of the label; see `Summary`.
         periods_run: Forcing periods that were flown, up to where an orbit was certain.
@@ -35,6 +38,7 @@ class Averages(NamedTuple):
     depth: np.ndarray
     room: np.ndarray
     ratio: np.ndarray
+    energy_room: np.ndarray
     lyapunov: np.ndarray
     period: np.ndarray
     left: np.ndarray
@@ -59,9 +63,9 @@ class Averages(NamedTuple):
         return self.P * np.asarray(device.omega) / np.pi if objective == "power" else self.P
 
     def margins(self) -> np.ndarray:
-        """Compute logarithms [ball, 2] of the room left below the penetration limit and the energy given."""
+        """Compute the logarithms [ball, 2] of what is left below each of `LIMITS`; negative where one is broken."""
         with np.errstate(divide="ignore"):
-            left = np.stack([np.log(self.room), -np.log(self.ratio)], axis=-1)
+            left = np.stack([np.log(self.room), np.log(self.energy_room)], axis=-1)
         return np.minimum(left, _MOST)
 
 
@@ -74,14 +78,17 @@ def averages(device: Harvester, ended: Any) -> Averages:
     """
     length, speed = np.asarray(device.length_unit), np.asarray(device.speed_unit)
     limits = named("deepest", device.depth_limit)
+    ratio = ended.energy_ratio[:, 0]
     with np.errstate(divide="ignore"):
+        energy_room = np.asarray(device.energy_ratio_limit) / ratio
         rooms = [np.asarray(limit) / (getattr(ended, name) * length) for name, limit in limits.items()]
     return Averages(
         P=ended.P[:, 0],
         speed=ended.fastest * speed,
         depth=ended.deepest * length,
         room=reduce(np.minimum, rooms),
-        ratio=ended.energy_ratio[:, 0],
+        ratio=ratio,
+        energy_room=energy_room,
         lyapunov=ended.lyapunov,
         period=ended.period,
         left=ended.impacts_left,

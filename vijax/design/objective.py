@@ -73,7 +73,7 @@ def _measure(scene: Scene, device: Harvester, sequence: Sequence, factors, knots
     value = {"power": there.power, "speed": there.speed}.get(scene.objective, there.P)
     real, one = sequence.real, jnp.ones_like(there.depth)
     deep = jnp.log(at(own.depth_limit, sequence.side) / jnp.where(real, there.depth, one))
-    rich = jnp.log(jnp.where(real, there.work, one) / jnp.where(real, there.energy, one))
+    rich = jnp.log(own.energy_ratio_limit * jnp.where(real, there.work, one) / jnp.where(real, there.energy, one))
     margins = jnp.concatenate([jnp.where(real, x, _MOST) for x in (deep, rich)])
     seen = _SeenOrbit(jnp.log(value), jnp.minimum(margins, _MOST), there.knots)
     return seen, (seen, there.status)

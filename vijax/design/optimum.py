@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vijax.batch.simulate import Starts
+from vijax.design.averages import LIMITS
 from vijax.design.candidates import Begun
 from vijax.design.design_settings import DesignSettings
 from vijax.design.objective import Scene
@@ -273,9 +274,8 @@ def _active(scene: Scene, end: End, side: Any, near: float) -> tuple[str, ...]:
     margins, low, high = np.split(end.margins, [end.margins.size - 2 * count, end.margins.size - count])
     words = []
     for node, kind, impact in np.argwhere(margins.reshape(-1, 2, width) < near):
-        what = ("penetration limit", "energy given to the membrane")[kind]
         wall = "left" if side[impact] < 0 else "right"
-        words.append(f"{what} at the {wall} wall" + (" at an end of the tolerance" if node else ""))
+        words.append(f"{LIMITS[kind]} at the {wall} wall" + (" at an end of the tolerance" if node else ""))
     words += [f"lower bound of {name}" for name, room in zip(scene.names, low, strict=True) if room < near]
     words += [f"upper bound of {name}" for name, room in zip(scene.names, high, strict=True) if room < near]
     return tuple(dict.fromkeys(words))

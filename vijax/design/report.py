@@ -103,6 +103,7 @@ def optimum(one: Optimum | AperiodicOptimum) -> dict[str, Any]:
         "pair": {name: float(value) for name, value in quantities(device.pair()).items()},
         "device": {key: x for name in CONSTANTS for key, x in _numbers(name, getattr(device, name)).items()},
         **_numbers("penetration_limit", device.depth_limit),
+        "energy_ratio_limit": float(device.energy_ratio_limit),
         "gradient": one.gradient,
         "active": list(one.active),
         "stopped": one.stopped,

@@ -87,9 +87,7 @@ def _instead(survey: dict[str, Any]) -> Iterator[str]:
         )
     broken = survey["orbits"] - survey["admissible"]
     if broken:
-        yield see(
-            "model", f"{broken:,} periodic orbits that break a constraint: widen the bounds or the penetration limit"
-        )
+        yield see("model", f"{broken:,} periodic orbits that break a constraint: widen the bounds or the limits")
     if survey["admissible"]:
         yield f"{survey['admissible']:,} admissible orbits that led to no optimum: take more steps and balls"
     if survey["restless"]:
@@ -127,7 +125,8 @@ def _best(best: dict[str, Any], objective: str) -> Iterator[str]:
     deepest, limit = 1e3 * max(best["penetration"]), 1e3 * best["penetration_limit"]
     yield (
         f"  penetration {deepest:.6g} mm of {limit:.6g} allowed; "
-        f"harvested at most {100 * max(best['energy_ratio']):.4g} % of the energy that an impact gives"
+        f"harvested at most {100 * max(best['energy_ratio']):.4g} % of the energy that an impact gives, of "
+        f"{100 * best['energy_ratio_limit']:.4g} % allowed"
     )
     if "balls" in best:
         yield from _flown(best, objective)
@@ -300,7 +299,7 @@ def _unconstrained(report: dict[str, Any]) -> Iterator[str]:
     if peak is None or peak["admissible"] or (best is not None and peak["P"] <= best["P"]):
         return
     more = f"{peak['P'] / best['P']:.4g} times as much, " if best else ""
-    beyond = "not physical" if peak["unphysical"] else "beyond your penetration limit"
+    beyond = "not physical" if peak["unphysical"] else "beyond your limits"
     yield (
         f"{beyond}: P alone would choose {quantity(peak['along'], peak['value'])} with {amount(peak['P'], 'J')}, "
         f"{more}{1e3 * peak['max_penetration']:.4g} mm deep, "

@@ -36,12 +36,13 @@ def cell_rows(cell: ExploredCell, found: CellMotion) -> Rows:
     ]
     numbers = found.numbers
     limit = min(map(float, named("limit", cell.device.depth_limit).values()))
+    most = float(cell.device.energy_ratio_limit)
     rows = [
         ["label", found.name],
         ["P", f"{amount(numbers['P'], 'J')} per half period"],
         ["power", amount(numbers["power"], "W")],
         ["admissible", "yes" if numbers["admissible"] else "no"],
-        ["energy harvested / given", f"{amount(numbers['energy_ratio'])} (limit 1)"],
+        ["energy harvested / given", f"{amount(numbers['energy_ratio'])} (limit {amount(most)})"],
         ["penetration", f"{amount(1e3 * numbers['max_penetration'], 'mm')} (limit {amount(1e3 * limit, 'mm')})"],
         ["largest impact speed", amount(numbers["max_impact_speed"], "m/s")],
         ["impacts per period", amount(numbers["impacts_per_period"])],

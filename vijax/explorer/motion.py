@@ -14,7 +14,7 @@ import numpy as np
 from vijax.batch.trajectory import trajectory
 from vijax.explorer.plane import ExploredCell
 from vijax.model.device import depth_unit
-from vijax.model.energy import harvested_energy
+from vijax.model.energy import admissible, harvested_energy
 from vijax.model.label import label
 from vijax.model.records import Impact, Status
 from vijax.model.sides import at
@@ -24,6 +24,7 @@ from vijax.orbits.orbit_search import from_state
 from vijax.orbits.periodic import Orbit
 from vijax.planes.orbit_diagram import orbit_diagram
 from vijax.planes.sweep import sweep
+from vijax.runtime import tiles
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -193,7 +194,7 @@ def _impacts(cell: ExploredCell, hits: Impact, span: float) -> dict[str, np.ndar
     depth = np.asarray(hits.depth) * np.asarray(at(depth_unit(device, cell.pair), side))
     given = float(device.m_b) * speed**2 * np.asarray(hits.work)
     harvested = np.asarray(harvested_energy(device.at(side), depth))
-    good = (harvested <= given) & (depth <= np.asarray(at(device.depth_limit, side)))
+    good = np.asarray(admissible(device.at(side), *tiles.arrays((harvested, given, depth))))
     return {
         "t": np.mod(2 * np.asarray(hits.n) + np.asarray(hits.t), span),
         "u": 0.5 * float(cell.pair.d) * np.asarray(hits.side, float),

@@ -62,6 +62,8 @@ def _constants(cell: ExploredCell | _Run) -> dict[str, float]:
             found |= {argument: float(value) for argument, value in own if value != getattr(_DEVICE, name)}
     if cell.device.penetration_limit is not None:
         found["penetration_limit"] = float(cell.device.penetration_limit)
+    if cell.device.energy_ratio_limit != _DEVICE.energy_ratio_limit:
+        found["energy_ratio_limit"] = float(cell.device.energy_ratio_limit)
     return found
 
 

@@ -54,6 +54,9 @@ class Harvester(eqx.Module):
         V: Voltage [V].
         r_b: Radius of the ball [m], below R0.
         penetration_limit: Largest admissible penetration [m]; None for R0.
+        energy_ratio_limit: Largest admissible ratio of the energy that an impact yields to the energy that it gives to
+            the membrane, E_j/W_j, in (0, 1]. The formula of E_j leaves out the force of the charge on the ball, which
+            changes the motion where the ratio is not small.
 
     Raises:
         TypeError: A name that is no constant; it says which there are.
@@ -75,6 +78,7 @@ class Harvester(eqx.Module):
     V: Own = 2000.0
     r_b: Real = 0.0050
     penetration_limit: Real | None = None
+    energy_ratio_limit: Real = 1.0
 
     def __new__(cls, *constants: Any, **named: Any):
         """Refuse a name that is no constant, with the names that there are, which Python would not say."""
@@ -187,14 +191,17 @@ class Harvester(eqx.Module):
 WALLS_OWN = "omega0", "r", "w0", "R0", "eps_M", "V"
 """Constants that each wall may have of its own."""
 
-CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field.name != "penetration_limit")
-"""Constants of the device; the penetration limit is none, but a choice of who builds it."""
+LIMITS = "penetration_limit", "energy_ratio_limit"
+"""Limits of admissible impacts: requirements of the designer, not constants of the device."""
+
+CONSTANTS = tuple(field.name for field in dataclasses.fields(Harvester) if field.name not in LIMITS)
+"""Constants of the device, without the limits of admissible impacts."""
 
 
 def told_device(attributes: Mapping[Any, Any]) -> Harvester:
     """Read the device that a map's attributes tell; what they do not tell, as its axes, is that of Tables I and II."""
     told: dict[str, Any] = {}
-    for name in (*CONSTANTS, "penetration_limit"):
+    for name in (*CONSTANTS, *LIMITS):
         both, sides = f"harvester_{name}", [f"harvester_{name}_{side}" for side in SIDES]
         if both in attributes:
             told[name] = float(attributes[both])
@@ -337,9 +344,9 @@ def electrical(device: Harvester, *, unequal: bool = False) -> Harvester:
         names = [name for name in WALLS_OWN if name not in ("omega0", "r")]
         device = changed(device, {name: apart(getattr(device, name)) for name in names}, checked=False)
     return eqx.tree_at(
-        lambda one: (one.s, one.omega0, one.r, one.A, one.omega, one.beta, one.g, one.penetration_limit),
+        lambda one: [getattr(one, name) for name in ("s", "omega0", "r", "A", "omega", "beta", "g", *LIMITS)],
         device,
-        (None,) * 8,
+        [None] * 9,
         is_leaf=lambda leaf: leaf is None,
     )
 

@@ -280,7 +280,7 @@ def energy_ratio(energy: Values, work: Values) -> Values:
 
 @door
 def admissible(device: Harvester, energy: Values, work: Values, depth: Values) -> Bool[Array, "..."]:
-    """Tell whether an impact may be: it gives out no more than it got, within the device's penetration limit.
+    """Return whether an impact is admissible: E_j <= energy_ratio_limit W_j, and the penetration is within its limit.
 
     Args:
         energy: E_j [J].
@@ -288,4 +288,4 @@ def admissible(device: Harvester, energy: Values, work: Values, depth: Values) -
         depth: Largest penetration [m].
     """
     limit: Any = device.depth_limit
-    return (energy <= work) & (depth <= limit)
+    return (energy <= device.energy_ratio_limit * work) & (depth <= limit)

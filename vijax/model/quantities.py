@@ -225,6 +225,12 @@ QUANTITIES = AXES | _named(
         "m",
         advice="leave it out for R0, or give inf for no limit",
     ),
+    Quantity(
+        "energy_ratio_limit",
+        "largest admissible ratio of the energy that an impact yields to the energy that it gives to the membrane",
+        _PART,
+        advice="1 admits all energy that the impact gives",
+    ),
 )
 """All that may be given by value: the axes, and the constants of the device that are none."""
 

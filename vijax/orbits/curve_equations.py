@@ -162,7 +162,7 @@ class CurvePath(eqx.Module):
             return depth / limit
         if device.unequal:
             energy = jnp.maximum(energy, steady.image_energy(device, self.sequence, depth, energy))
-        return energy / work
+        return energy / (device.energy_ratio_limit * work)
 
     def equations(self, y) -> PathEquations:
         """Compute the gap and the condition, and their derivatives in all unknowns."""

@@ -42,7 +42,7 @@ def loads(orbit: Orbit, device: Harvester) -> dict[str, np.ndarray]:
     energy, given = tiles.arrays((most, work * np.asarray(device.m_b * device.speed_unit**2)))
     found = {
         LIMITS[0]: metres / least,
-        LIMITS[1]: np.asarray(energy_ratio(energy, given)),
+        LIMITS[1]: np.asarray(energy_ratio(energy, given)) / np.asarray(device.energy_ratio_limit),
     }
     real = np.asarray(orbit.sequence.real)
     return {kind: np.where(real, load, 0.0) for kind, load in found.items()}
@@ -52,8 +52,8 @@ def loads(orbit: Orbit, device: Harvester) -> dict[str, np.ndarray]:
 def limit_points(branches: list[Branch], *, device: Harvester | None = None) -> list[Point]:
     """Find the orbits of branches next to which a limit of a device is met, for `follow_curves` to begin at.
 
-    Limits are those of `admissible`: no impact is deeper than the penetration limit, and none harvests more energy than
-    it gives to the membrane.
+    Limits are those of `admissible`: no impact is deeper than the penetration limit, and none harvests more than the
+    part `energy_ratio_limit` of the energy that it gives to the membrane.
 
     Args:
         branches: As `vijax.follow_families` returns them.

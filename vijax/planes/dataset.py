@@ -218,6 +218,7 @@ def asked(planned: SweepPlan) -> dict[str, Any]:
             f"harvester_{argument}": float(value)
             for argument, value in named("penetration_limit", planned.device.depth_limit).items()
         },
+        "harvester_energy_ratio_limit": float(planned.device.energy_ratio_limit),
         **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings.dtype).items()},
     }
 

@@ -324,7 +324,7 @@ def _simulate(
     points["max_penetration"] = summary.deepest * table["depth"]
     limits = named("deepest", planned.device.depth_limit)
     within = [getattr(summary, name) * table["depth"] <= float(limit) for name, limit in limits.items()]
-    points["admissible"] = np.all(within, axis=0) & (points["energy_ratio"] <= 1)
+    points["admissible"] = np.all(within, axis=0) & (points["energy_ratio"] <= float(planned.device.energy_ratio_limit))
     points |= {name: getattr(summary, name) for name in ("period", "impacts_left", "impacts_right", "status")}
     return points | {name: values.reshape(shape + values.shape[1:]) for name, values in fields.items()}
 

@@ -42,7 +42,7 @@ def _speed(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
 def _admissible(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
     limits = named("deepest", device.depth_limit)
     within = [found[name] * cells.length <= float(limit) for name, limit in limits.items()]
-    return reduce(and_, within, found["energy_ratio"] <= 1)
+    return reduce(and_, within, found["energy_ratio"] <= float(device.energy_ratio_limit))
 
 
 def _risk(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
@@ -71,7 +71,8 @@ OUTPUTS = {
     "contact_fraction": Output("1", "part of the time spent in contact", ("contact_fraction",)),
     "admissible": Output(
         "1",
-        "no impact yields more energy than it gives to the membrane, none passes the penetration limit",
+        "no impact yields more than the admissible part of the energy that it gives to the membrane, or passes the "
+        "penetration limit",
         ("energy_ratio", "deepest"),
         _admissible,
     ),

@@ -8,12 +8,12 @@ from matplotlib.figure import Figure
 
 from vijax.batch.run_records import Trajectory
 from vijax.model.device import Harvester, depth_unit, one_device
-from vijax.model.energy import harvested_energy
+from vijax.model.energy import admissible, harvested_energy
 from vijax.model.pair import ImpactPair
 from vijax.model.sides import at
 from vijax.orbits.motion import Curve, curve
 from vijax.plots.figure import styled
-from vijax.runtime import checks
+from vijax.runtime import checks, tiles
 
 _WALL: dict[str, Any] = {"color": "0.8", "linewidth": 0.8}
 _BALL: dict[str, Any] = {"color": "black", "linewidth": 0.7}
@@ -63,8 +63,8 @@ def energies(pair: ImpactPair, path: Trajectory, device: Harvester | None = None
     """Draw the energy of one motion over time: that of the moving ball, and what each impact gives and yields.
 
     Above is the kinetic energy of the ball as the capsule sees it. Below, each impact has the energy that it gives to
-    the membrane and the energy harvested from it. A cross stands on an impact that cannot be: it yields more than it
-    gives, or goes deeper than the device's limit.
+    the membrane and the energy harvested from it. A cross marks an inadmissible impact: it breaks a limit of the
+    device, that of the energy ratio or that of the penetration.
 
     Args:
         pair, path: As in `trajectory`.
@@ -81,7 +81,7 @@ def energies(pair: ImpactPair, path: Trajectory, device: Harvester | None = None
     depth = np.asarray(path.impacts.depth)[there] * np.asarray(at(depth_unit(device, pair), side))
     given = float(device.m_b) * speed**2 * np.asarray(path.impacts.work)[there]
     harvested = np.asarray(harvested_energy(device.at(side), depth))
-    refused = (harvested > given) | (depth > np.asarray(at(device.depth_limit, side)))
+    refused = ~np.asarray(admissible(device.at(side), *tiles.arrays((harvested, given, depth))))
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     upper, lower = figure.subplots(2, sharex=True)
     upper.plot(line.t, 0.5 * float(device.m_b) * (speed * line.v) ** 2, **_BALL)
@@ -91,7 +91,7 @@ def energies(pair: ImpactPair, path: Trajectory, device: Harvester | None = None
     _on_log_axis(lower, time, given, "given to the membrane", _GIVEN)
     _on_log_axis(lower, time, harvested, "harvested", _HARVESTED)
     if refused.any():
-        _on_log_axis(lower, time[refused], harvested[refused], "cannot be: more than given, or too deep", _REFUSED)
+        _on_log_axis(lower, time[refused], harvested[refused], "inadmissible: beyond a limit of the device", _REFUSED)
     lower.set(xlabel=_TIME, ylabel="energy of an impact [J]", yscale="log")
     lower.margins(y=0.25)  # of decades: points of nearly one height would else stand at its edges
     figure.legend(loc="outside lower center", ncols=3, frameon=False, handlelength=1.0)
