@@ -17,7 +17,7 @@ from scripts import grid as script
 from tests.helpers import SCRIPTS
 from vijax.cli import closing, progress
 from vijax.model.records import Status
-from vijax.planes import dataset, sweep
+from vijax.planes import dataset, outputs, sweep
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots import figure, kind_maps, number_maps
 
@@ -368,7 +368,7 @@ def test_a_slow_rate_has_digits(count, seconds, said):
 
 
 def test_what_to_do_is_said_where_a_status_is_printed():
-    status = dataset.flagged(xr.Variable("d", [0, 4, 4, 2]))
+    status = outputs.flagged(xr.Variable("d", [0, 4, 4, 2]), Status)
     lines = closing.statuses(xr.DataArray(status)).split("\n")
     assert lines[0] == "cells by status: ok 1, permanent_contact 1, slow 2"
     assert lines[1] == f"    permanent_contact: {Status(2).advice}"

@@ -25,7 +25,8 @@ from vijax.planes.sweep import load, save, sweep
 from vijax.runtime import export_cache
 
 LONG = 40  # periods: enough for the 1:1 orbits of these tests
-ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "max_penetration", "max_impact_speed"}
+ENERGY_ONLY = {"P", "power", "P_stderr", "energy_ratio", "admissible", "violated_limits", "max_penetration"}
+ENERGY_ONLY |= {"max_impact_speed"}
 
 
 @pytest.fixture
@@ -294,12 +295,17 @@ def test_only_what_is_asked_for_is_computed(engine):
 
 
 def test_admissible_asks_for_energy_and_depth(monkeypatch):
-    plan = sweeps.plan({"d": [0.1, 0.2, 0.3, 0.4], "kappa": 20.0, "omega": math.pi}, ["admissible"])
+    plan = sweeps.plan({"d": [0.1, 0.2, 0.3, 0.4], "kappa": 20.0, "omega": math.pi}, ["admissible", "violated_limits"])
     ratio = np.array([[0.5], [1.5], [0.5], [np.nan]])
     found = dataset.label(
         plan, {"energy_ratio": ratio, "deepest": np.array([0.0062, 0.001, 0.0064, 0.001]), "status": np.zeros(4, int)}
     )
     assert found["admissible"].values.tolist() == [True, False, False, False]
+    violated = found["violated_limits"]
+    words = dict(zip(violated.flag_values, violated.flag_meanings.split(), strict=True))
+    names = [words[code] for code in violated.values.tolist()]
+    assert names == ["none", "energy_ratio_limit", "penetration_limit", "unknown"]
+    assert violated.dtype == np.int8
 
 
 def test_the_energy_ratio_limit_is_a_constraint_of_a_map_and_recorded(engine):

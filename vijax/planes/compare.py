@@ -20,6 +20,7 @@ from vijax.model.records import SETTLED, Status
 from vijax.planes import sweep
 from vijax.planes.axes import Axes
 from vijax.planes.dataset import DEFAULT, SweepPlan
+from vijax.planes.outputs import flagged
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import checks
 from vijax.runtime.context import door
@@ -252,14 +253,9 @@ def _judged(found: "xr.Dataset", tolerance: float) -> "xr.Dataset":
 
 
 def _flags(values: "xr.DataArray", kinds: type[enum.IntEnum], long_name: str, found: "xr.Dataset") -> "xr.DataArray":
-    values = values.astype(np.int8).transpose(*(dim for dim in found["P_soft"].dims if dim in values.dims))
-    values.attrs = {
-        "units": "1",
-        "long_name": long_name,
-        "flag_values": [int(kind) for kind in kinds],
-        "flag_meanings": _meanings(kinds),
-    }
-    return values
+    values = values.transpose(*(dim for dim in found["P_soft"].dims if dim in values.dims))
+    values.attrs = {"units": "1", "long_name": long_name}
+    return flagged(values, kinds)
 
 
 def _meanings(kinds: type[enum.IntEnum]) -> str:

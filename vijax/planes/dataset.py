@@ -23,7 +23,7 @@ from vijax.model.records import Status
 from vijax.model.sides import Sides, named
 from vijax.planes.cells import Cells
 from vijax.planes.expected import NEEDS, ManyStarts
-from vijax.planes.outputs import VARIED, Found, Output, needs, table
+from vijax.planes.outputs import VARIED, Found, Output, flagged, needs, table
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.runtime import tiles
 from vijax.runtime.pages import see
@@ -108,8 +108,7 @@ def variables(planned: SweepPlan, fields_found: dict[str, np.ndarray]) -> "dict[
     for name, values in fields_found.items():
         dims = of.dynamic + (of.variant if values.ndim > 1 else ())
         found[name] = xr.Variable(dims, values.reshape([of.sizes[dim] for dim in dims]))
-    wanted = {name: _variable(name, found, planned) for name in planned.outputs}
-    return wanted | {"status": flagged(wanted["status"])}
+    return {name: _variable(name, found, planned) for name in planned.outputs}
 
 
 def specimen(planned: SweepPlan) -> "xr.Dataset":
@@ -122,16 +121,6 @@ def specimen(planned: SweepPlan) -> "xr.Dataset":
     one = ManyStarts(np.array([True]))
     one.add({name: np.asarray(getattr(blank, name)) for name in NEEDS | (planned.needs & simulate.DEEP)})
     return label(first, one.fields())
-
-
-def flagged(status: "xr.Variable") -> "xr.Variable":
-    """Let a variable of `Status` codes say what they mean."""
-    found = status.astype(np.int8)
-    found.attrs = status.attrs | {
-        "flag_values": [int(status) for status in Status],
-        "flag_meanings": " ".join(status.name.lower() for status in Status),
-    }
-    return found
 
 
 def best(dataset: "xr.Dataset") -> "xr.DataArray | None":
@@ -163,7 +152,7 @@ def _variable(name: str, found: Found, planned: SweepPlan) -> "xr.Variable":
     # Scales are float64 whatever the cells were computed in.
     values = values.astype(planned.settings.dtype if values.dtype.kind == "f" else values.dtype, copy=False)
     values.attrs = {"units": output.units, "long_name": output.description}
-    return values
+    return flagged(values, output.flags) if output.flags else values
 
 
 def coordinates(of: Cells) -> "dict[str, xr.Variable]":

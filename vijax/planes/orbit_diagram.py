@@ -28,8 +28,8 @@ from vijax.model.units import Given
 from vijax.planes import estimate
 from vijax.planes.axes import Axes, check_axis
 from vijax.planes.cells import cells
-from vijax.planes.dataset import SweepPlan, coordinates, flagged, provenance, warn_if_held
-from vijax.planes.outputs import OUTPUTS
+from vijax.planes.dataset import SweepPlan, coordinates, provenance, warn_if_held
+from vijax.planes.outputs import OUTPUTS, LimitViolation, flagged, violation
 from vijax.planes.sweep_settings import DiagramSettings
 from vijax.runtime import checks, context
 from vijax.runtime.context import door
@@ -51,7 +51,7 @@ _POINTS = {
     **{name: OUTPUTS[name][:2] for name in ("P", "P_stderr", "period", "impacts_left", "impacts_right")},
     "status": ("1", "how the point ended"),
     "filled": ("1", "impacts in the kept periods"),
-    **{name: OUTPUTS[name][:2] for name in ("max_penetration", "energy_ratio", "admissible")},
+    **{name: OUTPUTS[name][:2] for name in ("max_penetration", "energy_ratio", "admissible", "violated_limits")},
 }
 _IMPACTS = {
     "phase": ("1", f"{MEASURED['phase'].text} from that of the greatest forcing"),
@@ -323,8 +323,9 @@ def _simulate(
     }
     points["max_penetration"] = summary.deepest * table["depth"]
     limits = named("deepest", planned.device.depth_limit)
-    within = [getattr(summary, name) * table["depth"] <= float(limit) for name, limit in limits.items()]
-    points["admissible"] = np.all(within, axis=0) & (points["energy_ratio"] <= float(planned.device.energy_ratio_limit))
+    depths = [(getattr(summary, name) * table["depth"], limit) for name, limit in limits.items()]
+    points["violated_limits"] = violation(points["energy_ratio"], depths, planned.device)
+    points["admissible"] = points["violated_limits"] == LimitViolation.NONE
     points |= {name: getattr(summary, name) for name in ("period", "impacts_left", "impacts_right", "status")}
     return points | {name: values.reshape(shape + values.shape[1:]) for name, values in fields.items()}
 
@@ -389,7 +390,8 @@ def _label(diagram: Diagram, fields: dict[str, np.ndarray]) -> "xr.Dataset":
             values = values.reshape(*sizes.values(), *values.shape[2:])
             values = values.astype(planned.settings.dtype) if values.dtype.kind == "f" else values
             variables[name] = xr.Variable((*sizes, *further), values, {"units": units, "long_name": text})
-    variables["status"] = flagged(variables["status"])
+    for name, kinds in (("status", Status), ("violated_limits", LimitViolation)):
+        variables[name] = flagged(variables[name], kinds)
     of = planned.cells
     # Later points start where the one before ended: a start that was not given is no coordinate.
     known = {name: x for name, x in coordinates(of).items() if name in of.given or name not in STARTS}

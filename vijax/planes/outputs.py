@@ -1,14 +1,16 @@
 """The outputs of a map: what each variable is, its unit, what it needs of a `Summary`, and how it follows from that."""
 
-from collections.abc import Callable
+import enum
+from collections.abc import Callable, Iterable
 from functools import reduce
-from operator import and_
+from operator import or_
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from vijax.model.device import Harvester
 from vijax.model.quantities import MEASURED
+from vijax.model.records import Status
 from vijax.model.sides import Sides, named
 from vijax.planes.cells import Cells
 
@@ -19,12 +21,26 @@ Found = dict[str, Any]  # field of Summary -> xr.Variable
 
 
 class Output(NamedTuple):
-    """A variable of the map: what it is, the fields of `Summary` it needs, and how it follows from them."""
+    """A variable of the map: what it is, the fields of `Summary` it needs, and how it follows from them.
+
+    `flags` are the values of a variable that is a code, under the names that CF's `flag_meanings` list.
+    """
 
     units: str
     description: str
     needs: tuple[str, ...]
     formula: "Callable[[Found, Cells, Harvester], xr.Variable] | None" = None
+    flags: type[enum.IntEnum] | None = None
+
+
+class LimitViolation(enum.IntEnum):
+    """The limits of admissible impacts that the impacts of a cell break."""
+
+    UNKNOWN = -1  # the cell failed or was not run
+    NONE = 0
+    ENERGY_RATIO_LIMIT = 1
+    PENETRATION_LIMIT = 2
+    BOTH_LIMITS = 3
 
 
 def _power(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
@@ -39,10 +55,30 @@ def _speed(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
     return found["fastest"] * cells.speed
 
 
-def _admissible(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
+def violation(ratio: Any, depths: Iterable[tuple[Any, Any]], device: Harvester) -> Any:
+    """Compute the code `LimitViolation` of cells; arrays or xarray's variables.
+
+    Args:
+        ratio: Largest ratio of harvested energy to energy given to the membrane.
+        depths: Penetrations and their limits [m], of both walls or of each.
+        device: Has the limit of the energy ratio.
+    """
+    some = list(depths)
+    rich = ratio > float(device.energy_ratio_limit)
+    deep = reduce(or_, [depth > float(limit) for depth, limit in some])
+    failed = reduce(or_, [depth != depth for depth, _ in some], ratio != ratio)
+    code = rich * LimitViolation.ENERGY_RATIO_LIMIT + deep * LimitViolation.PENETRATION_LIMIT
+    return code * ~failed + failed * LimitViolation.UNKNOWN
+
+
+def _violation(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
     limits = named("deepest", device.depth_limit)
-    within = [found[name] * cells.length <= float(limit) for name, limit in limits.items()]
-    return reduce(and_, within, found["energy_ratio"] <= float(device.energy_ratio_limit))
+    depths = [(found[name] * cells.length, limit) for name, limit in limits.items()]
+    return violation(found["energy_ratio"], depths, device)
+
+
+def _admissible(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
+    return _violation(found, cells, device) == LimitViolation.NONE
 
 
 def _risk(found: Found, cells: Cells, device: Harvester) -> "xr.Variable":
@@ -76,10 +112,17 @@ OUTPUTS = {
         ("energy_ratio", "deepest"),
         _admissible,
     ),
+    "violated_limits": Output(
+        "1",
+        "limits of admissible impacts that some impact breaks",
+        ("energy_ratio", "deepest"),
+        _violation,
+        LimitViolation,
+    ),
     "energy_ratio": Output("1", "largest ratio of harvested energy to energy given to the membrane", ("energy_ratio",)),
     "lyapunov": Output("1", "largest Lyapunov exponent per forcing period", ("lyapunov",)),
     "periods_run": Output("1", "forcing periods simulated", ("periods_run",)),
-    "status": Output("1", "how the cell ended", ("status",)),
+    "status": Output("1", "how the cell ended", ("status",), flags=Status),
 }
 EXPECTED = {
     "P": Output("J", "harvested energy per half period, mean over the starts", ("P",)),
@@ -96,8 +139,8 @@ EXPECTED = {
         ("attractors",),
     ),
     "undecided": Output("1", "part of the starts without a verdict", ("undecided",)),
-    **{name: OUTPUTS[name] for name in ("max_penetration", "admissible", "energy_ratio")},
-    "status": Output("1", "how most starts ended, or that one failed", ("status",)),
+    **{name: OUTPUTS[name] for name in ("max_penetration", "admissible", "violated_limits", "energy_ratio")},
+    "status": Output("1", "how most starts ended, or that one failed", ("status",), flags=Status),
 }
 """The outputs of a map over many starts in every cell, made of the fields of `expected.ManyStarts`."""
 SIDES_DEEPEST = "deepest_left", "deepest_right"
@@ -110,9 +153,19 @@ VARIED = {
 ON_REQUEST = ("asymmetry", "lyapunov")
 
 
+def flagged(values: Any, kinds: type[enum.IntEnum]) -> Any:
+    """Return a variable or an array of codes as CF flags: its attributes name the codes."""
+    found = values.astype(np.int8)
+    found.attrs = values.attrs | {
+        "flag_values": [int(kind) for kind in kinds],
+        "flag_meanings": " ".join(kind.name.lower() for kind in kinds),
+    }
+    return found
+
+
 def needs(output: Output, device: Harvester) -> tuple[str, ...]:
     """Name the fields that an output needs of cells of a device: by wall where these have limits of their own."""
-    by_wall = output.formula is _admissible and isinstance(device.depth_limit, Sides)
+    by_wall = output.formula in (_admissible, _violation) and isinstance(device.depth_limit, Sides)
     return (*output.needs, *(SIDES_DEEPEST if by_wall else ()))
 
 

@@ -130,7 +130,7 @@ def void(name: str, dtype: np.dtype) -> Any:
 
 def _fill(variable: "xr.Variable") -> dict[str, Any]:
     """Choose the value that readers of zarr see in place of a lost chunk, where the type has a void one."""
-    name = "status" if "flag_meanings" in variable.attrs else ""
+    name = "status" if "not_run" in variable.attrs.get("flag_meanings", "").split() else ""
     return {"fill_value": void(name, variable.dtype)} if variable.dtype.kind in _VOID else {}
 
 
