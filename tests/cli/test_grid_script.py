@@ -278,6 +278,16 @@ def test_a_refined_map_says_how_much_was_computed(folder, monkeypatch, capsys):
     assert "cells computed: 1 of 2 shown, 50.0%; the others filled" in out
 
 
+def test_a_summary_counts_inadmissible_cells_by_limit():
+    codes = xr.Variable("d", np.array([0, 1, 1, 2, 3, -1], np.int8))
+    (line,) = closing.limit_lines(xr.Dataset({"violated_limits": codes}))
+    counted = "energy ratio limit 2, penetration limit 1, both limits 1"
+    assert line == f"inadmissible cells: 5 of 6 (unknown 1, {counted}); see docs: model"
+    (line,) = closing.limit_lines(xr.Dataset({"violated_limits": codes[:1]}))
+    assert line == "inadmissible cells: 0 of 1"
+    assert not closing.limit_lines(xr.Dataset())
+
+
 def test_several_starts_from_arguments_to_store_and_picture(folder, capsys):
     names = ["--out", "expected.zarr", "--plot", "expected.png"]
     assert script.main([*TINY, "--starts", "5", *names]) == 0
@@ -327,6 +337,7 @@ def test_from_arguments_to_store_and_picture(folder, monkeypatch):
         "cells/s",
         "by status: ok 6",
         "by period: period 1 ",
+        f"inadmissible cells: {int((~found['admissible']).sum())} of 6",
         f"{float(peak):.6g} J per half period",
     ):
         assert part in out, part

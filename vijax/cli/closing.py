@@ -69,6 +69,21 @@ def statuses(variable: "xr.DataArray", of: str = "cells") -> str:
     return see("status", "\n".join([counted, *advice])) if found else counted
 
 
+def limit_lines(dataset: "xr.Dataset", of: str = "cells") -> list[str]:
+    """Count the inadmissible cells by the limit that they break; nothing where the dataset has no such variable."""
+    if "violated_limits" not in dataset:
+        return []
+    from vijax.planes.outputs import LimitViolation
+
+    code = dataset["violated_limits"].values
+    names = ((one, one.name.lower().replace("_", " ")) for one in LimitViolation if one != LimitViolation.NONE)
+    counts = {name: int((code == one).sum()) for one, name in names}
+    listed = ", ".join(f"{name} {count:,}" for name, count in counts.items() if count)
+    bad = sum(counts.values())
+    said = f"inadmissible {of}: {bad:,} of {code.size:,}" + (f" ({listed})" if bad else "")
+    return [see("model", said) if bad else said]
+
+
 def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:
     """Count how often each name occurs among values, the least values first, or those least by `order`."""
     import numpy as np

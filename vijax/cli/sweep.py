@@ -9,7 +9,7 @@ import click
 
 from vijax.cli import membranes, options, process
 from vijax.cli.arguments import device, take_axes
-from vijax.cli.closing import finish, statuses, tally
+from vijax.cli.closing import finish, limit_lines, statuses, tally
 from vijax.cli.excitation import excitation_options, take_excitation
 from vijax.cli.kinds import Choice, Periods, Real, Whole
 from vijax.cli.page import Page, Sections
@@ -203,6 +203,7 @@ def _summary(dataset: "xr.Dataset") -> str:
     if "attractors" in dataset:
         number = tally(dataset["attractors"].values, lambda found: str(found), order=lambda found: found)
         lines.append(f"cells by attractors found: {number}")
+    lines += limit_lines(dataset)
     if "P" in dataset and dataset["P"].size == 1:
         lines.append(f"P: {_only(dataset)}")
     elif {"P", "admissible"} <= set(dataset):

@@ -316,11 +316,7 @@ def _simulate(
         "u_strobe": flown.u,
         "v_strobe": flown.v,
     }
-    points = {
-        "P": summary.P[..., 0],
-        "P_stderr": summary.P_stderr[..., 0],
-        "energy_ratio": summary.energy_ratio[..., 0],
-    }
+    points = {name: getattr(summary, name)[..., 0] for name in ("P", "P_stderr", "energy_ratio")}
     points["max_penetration"] = summary.deepest * table["depth"]
     limits = named("deepest", planned.device.depth_limit)
     depths = [(getattr(summary, name) * table["depth"], limit) for name, limit in limits.items()]
