@@ -134,6 +134,10 @@ def test_the_path_is_the_motion():
         (lambda p: orbit_search.search(p, "RL", 1.5), "period must be a whole number"),
         (lambda p: orbit_search.search(p, "RL", guesses=0), "guesses must be a whole number"),
         (lambda p: orbit_search.search(impact_pair([0.1, 0.2], 40.0, 0.5), "RL"), "pair must be one cell"),
+        (
+            lambda p: orbit_search.from_state(impact_pair([[0.1, 0.2]], 40.0, 0.5), 0.0, 0.1),
+            r"pair must be one cell, or one a state; got d of shape \(1, 2\); flatten its fields and the states",
+        ),
         (lambda p: orbit_search.from_state(p, 0.0, 0.1, 2.5), "t must lie in"),
         (lambda p: orbit_search.from_state(p, 0.0, 0.1, period=0), "period must be a whole number of at least 1"),
         (lambda p: orbit_search.from_state(p, 0.0, 0.1, settle=-1), "settle must be a whole number of at least 0"),

@@ -141,6 +141,15 @@ def test_a_rigid_wall_yields_by_the_depth_it_is_lent():
     assert float(jax.jit(jax.jacfwd(P))(0.5)) == pytest.approx(float(difference), rel=1e-7)
 
 
+def test_several_cells_or_devices_are_refused_with_what_to_do(found):
+    orbit = jax.tree.map(lambda x: x[0], found[0])
+    cells = impact_pair(np.full((2, 2), 0.2), 400.0, 0.5)
+    with pytest.raises(ValueError, match=r"pair must be one cell; got d of shape \(2, 2\); map several by jax.vmap"):
+        steady(DEVICE, orbit, pair=cells)
+    with pytest.raises(ValueError, match=r"device.s must be one number; got shape \(2,\); map several by jax.vmap"):
+        steady(Harvester(s=[0.2, 0.3]), orbit)
+
+
 def test_a_record_prints_its_status_by_name_and_what_to_do():
     # The symmetric 1:1 orbit of a rigid wall repels beyond its flip at d = 0.187.
     found = orbit_search.search(impact_pair(0.15, None, 0.5), "RL", guesses=64)

@@ -20,15 +20,16 @@ from vijax.batch import perturbed
 from vijax.batch.summary import Summary
 from vijax.design.local_fit import LocalFit, local_fit
 from vijax.model import flow
-from vijax.model.device import Harvester, check_device, electrical
+from vijax.model.device import Harvester, check_each_constant, electrical
 from vijax.model.energy import capacitance
 from vijax.model.pair import ImpactPair, pair_of, quantities
-from vijax.model.sides import named
 from vijax.planes.basins import SPEED
 from vijax.runtime import checks, tiles
 from vijax.runtime.arrays import Values, present
+from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
 from vijax.runtime.lattice import lattice
+from vijax.runtime.printed import PrintedRecord, printed
 from vijax.runtime.programs import jitted
 
 _LEAST_BALLS = 32  # fewer give no standard error that could be trusted
@@ -72,7 +73,7 @@ _ADVICE = {
 }
 
 
-class Average(eqx.Module):
+class Average(PrintedRecord):
     """The average of a device's motion, its derivatives, and how far they can be trusted.
 
     Standard errors are those of the scatter of the balls. They do not know of what no ball has met: an attractor that
@@ -101,6 +102,11 @@ class Average(eqx.Module):
     periodic: Float[Array, ""]
     smooth: Bool[Array, ""]
     verdict: Int[Array, ""]
+
+    def __repr__(self) -> str:
+        # The verdict may be traced, or a tangent.
+        known = isinstance(self.verdict, jax.Array) and is_concrete(self.verdict) and self.verdict.ndim == 0
+        return printed(self, verdict=f"Smoothness.{Smoothness(int(self.verdict)).name}") if known else printed(self)
 
 
 class _Inputs(NamedTuple):
@@ -173,7 +179,7 @@ def average(
     Raises:
         ValueError: Which argument, what must hold, what came.
     """
-    _check(device)
+    check_each_constant(device, "map devices by jax.vmap")
     balls = checks.whole("balls", balls, _LEAST_BALLS, _MOST_BALLS)
     if balls % 2:
         raise ValueError(f"balls must be even, as they fly in pairs; got {balls}; take {balls + 1}")
@@ -184,16 +190,6 @@ def average(
     size = len(jax.tree.leaves(at.pair))
     flown = _fly(at, _design(balls, size, checks.seed(seed)), periods, width)
     return _concluded(device, at, flown, balls >= _BALLS_A_TERM * (size + 1) * (size + 2) // 2)
-
-
-def _check(device: Any) -> None:
-    """Raise ValueError unless this is one device; what is traced passes unseen."""
-    for name, value in vars(check_device(device)).items():
-        for argument, one in named(name, value).items():
-            if one is not None and np.ndim(one):
-                raise ValueError(
-                    f"device.{argument} must be one number; got shape {np.shape(one)}; map devices by jax.vmap"
-                )
 
 
 def _inputs(device: Harvester) -> _Inputs:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -18,6 +18,7 @@ from vijax.model.sides import Sides, apart, at, each, named, with_own
 from vijax.runtime import checks
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
+from vijax.runtime.printed import PrintedRecord
 from vijax.runtime.tiles import library
 
 Own = Real | Sides[Real]
@@ -30,7 +31,7 @@ _NO_CONSTANTS = {
 }
 
 
-class Harvester(eqx.Module):
+class Harvester(PrintedRecord):
     """The device in SI units; the defaults are Tables I and II of the paper.
 
     Every field is a number or an array, traced and never static; quantities of pint become plain numbers. The stiffness
@@ -360,12 +361,28 @@ def one_device(device: Any) -> Harvester:
     """Return the device, each constant one number that is not traced; that of Tables I and II where none is given."""
     if device is None:
         return Harvester()
-    for name, value in vars(checks.known("device", check_device(device))).items():
+    check_each_constant(checks.known("device", check_device(device)), _advice)
+    return device
+
+
+def check_each_constant(device: Any, remedy: str | Callable[[str], str]) -> Harvester:
+    """Return the device, if it is one whose constants are one number each, also where they are traced.
+
+    Args:
+        device: What came.
+        remedy: What to do about several devices, for the error; or a function of the constant that is no number.
+
+    Raises:
+        ValueError: "device.s must be one number; got shape (2,); map devices by jax.vmap".
+    """
+    for name, value in vars(check_device(device)).items():
         for argument, one in named(name, value).items():
             if one is not None and np.ndim(one):
-                advice = f"give {argument} as an axis" if argument in AXES else f"{argument} is no axis"
-                raise ValueError(
-                    f"device.{argument} must be one number; got shape {np.shape(one)}; "
-                    f"{advice}, or make a call for each device"
-                )
+                advice = remedy if isinstance(remedy, str) else remedy(argument)
+                raise ValueError(f"device.{argument} must be one number; got shape {np.shape(one)}; {advice}")
     return device
+
+
+def _advice(name: str) -> str:
+    """Return what to do about a constant of several numbers where a device must be one."""
+    return f"{f'give {name} as an axis' if name in AXES else f'{name} is no axis'}, or make a call for each device"

@@ -23,12 +23,13 @@ from vijax.runtime.arrays import AnyArray, choose
 from vijax.runtime.checks import is_concrete
 from vijax.runtime.context import door
 from vijax.runtime.pages import see
+from vijax.runtime.printed import PrintedRecord
 
 Real = float | Float[AnyArray, "..."]
 T = TypeVar("T")
 
 
-class ImpactPair(eqx.Module):
+class ImpactPair(PrintedRecord):
     """Nondimensional impact pair, Eqs. (37)-(38); every field a scalar or an array of one common shape.
 
     Fields are not checked, so that the record can be traced; `impact_pair` is the door that checks.
@@ -186,6 +187,25 @@ def check_pair(pair: Any, *, of_orbit: bool = False) -> ImpactPair:
                 check(name, one, argument)
                 fields[argument] = one
     checks.shapes(**fields)
+    return pair
+
+
+def check_one_pair(pair: Any, remedy: str, *, most: int = 0, of_orbit: bool = False) -> ImpactPair:
+    """Return the pair, if it may be and has no more dimensions than the function takes; traced values count too.
+
+    Args:
+        pair: What came.
+        remedy: What to do about several cells, for the error.
+        most: Dimensions that its fields may have: 0 for one cell, 1 for one a state.
+        of_orbit: See `check_pair`.
+
+    Raises:
+        ValueError: "pair must be one cell; got d of shape (2, 2); search each".
+    """
+    for name, value in quantities(check_pair(pair, of_orbit=of_orbit)).items():
+        if np.ndim(value) > most:
+            must = "one cell" if most == 0 else "one cell, or one a state"
+            raise ValueError(f"pair must be {must}; got {name} of shape {np.shape(value)}; {remedy}")
     return pair
 
 

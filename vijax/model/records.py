@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from vijax.runtime.arrays import AnyArray
 from vijax.runtime.checks import is_concrete
+from vijax.runtime.printed import PrintedRecord, printed
 
 
 class Status(enum.IntEnum):
@@ -59,16 +60,15 @@ SETTLED = Status.OK, Status.CONVERGING, Status.STICKING
 """Ends of a motion that is known: an orbit, or averages with a standard error."""
 
 
-class WithStatus(eqx.Module):
+class WithStatus(PrintedRecord):
     """A record that prints its `status` by name."""
 
     def __repr__(self) -> str:
         status = getattr(self, "status", None)
         if not isinstance(status, np.ndarray | np.generic | jax.Array) or not is_concrete(status):
-            return eqx.tree_pformat(self)
+            return printed(self)
         names = Counter(Status(int(code)).name for code in np.ravel(status))
-        told = dict(names) if np.ndim(status) else Status(int(status))
-        return eqx.tree_pformat(eqx.tree_at(lambda record: record.status, self, told))
+        return printed(self, status=repr(dict(names) if np.ndim(status) else Status(int(status))))
 
 
 class State(eqx.Module):

@@ -3,16 +3,16 @@
 from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from vijax.model.quantities import SIDES, parted
+from vijax.runtime.printed import PrintedRecord
 
 T = TypeVar("T")
 
 
-class Sides(eqx.Module, Generic[T]):
+class Sides(PrintedRecord, Generic[T]):
     """What the left wall has, at u = -d/2, and what the right one has, at u = d/2.
 
     ::

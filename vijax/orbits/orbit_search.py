@@ -15,7 +15,7 @@ from vijax.engine.forcing import with_harmonics
 from vijax.model import units
 from vijax.model.excitation import Excitation
 from vijax.model.membrane import Laws, with_law
-from vijax.model.pair import ImpactPair, check_pair, check_start, quantities
+from vijax.model.pair import ImpactPair, check_one_pair, check_start, quantities
 from vijax.model.records import Status
 from vijax.orbits.orbit_properties import marks_of_knots
 from vijax.orbits.periodic import (
@@ -69,7 +69,7 @@ def from_state(
         ValueError: period below 1, settle below 0, or an inadmissible pair, state or excitation.
     """
     period, settle = checks.whole("period", period, 1, _MOST_PERIOD), checks.whole("settle", settle, 0)
-    checks.known("pair", check_pair(pair))
+    checks.known("pair", check_one_pair(pair, "flatten its fields and the states", most=1))
     given = {"u": ("displacement", u), "v": ("velocity", v), "t": ("phase", t)}
     taken = (units.given(quantity, checks.known(name, x), name) for name, (quantity, x) in given.items())
     # By NumPy, as JAX would compile a program for each number of states.
@@ -132,9 +132,7 @@ def search(
 
     Source: Eqs. (28)-(29) ask for one sequence from one guess.
     """
-    checks.known("pair", check_pair(pair))
-    if any(np.ndim(x) for x in jax.tree.leaves(pair)):
-        raise ValueError(f"pair must be one cell; got shape {np.shape(pair.d)}; search each")
+    checks.known("pair", check_one_pair(pair, "search each"))
     every, period = sequences(impacts, period)
     check_guesses(guesses, len(every))
     pair = with_harmonics(with_law(pair, membrane), excitation)

@@ -16,9 +16,9 @@ from jaxtyping import Array, Float, Int
 
 from vijax.model import energy, flow
 from vijax.model.choices import Walls
-from vijax.model.device import Harvester, check_device
+from vijax.model.device import Harvester, check_each_constant
 from vijax.model.membrane import Laws, Linear, check_laws, has_units, nondimensional, of_device, of_pair, one_of, said
-from vijax.model.pair import ImpactPair, check_pair
+from vijax.model.pair import ImpactPair, check_one_pair
 from vijax.model.records import Status, WithStatus
 from vijax.model.sides import at
 from vijax.model.waves import Waves
@@ -32,6 +32,8 @@ from vijax.runtime.context import door
 from vijax.runtime.derivatives import differentiable, shared_slopes
 from vijax.runtime.pages import see
 from vijax.runtime.xla import each
+
+_MAPPED = "map several by jax.vmap"  # What an error says to do about several devices or cells.
 
 
 class Steady(WithStatus):
@@ -187,17 +189,15 @@ _near = differentiable(_respond, _found, _like_found)
 
 def _check(device: Any, orbit: Any, pair: Any) -> None:
     """Raise ValueError unless these are records of the right kind; what is traced passes unseen."""
-    check_device(device)
+    check_each_constant(device, _MAPPED)
     if not all(hasattr(orbit, name) for name in ("pair", "sequence", "knots")):
         raise ValueError(
             f"orbit must be one of a vijax.orbits.periodic.Orbit; got {checks.shown(orbit)}; take found[0]"
         )
     if jnp.ndim(orbit.knots) != 2:
         raise ValueError(f"orbit must be a single one; got knots of shape {jnp.shape(orbit.knots)}; take found[0]")
-    walls = [
-        (one.rigid, one.hard_wall)
-        for one in (orbit.pair if pair is None else check_pair(pair, of_orbit=True), orbit.pair)
-    ]
+    own = orbit.pair if pair is None else check_one_pair(pair, _MAPPED, of_orbit=True)
+    walls = [(one.rigid, one.hard_wall) for one in (own, orbit.pair)]
     if walls[0] != walls[1]:
         raise ValueError("pair must have the walls of the orbit, soft or rigid; got the others")
 
