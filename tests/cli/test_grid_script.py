@@ -288,6 +288,19 @@ def test_a_summary_counts_inadmissible_cells_by_limit():
     assert not closing.limit_lines(xr.Dataset())
 
 
+def test_a_wide_gap_from_one_start_says_that_starts_matter():
+    d = xr.DataArray([0.2, 0.21], dims="d")
+    level, inclined = (xr.Dataset(coords={"d": d, "gamma": gamma}) for gamma in (0.0, 0.1))
+    (line,) = closing.wide_gap_lines(level, "vijax sweep ")
+    assert line.startswith("d > 2/pi^2 on level ground in 50.0% of the cells")
+    assert line.endswith("try vijax sweep --starts 64")
+    assert "everywhere" in closing.wide_gap_lines(level.isel(d=[1]))[0]
+    assert not closing.wide_gap_lines(level.isel(d=[0]))
+    assert not closing.wide_gap_lines(inclined)
+    assert not closing.wide_gap_lines(level.assign_attrs(starts=64))
+    assert not closing.wide_gap_lines(level.expand_dims(v0=[0.1, 0.2]))
+
+
 def test_several_starts_from_arguments_to_store_and_picture(folder, capsys):
     names = ["--out", "expected.zarr", "--plot", "expected.png"]
     assert script.main([*TINY, "--starts", "5", *names]) == 0
@@ -301,7 +314,7 @@ def test_several_starts_from_arguments_to_store_and_picture(folder, capsys):
 @pytest.mark.parametrize(("admissible", "says"), [(True, "admissible\n"), (False, "inadmissible; see docs: model\n")])
 def test_one_cell_has_no_picture_unless_asked_for_and_its_energy_is_said(folder, capsys, monkeypatch, admissible, says):
     ok = ("d", [0], {"flag_values": [0], "flag_meanings": "ok"})
-    found = xr.Dataset({"status": ok, "P": ("d", [2e-5]), "admissible": ("d", [admissible])})
+    found = xr.Dataset({"status": ok, "P": ("d", [2e-5]), "admissible": ("d", [admissible])}, {"omega": np.pi})
 
     def run(plan, tell, *_):
         tell(0, 1)
@@ -311,7 +324,7 @@ def test_one_cell_has_no_picture_unless_asked_for_and_its_energy_is_said(folder,
     monkeypatch.setattr(sweep, "run", run)
     assert script.main(["--d", "0.1", "--kappa", "50"]) == 0
     out = capsys.readouterr().out
-    assert f"P: 2e-05 J per half period, {says}" in out
+    assert f"P: 2e-05 J per half period, 2e-05 W, {says}" in out
     assert "wrote power_map.zarr\n" in out
 
 
@@ -338,7 +351,9 @@ def test_from_arguments_to_store_and_picture(folder, monkeypatch):
         "by status: ok 6",
         "by period: period 1 ",
         f"inadmissible cells: {int((~found['admissible']).sum())} of 6",
-        f"{float(peak):.6g} J per half period",
+        f"{float(peak):.6g} J per half period, {float(peak):.6g} W at",
+        "d > 2/pi^2 on level ground in 50.0% of the cells: the motion depends on the start, and this is that of one; "
+        "try --starts 64",
     ):
         assert part in out, part
     assert sorted(path.name for path in folder.iterdir()) == ["cache", "map.png", "map.zarr"]

@@ -438,7 +438,7 @@ def test_designs_along_an_axis(folder, capsys):
     assert report["over"] == {"name": "d", "values": [0.16, 0.2]}
     assert [one["best"]["pair"]["d"] for one in report["designs"]] == pytest.approx([0.16, 0.2])
     assert report["designs"][1]["best"]["P"] == pytest.approx(ENERGY, rel=1e-6)
-    assert "d 0.2: omega0 = 40.07126 rad/s, 1:1, P 57.758 uJ, interior" in capsys.readouterr().out
+    assert "d 0.2: omega0 = 40.07126 rad/s, 1:1, P 57.758 uJ, 577.58 uW, interior" in capsys.readouterr().out
     assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
     # Orbits of more impacts than two climb too.
     found = [one["label"].split("/")[0].split(":") for design in report["designs"] for one in design["others"]]

@@ -1,5 +1,6 @@
 """`vijax basins`: which attractor each start ends on."""
 
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -112,17 +113,18 @@ def _summary(dataset: "xr.Dataset") -> Iterator[str]:
         return
     first = dataset.isel(dict.fromkeys(cells, 0))
     mirrors = ", mirror images as one" if dataset.attrs["merge_mirrors"] else ""
-    yield f"{'label':<20}{'starts':>12}{'share':>9}{'P [J]':>12}{'v max [m/s]':>13}{'exponent':>10}  {mirrors[2:]}"
+    measures = f"{'P [J]':>12}{'power [W]':>12}{'v max [m/s]':>13}{'exponent':>10}"
+    yield f"{'label':<20}{'starts':>12}{'share':>9}{measures}  {mirrors[2:]}"
     for n in range(min(first.sizes["attractor"], _MOST_ROWS)):
-        yield _row(first.isel(attractor=n))
+        yield _row(first.isel(attractor=n), float(first["omega"].values.flat[0]) / math.pi)
 
 
-def _row(entry: "xr.Dataset") -> str:
+def _row(entry: "xr.Dataset", rate: float) -> str:
     label, share = str(entry["label"].values), 100 * float(entry["fraction"])
     energy, speed, exponent = (float(entry[name].values.flat[0]) for name in ("P", "max_impact_speed", "lyapunov"))
     looked = "" if entry["periodic"] else f"  looked for {float(entry['periods_run']):g} periods"
     start = f"{label:<20}{int(entry['starts']):>12,}{share:>7.2f} %"
-    return f"{start}{energy:>12.4g}{speed:>13.4g}{exponent:>10.3g}{looked}"
+    return f"{start}{energy:>12.4g}{energy * rate:>12.4g}{speed:>13.4g}{exponent:>10.3g}{looked}"
 
 
 # --- the page --------------------------------------------------------------------------------------------------------

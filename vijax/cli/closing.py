@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from vijax.model.quantities import FREE_GAP, STARTS
 from vijax.runtime.pages import see
 
 if TYPE_CHECKING:
@@ -82,6 +83,37 @@ def limit_lines(dataset: "xr.Dataset", of: str = "cells") -> list[str]:
     bad = sum(counts.values())
     said = f"inadmissible {of}: {bad:,} of {code.size:,}" + (f" ({listed})" if bad else "")
     return [see("model", said) if bad else said]
+
+
+def wide_gap_lines(dataset: "xr.Dataset", command: str = "") -> list[str]:
+    """Return a line where a map of one start has wide level gaps, in which balls may fly for ever without an impact.
+
+    Args:
+        dataset: A map with the coordinates d and gamma.
+        command: The command that has `--starts`, where it is another one.
+    """
+    started = any(name in dataset.dims for name in STARTS) or dataset.attrs.get("starts", 1) > 1
+    if started or not {"d", "gamma"} <= set(dataset.coords):
+        return []
+    return wide_gap_advice(dataset["d"], dataset["gamma"], command)
+
+
+def wide_gap_advice(d: Any, gamma: Any, command: str = "") -> list[str]:
+    """Return the line of `wide_gap_lines` for gaps d and gravities gamma; nothing if no gap is wide."""
+    part = float(((d > FREE_GAP) & (gamma == 0)).mean())
+    if not part:
+        return []
+    where = "everywhere" if part == 1 else f"in {part:.1%} of the cells"
+    return [
+        f"d > 2/pi^2 on level ground {where}: the motion depends on the start, and this is that of one; "
+        f"try {command}--starts 64"
+    ]
+
+
+def harvest(P: float, power: float, error: float | None = None) -> str:
+    """Write harvested energy, with its standard error, and power: 2e-05 J per half period, 2e-05 W."""
+    off = "" if error is None else f" +- {error:.1g}"
+    return f"{P:.6g}{off} J per half period, {power:.6g} W"
 
 
 def tally(values: Any, name: Callable[[Any], Any], order: Callable[[Any], Any] | None = None) -> str:

@@ -7,7 +7,7 @@ import click
 
 from vijax.cli import options, process
 from vijax.cli.arguments import device, part, take_axes
-from vijax.cli.closing import finish, flags, statuses
+from vijax.cli.closing import finish, flags, statuses, wide_gap_lines
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
 from vijax.cli.sweep import PLANE, plane_options, run_options
@@ -72,6 +72,7 @@ def _draw(dataset: "xr.Dataset", path: Path) -> None:
 def _summary(dataset: "xr.Dataset") -> str:
     """Say what the comparison holds: how cells ended, labels, verdicts, from where rigid is enough."""
     lines = [statuses(dataset[f"status_{wall}"], f"{wall} cells") for wall in ("soft", "rigid")]
+    lines += wide_gap_lines(dataset, "vijax sweep ")
     lines.append(f"label: {flags(dataset['label'])}")
     lines.append(f"median difference in P: {100 * float(dataset['relative_difference'].median()):.3g} %")
     if "cheapest_model" in dataset:

@@ -11,7 +11,7 @@ import click
 
 from vijax.cli import options, process
 from vijax.cli.arguments import about, at_one_point, device, part, take_axes
-from vijax.cli.closing import close, how_many
+from vijax.cli.closing import close, how_many, wide_gap_advice
 from vijax.cli.kinds import Choice, Whole
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import progress, waiting
@@ -70,7 +70,7 @@ def best(out: str | None, plot: str | None, overwrite: bool, yes: bool, **given:
         _agree(asked, yes)
     whole, diagram, plane, climbed = _run(asked)
     _write(whole, diagram, plane, written, picture)
-    close("\n".join([climbed, *_lines(whole)]), written, picture)
+    close("\n".join([climbed, *_wide_gap(asked), *_lines(whole)]), written, picture)
 
 
 def _check_format(picture: Path) -> None:
@@ -175,6 +175,16 @@ def _lines(whole: dict[str, Any]) -> Iterable[str]:
     from vijax.design.report_lines import lines, table
 
     return table(whole) if "over" in whole else lines(whole)
+
+
+def _wide_gap(asked: DesignRequest) -> list[str]:
+    """Say that starts matter where the survey has but one and a gap is wide."""
+    import numpy as np
+
+    if asked.search["starts"] > 1:
+        return []
+    d, gamma = np.array([(float(pair.d), float(pair.gamma)) for pair in (one.pair() for one in asked.devices)]).T
+    return wide_gap_advice(d, gamma)
 
 
 def _devices(

@@ -9,7 +9,7 @@ import click
 
 from vijax.cli import options, process
 from vijax.cli.arguments import about, device, take_axes
-from vijax.cli.closing import finish, pace, statuses
+from vijax.cli.closing import finish, pace, statuses, wide_gap_lines
 from vijax.cli.excitation import harmonic_options, take_excitation
 from vijax.cli.kinds import Whole
 from vijax.cli.page import Page, Sections
@@ -104,6 +104,7 @@ def _summary(dataset: "xr.Dataset", count: int, seconds: float) -> str:
         [
             pace(count, seconds, "points"),
             statuses(dataset["status"], "points"),
+            *wide_gap_lines(dataset, "vijax sweep "),
             f"points by label: {', '.join(f'{name} {n:,}' for name, n in [*common, ('others', rest)] if n)}",
         ]
     )

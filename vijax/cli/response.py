@@ -8,7 +8,7 @@ import click
 
 from vijax.cli import options, process
 from vijax.cli.arguments import at_one_point, device, take_axes
-from vijax.cli.closing import finish, how_many
+from vijax.cli.closing import finish, harvest, how_many
 from vijax.cli.excitation import excitation_options, take_excitation
 from vijax.cli.kinds import Periods, Whole
 from vijax.cli.page import Page, Sections
@@ -59,7 +59,7 @@ def _summary(dataset: "xr.Dataset") -> str:
     spread = "(too few for an error)" if math.isnan(off) else f"+- {off:.1g}"
     lines = [
         f"excitation: {dataset.attrs['excitation']}",
-        f"P: {number['P']:.6g} +- {number['P_stderr']:.1g} J per half period over "
+        f"P: {harvest(number['P'], number['power'], number['P_stderr'])} over "
         f"{how_many(dataset.sizes['realisation'], 'realisations')}",
         f"impacts: {number['impacts_per_period']:.4g} a period, up to {number['max_impact_speed']:.4g} m/s; one in a "
         f"thousand deeper than {deep:.4g} {spread} mm; past the limit {number['beyond_limit']:.2%}",

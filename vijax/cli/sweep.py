@@ -9,7 +9,7 @@ import click
 
 from vijax.cli import membranes, options, process
 from vijax.cli.arguments import device, take_axes
-from vijax.cli.closing import finish, limit_lines, statuses, tally
+from vijax.cli.closing import finish, harvest, limit_lines, statuses, tally, wide_gap_lines
 from vijax.cli.excitation import excitation_options, take_excitation
 from vijax.cli.kinds import Choice, Periods, Real, Whole
 from vijax.cli.page import Page, Sections
@@ -203,7 +203,7 @@ def _summary(dataset: "xr.Dataset") -> str:
     if "attractors" in dataset:
         number = tally(dataset["attractors"].values, lambda found: str(found), order=lambda found: found)
         lines.append(f"cells by attractors found: {number}")
-    lines += limit_lines(dataset)
+    lines += [*wide_gap_lines(dataset), *limit_lines(dataset)]
     if "P" in dataset and dataset["P"].size == 1:
         lines.append(f"P: {_only(dataset)}")
     elif {"P", "admissible"} <= set(dataset):
@@ -214,12 +214,13 @@ def _summary(dataset: "xr.Dataset") -> str:
 
 def _place(peak: "xr.DataArray", dataset: "xr.Dataset") -> str:
     where = ", ".join(f"{dim} = {float(peak[dim]):.6g}" for dim in dataset["P"].dims)
-    return f"{float(peak):.6g} J per half period at {where}"
+    return f"{harvest(float(peak), float(peak * peak['omega'] / math.pi))} at {where}"
 
 
 def _only(dataset: "xr.Dataset") -> str:
     """Say what the only cell of a map gives, and whether to believe it."""
-    said = f"{float(dataset['P'].squeeze()):.6g} J per half period"
+    P = dataset["P"].squeeze()
+    said = harvest(float(P), float(P * P["omega"] / math.pi))
     if "admissible" not in dataset:
         return said
     return f"{said}, admissible" if bool(dataset["admissible"].squeeze()) else see("model", f"{said}, inadmissible")

@@ -46,7 +46,7 @@ def lines(report: dict[str, Any]) -> Iterator[str]:
         yield from _best(best, report["objective"])
         yield from _dropped(report)
         yield from _off_design(report["extents"], report["arrival"])
-        yield from _around(report["surroundings"])
+        yield from _around(report["surroundings"], best["power"] / best["P"])
         yield from _in_plane(report["plane"])
         yield from _others(best, report["others"], report["objective"])
         yield from _off(report)
@@ -202,7 +202,8 @@ def _off_design(extents: list[dict[str, Any]], arrival: dict[str, Any] | None) -
         yield f"  {100 * arrival['share']:.3g} % of the balls arrive there in {arrival['periods']:,} periods{when}"
 
 
-def _around(around: dict[str, Any] | None) -> Iterator[str]:
+def _around(around: dict[str, Any] | None, rate: float) -> Iterator[str]:
+    """Say what attracts at the best design; `rate` is the watts of a joule per half period."""
     if around is None:
         return
     if around["below"]:
@@ -211,7 +212,8 @@ def _around(around: dict[str, Any] | None) -> Iterator[str]:
     shown = around["attractors"][:_MOST_ROWS]
     for one in shown:
         flaw = "" if one["admissible"] else "  inadmissible"
-        yield f"    {one['label']:<18}{100 * one['share']:>8.3g} %   P {amount(one['P'], 'J', 5)}{flaw}"
+        gives = f"P {amount(one['P'], 'J', 5)}, {amount(one['P'] * rate, 'W', 5)}"
+        yield f"    {one['label']:<18}{100 * one['share']:>8.3g} %   {gives}{flaw}"
     if len(around["attractors"]) > len(shown):
         yield f"    and {len(around['attractors']) - len(shown)} more"
 
@@ -265,7 +267,8 @@ def _off(report: dict[str, Any]) -> Iterator[str]:
     nominal = report["best"]["P"]
     counted = _counted(spread)
     for name in ("mean", "worst"):
-        yield f"  {name} P {amount(spread[name], 'J')}, {100 * spread[name] / nominal:.4g} % of nominal{counted[name]}"
+        gives = f"{amount(spread[name], 'J')}, {amount(spread[name] * report['best']['power'] / nominal, 'W')}"
+        yield f"  {name} P {gives}, {100 * spread[name] / nominal:.4g} % of nominal{counted[name]}"
     shares = ", ".join(f"{100 * spread[name]:.3g} % {text}" for name, text in _LOSSES.items())
     yield f"  of the devices, {shares}"
     yield from _ahead(report)
@@ -318,7 +321,8 @@ def table(report: dict[str, Any]) -> Iterator[str]:
             continue
         tuned = ", ".join(quantity(*item) for item in best["values"].items())
         spread = f", at worst {amount(one['spread']['worst'], 'J', 5)}" if one["spread"] else ""
-        yield f"{name} {value:.5g}: {tuned}, {best['label']}, P {amount(best['P'], 'J', 5)}{spread}, {_held(best)}"
+        gives = f"P {amount(best['P'], 'J', 5)}, {amount(best['power'], 'W', 5)}"
+        yield f"{name} {value:.5g}: {tuned}, {best['label']}, {gives}{spread}, {_held(best)}"
 
 
 def _held(best: dict[str, Any]) -> str:

@@ -89,6 +89,9 @@ def _named(*quantities: Quantity) -> dict[str, Quantity]:
 START, START_REACH = (0.05853, -0.47898), 0.49
 """The start unless given, u0 and v0, off the centre of every gap; the displacement is at most this part of the gap."""
 
+FREE_GAP = 2 / math.pi**2
+"""Gap d above which a ball on level ground may fly for ever without an impact, with amplitude 1/pi^2."""
+
 _RIGID = 'a rigid wall is wall="rigid" (kappa=None in an ImpactPair)'
 _GAP = "it is the free travel of the ball in units of A pi^2/omega^2"
 _TRAVEL = "it is the free travel of the ball in m; membranes a distance D apart have s = D - 2 r_b"
