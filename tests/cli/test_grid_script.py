@@ -8,18 +8,22 @@ import subprocess
 import sys
 import time
 
+import click
 import numpy as np
 import pytest
 import xarray as xr
 
 import vijax
 from scripts import grid as script
-from tests.helpers import SCRIPTS
+from tests.helpers import SCRIPTS, no_cell_runs
 from vijax.cli import closing, progress
+from vijax.cli.sweep import _place
+from vijax.cli.sweep import sweep as sweep_page
 from vijax.model.records import Status
 from vijax.planes import dataset, outputs, sweep
 from vijax.planes.sweep_settings import SweepSettings
 from vijax.plots import figure, kind_maps, number_maps
+from vijax.plots.style import axis_label
 
 TINY = ["--d", "0.2,0.3", "--kappa", "100:400:3:log", "--periods", "40"]
 
@@ -299,6 +303,36 @@ def test_a_wide_gap_from_one_start_says_that_starts_matter():
     assert not closing.wide_gap_lines(inclined)
     assert not closing.wide_gap_lines(level.assign_attrs(starts=64))
     assert not closing.wide_gap_lines(level.expand_dims(v0=[0.1, 0.2]))
+
+
+def test_hertz_are_shown_where_they_were_given(folder, capsys, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(number_maps, "power_map", drawn.append)
+    monkeypatch.setattr(figure, "save", lambda made, path: None)
+    with no_cell_runs():
+        for omega, store in (("1Hz:2Hz:3", "hertz.zarr"), ("7:12:3", "angular.zarr")):
+            names = ["--out", store, "--plot", "map.png"]
+            assert script.main(["--omega", omega, "--s", "0.2", "--omega0", "20,400", *names]) == 0
+    hertz, angular = drawn
+    np.testing.assert_allclose(hertz["omega"], [1, 1.5, 2], rtol=1e-14)
+    assert axis_label(hertz["omega"]) == r"$\omega / 2 \pi$ [Hz]"
+    np.testing.assert_allclose(angular["omega"], [7, 9.5, 12], rtol=1e-14)
+    assert axis_label(angular["omega"]) == r"$\omega$ [rad s$^{-1}$]"
+    np.testing.assert_allclose(
+        sweep.load(folder / "hertz.zarr")["omega"], 2 * np.pi * np.array([1, 1.5, 2]), rtol=1e-14
+    )
+
+
+def test_the_best_cell_is_in_hertz_where_they_were_given():
+    place = xr.DataArray(2e-5, {"omega": ((), 4 * np.pi, {"units": "rad s-1"}), "d": 0.2})
+    found = place.expand_dims("omega").to_dataset(name="P")
+    said = {}
+    for omega in ("1Hz:2Hz:3", "7:12:3"):
+        with click.Context(sweep_page, info_name="sweep") as context:
+            context.params = {"omega": omega}
+            said[omega] = _place(found["P"][0], found)
+    assert said["1Hz:2Hz:3"] == "2e-05 J per half period, 8e-05 W at omega = 2 Hz"
+    assert said["7:12:3"].endswith("at omega = 12.5664 rad s-1")
 
 
 def test_several_starts_from_arguments_to_store_and_picture(folder, capsys):

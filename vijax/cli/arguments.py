@@ -1,13 +1,19 @@
 """What options say: axes and device of the texts they were given, one point of them, parts of a whole."""
 
+import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
+
+import click
 
 from vijax.cli.options import PHYSICAL
 from vijax.model.quantities import AXES, of_both_walls, whole
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from vijax.model.choices import Walls
     from vijax.model.device import Harvester
     from vijax.model.pair import ImpactPair
@@ -29,6 +35,30 @@ def take_axes(given: dict[str, Any], defaults: Mapping[str, str]) -> dict[str, A
         taken = {*texts, *map(of_both_walls, texts)}
         texts = {name: text for name, text in defaults.items() if name not in taken} | texts
     return {name: parse_axis(name, text) for name, text in texts.items()}
+
+
+def given_in_hertz() -> set[str]:
+    """Return the angular frequencies that the running command was given in Hz: as axes, or as NAME=VALUES along one."""
+    from vijax.model import units
+
+    context = click.get_current_context(silent=True)
+    texts = {} if context is None else {name: text for name, text in context.params.items() if isinstance(text, str)}
+    for option in ("along", "over"):
+        name, _, text = texts.get(option, "").partition("=")
+        texts[name] = text
+    frequencies = [name for name, axis in AXES.items() if axis.unit == "rad/s" and name in texts]
+    return {name for name in frequencies if units.split(re.split("[:,]", texts[name])[0])[1] == "Hz"}
+
+
+def in_given_units(dataset: "xr.Dataset") -> "xr.Dataset":
+    """Return the dataset, for summaries and pictures, with coordinates in Hz where the running command got them in Hz."""
+    found = {}
+    for name in given_in_hertz() & set(map(str, dataset.coords)):
+        angular = dataset[name].variable
+        found[name] = angular.copy(data=angular.values / (2 * math.pi))
+        symbol = angular.attrs.get("symbol", name)
+        found[name].attrs = angular.attrs | {"units": "Hz", "symbol": rf"{symbol} / 2 \pi"}
+    return dataset.assign_coords(found)
 
 
 def device(constants: Iterable[str]) -> "Harvester":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vijax.cli import options, process
-from vijax.cli.arguments import device, take_axes
+from vijax.cli.arguments import device, in_given_units, take_axes
 from vijax.cli.closing import finish, pace, tally
 from vijax.cli.excitation import harmonic_options, take_excitation
 from vijax.cli.kinds import Real, Whole
@@ -102,7 +102,7 @@ def _check_picture(path: Path, planned: "SweepPlan") -> None:
 def _draw(dataset: "xr.Dataset", path: Path) -> None:
     from vijax import plots
 
-    plots.save(plots.basins(dataset), path)
+    plots.save(plots.basins(in_given_units(dataset)), path)
 
 
 def _summary(dataset: "xr.Dataset") -> Iterator[str]:

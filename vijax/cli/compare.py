@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vijax.cli import options, process
-from vijax.cli.arguments import device, part, take_axes
+from vijax.cli.arguments import device, in_given_units, part, take_axes
 from vijax.cli.closing import finish, flags, statuses, wide_gap_lines
 from vijax.cli.page import Page, Sections
 from vijax.cli.progress import counted
@@ -66,7 +66,7 @@ def _agree(planned: "Comparison", yes: bool) -> None:
 def _draw(dataset: "xr.Dataset", path: Path) -> None:
     from vijax import plots
 
-    plots.save(plots.difference_map(dataset), path)
+    plots.save(plots.difference_map(in_given_units(dataset)), path)
 
 
 def _summary(dataset: "xr.Dataset") -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from vijax.cli import options, process
-from vijax.cli.arguments import about, device, take_axes
+from vijax.cli.arguments import about, device, in_given_units, take_axes
 from vijax.cli.closing import finish, pace, statuses, wide_gap_lines
 from vijax.cli.excitation import harmonic_options, take_excitation
 from vijax.cli.kinds import Whole
@@ -55,7 +55,7 @@ def diagram(
     def draw(dataset: "xr.Dataset", path: Path) -> None:
         from vijax import plots
 
-        plots.save(plots.orbit_diagram(dataset, quantity), path)
+        plots.save(plots.orbit_diagram(in_given_units(dataset), quantity), path)
 
     finish(dataset, _summary(dataset, planned.count, seconds), store, picture, draw, overwrite)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from vijax.cli import membranes, options, process
-from vijax.cli.arguments import device, take_axes
+from vijax.cli.arguments import device, in_given_units, take_axes
 from vijax.cli.closing import finish, harvest, limit_lines, statuses, tally, wide_gap_lines
 from vijax.cli.excitation import excitation_options, take_excitation
 from vijax.cli.kinds import Choice, Periods, Real, Whole
@@ -180,7 +180,7 @@ def _draw(show: str, curves: "xr.Dataset | None", dataset: "xr.Dataset", path: P
     if curves is not None:
         plots.save(plots.curves(curves, dataset, ground=show), path)
         return
-    known = {"P": plots.power_map, "label": plots.label_map}
+    known, dataset = {"P": plots.power_map, "label": plots.label_map}, in_given_units(dataset)
     plots.save(known[show](dataset) if show in known else plots.variable_map(dataset, show), path)
 
 
@@ -213,7 +213,9 @@ def _summary(dataset: "xr.Dataset") -> str:
 
 
 def _place(peak: "xr.DataArray", dataset: "xr.Dataset") -> str:
-    where = ", ".join(f"{dim} = {float(peak[dim]):.6g}" for dim in dataset["P"].dims)
+    there = in_given_units(peak.to_dataset(name="P"))
+    units = {dim: f" {there[dim].attrs.get('units', '1')}".removesuffix(" 1") for dim in dataset["P"].dims}
+    where = ", ".join(f"{dim} = {float(there[dim]):.6g}{unit}" for dim, unit in units.items())
     return f"{harvest(float(peak), float(peak * peak['omega'] / math.pi))} at {where}"
 
 
