@@ -51,7 +51,7 @@ def given_in_hertz() -> set[str]:
 
 
 def in_given_units(dataset: "xr.Dataset") -> "xr.Dataset":
-    """Return the dataset, for summaries and pictures, with coordinates in Hz where the running command got them in Hz."""
+    """Return the dataset to be shown, with coordinates in Hz where the running command got them in Hz."""
     found = {}
     for name in given_in_hertz() & set(map(str, dataset.coords)):
         angular = dataset[name].variable

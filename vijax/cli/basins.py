@@ -44,7 +44,7 @@ def coexisting(
     parameters: how many attractors coexist in every cell, found from so many starts, and the share of each.
     """
     with process.door():
-        out, plot = targets(given.pop("out"), given.pop("plot"), _FILES, overwrite)
+        out, plot, rows = targets(given.pop("out"), given.pop("plot"), _FILES, overwrite, csv=given.pop("csv"))
         axes, made = take_axes(given, _CELL), device(constants)
         planned = _plan(axes, made, starts, speed, seed, merge_mirrors, given)
         if plot is not None:
@@ -59,7 +59,8 @@ def coexisting(
     from vijax.planes.basins import matched
 
     dataset = matched(swept, merge_mirrors)
-    finish(dataset, "\n".join([said, *_summary(dataset)]), out, plot, _draw, overwrite)
+    said = "\n".join([said, *_summary(dataset)])
+    finish(dataset, said, out, plot, _draw, overwrite, table=rows, rows_of="fraction")
 
 
 def _plan(
@@ -151,7 +152,7 @@ def _sections() -> Sections:
             options.wall_option(),
         ],
         "Excitation": harmonic_options(),
-        "Files": options.file_options(),
+        "Files": options.file_options(row="attractor of a cell"),
         "Large runs": [options.size_option()],
     }
 
@@ -168,5 +169,5 @@ basins = Page(
     coexisting,
     _sections(),
     _EXAMPLES,
-    f"{options.VALUES} With neither --out nor --plot, basins.zarr and basins.png are written.",
+    f"{options.VALUES} With none of --out, --csv and --plot, basins.zarr and basins.png are written.",
 )

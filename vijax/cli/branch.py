@@ -61,7 +61,13 @@ class BranchRequest:
 
 
 def branches(
-    quantity: str, out: str | None, plot: str | None, overwrite: bool, constants: tuple[str, ...], **given: Any
+    quantity: str,
+    out: str | None,
+    csv: str | None,
+    plot: str | None,
+    overwrite: bool,
+    constants: tuple[str, ...],
+    **given: Any,
 ) -> None:
     """Follow periodic orbits, and locate what they meet.
 
@@ -70,7 +76,7 @@ def branches(
     the device's own value, or where there are orbits within its bounds.
     """
     with process.door():
-        store, picture = targets(out, plot, _FILES, overwrite)
+        store, picture, rows = targets(out, plot, _FILES, overwrite, csv=csv)
         asked = _asked(constants, **given)
         _check_picture(picture, quantity)
     from vijax.orbits import branch_dataset, switching
@@ -94,7 +100,8 @@ def branches(
         plots.save(plots.branches(dataset, quantity), path)
 
     dataset = branch_dataset.dataset(followed, asked.device)
-    finish(dataset, _summary(followed, seconds), store, picture, draw, overwrite)
+    said = _summary(followed, seconds)
+    finish(dataset, said, store, picture, draw, overwrite, table=rows, rows_of=asked.along)
 
 
 def _asked(
@@ -240,7 +247,7 @@ def _sections() -> Sections:
             *membranes.membrane_options("law of the soft walls"),
         ],
         "Excitation": harmonic_options(),
-        "Files": [options.quantity_option(BRANCH_QUANTITIES), *options.file_options()],
+        "Files": [options.quantity_option(BRANCH_QUANTITIES), *options.file_options(row="orbit")],
     }
 
 
@@ -258,5 +265,5 @@ branch = Page(
     branches,
     _sections(),
     _EXAMPLES,
-    f"{options.VALUES} With neither --out nor --plot, branch.zarr and branch.png are written.",
+    f"{options.VALUES} With none of --out, --csv and --plot, branch.zarr and branch.png are written.",
 )

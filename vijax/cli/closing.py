@@ -25,15 +25,24 @@ def finish(
     picture: "Callable[[xr.Dataset, Path], Any]",
     overwrite: bool,
     kept: bool = False,
+    table: Path | None = None,
+    rows_of: str = "",
 ) -> None:
-    """Write the store, unless the run did, and the picture; say what was found and written, and how long it took."""
+    """Write the store, unless the run did, the table and the picture; say what was found, written, and in what time.
+
+    The table has a row for every element of the variable `rows_of`, or of the dataset.
+    """
     if out is not None and not kept:
         from vijax.planes.store import save
 
         save(dataset, out, overwrite=overwrite)
+    if table is not None:
+        from vijax.runtime.tables import write_dataset
+
+        write_dataset(dataset, table, rows_of)
     if plot is not None:
         picture(dataset, plot)
-    close(summary, out, plot)
+    close(summary, out, table, plot)
 
 
 def close(summary: str, *written: Path | None) -> None:

@@ -25,7 +25,7 @@ def difference_map(constants: tuple[str, ...], tolerance: str | None, overwrite:
     """Map what rigid walls change: the energy and the attractor."""
     with process.door():
         picture = given.pop("plot")
-        out, plot = targets(given.pop("out"), picture, _FILES, overwrite)
+        out, plot, rows = targets(given.pop("out"), picture, _FILES, overwrite, csv=given.pop("csv"))
         axes, made = take_axes(given, PLANE), device(constants)
         planned = _plan(axes, made, tolerance, given)
         plot = drawn(plot, picture, planned.soft.cells.sizes)
@@ -36,7 +36,7 @@ def difference_map(constants: tuple[str, ...], tolerance: str | None, overwrite:
     from vijax.planes.compare import run
 
     dataset, pace = counted(planned.count, lambda tell: run(planned, tell))
-    finish(dataset, f"{pace}\n{_summary(dataset)}", out, plot, _draw, overwrite)
+    finish(dataset, f"{pace}\n{_summary(dataset)}", out, plot, _draw, overwrite, table=rows)
 
 
 def _plan(axes: dict[str, Any], device: Any, tolerance: str | None, given: dict[str, Any]) -> "Comparison":
@@ -116,5 +116,5 @@ compare = Page(
     difference_map,
     _sections(),
     _EXAMPLES,
-    f"{options.VALUES} With neither --out nor --plot, comparison.zarr and comparison.png are written.",
+    f"{options.VALUES} With none of --out, --csv and --plot, comparison.zarr and comparison.png are written.",
 )

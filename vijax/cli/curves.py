@@ -75,12 +75,9 @@ def _asked(overwrite: bool, given: dict[str, Any]) -> CurvesRequest:
     from vijax.runtime import checks
 
     out, plot, rows, source = (given.pop(name) for name in ("out", "plot", "csv", "map"))
-    alone = out is None and plot is None
-    if alone and rows is not None:
-        store = picture = None
-    else:
-        store, picture = targets(out, plot, _FILES, overwrite)
-    table = _table(_ROWS if alone and rows is None else rows, overwrite)
+    if out is None and plot is None and rows is None:
+        (out, plot), rows = _FILES, _ROWS
+    store, picture, table = targets(out, plot, _FILES, overwrite, csv=rows)
     if picture is not None:
         check_format(picture)
     shown = {name: given.pop(name) for name in ("ground", "unstable")}
@@ -90,15 +87,6 @@ def _asked(overwrite: bool, given: dict[str, Any]) -> CurvesRequest:
     checks.choice("ground", shown["ground"], ["label", *variables])
     check_budget(**{name: budget[name] for name in ("max_rounds", "max_seconds") if name in budget})
     return CurvesRequest(labelled, (store, table, picture), budget, shown)
-
-
-def _table(rows: str | None, overwrite: bool) -> Path | None:
-    from vijax.runtime.files import check_ending, check_output
-
-    if rows is None:
-        return None
-    check_ending("csv", rows, ".csv")
-    return check_output("csv", rows, overwrite)
 
 
 def _planned(given: dict[str, Any]) -> "tuple[SweepPlan, list[str]]":
@@ -179,7 +167,7 @@ def _budget_options() -> list[click.Parameter]:
 
 
 def _sections() -> Sections:
-    store, out, plot, overwrite = "store of the map, in place of a plane", *options.file_options()
+    store = "store of the map, in place of a plane"
     ground = "what the map below the curves shows: label, P or another variable"
     limits = "follow also where orbits meet the penetration limit and the energy limit"
     faint = "draw grazings and limits of unstable orbits too, faintly"
@@ -202,12 +190,7 @@ def _sections() -> Sections:
             ),
             click.Option(["--unstable"], is_flag=True, help=faint),
         ],
-        "Files": [
-            out,
-            click.Option(["--csv"], type=NewFile(), metavar="FILE.csv", help="table to write, a row a point"),
-            plot,
-            overwrite,
-        ],
+        "Files": options.file_options(row="point"),
         "Large runs": [options.size_option()],
     }
 

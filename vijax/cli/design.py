@@ -56,21 +56,23 @@ class DesignRequest:
     search: dict[str, Any]
 
 
-def best(out: str | None, plot: str | None, overwrite: bool, yes: bool, **given: Any) -> None:
+def best(out: str | None, csv: str | None, plot: str | None, overwrite: bool, yes: bool, **given: Any) -> None:
     """Find the membrane that harvests most and can be built.
 
     Tuned are omega0 (or k, or kappa), s or d, r, A, omega, beta or gamma, and the constants of the membrane. With
     --over the best design is found for every value of an axis.
     """
     with process.door():
-        written, picture = targets(out, plot, _FILES, overwrite, ".json")
+        written, picture, rows = targets(out, plot, _FILES, overwrite, ".json", csv=csv)
         if picture is not None:
             _check_format(picture)
         asked = _asked(**given)
         _agree(asked, yes)
     whole, diagram, plane, climbed = _run(asked)
     _write(whole, diagram, plane, written, picture)
-    close("\n".join([climbed, *_wide_gap(asked), *_lines(whole)]), written, picture)
+    if rows is not None:
+        _write_optima(whole, rows)
+    close("\n".join([climbed, *_wide_gap(asked), *_lines(whole)]), written, rows, picture)
 
 
 def _check_format(picture: Path) -> None:
@@ -169,6 +171,31 @@ def _write(
         plots.save(plots.design(diagram, whole, plane), picture)
     elif picture is not None:
         plots.save(plots.design_map(whole), picture)
+
+
+def _write_optima(whole: dict[str, Any], path: Path) -> None:
+    """Write the optima, a row each: along an axis the best design at every value."""
+    import pandas as pd
+
+    from vijax.model.units import UNITS
+    from vijax.runtime.tables import write_table
+
+    if "over" in whole:
+        name, values = whole["over"]["name"], whole["over"]["values"]
+        found = [({name: value}, one["best"]) for value, one in zip(values, whole["designs"], strict=True)]
+    else:
+        found = [({}, one) for one in (whole["best"], *whole["others"])]
+    rows = [place | _row(one) for place, one in found if one is not None or place]
+    tuned = {key: UNITS.get(key, "") for row in rows for key in row}
+    write_table(pd.DataFrame(rows), tuned | {"P": "J", "P_stderr": "J", "power": "W", "penetration": "m"}, path)
+
+
+def _row(one: dict[str, Any] | None) -> dict[str, Any]:
+    """Return what a table says of an optimum; nothing where there is none."""
+    if one is None:
+        return {}
+    largest = {name: max(one[name]) for name in ("penetration", "energy_ratio")}
+    return one["values"] | {name: one[name] for name in ("label", "P", "P_stderr", "power")} | largest
 
 
 def _lines(whole: dict[str, Any]) -> Iterable[str]:
@@ -343,7 +370,7 @@ def _sections() -> Sections:
             click.Option(["--curves"], metavar="NAME,NAME", help=curves),
         ],
         "Device": [*options.axis_options(PARAMETERS), *options.device_options()],
-        "Files": options.file_options(".json", "report"),
+        "Files": options.file_options(".json", "report", row="optimum"),
         "Large runs": [options.size_option()],
     }
 
@@ -362,5 +389,5 @@ design = Page(
     best,
     _sections(),
     _EXAMPLES,
-    f"{options.VALUES} With neither --out nor --plot, design.json and design.png are written.",
+    f"{options.VALUES} With none of --out, --csv and --plot, design.json and design.png are written.",
 )

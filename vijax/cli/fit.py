@@ -33,6 +33,7 @@ def fitted(
     wall: str,
     constants: tuple[str, ...],
     out: str | None,
+    csv: str | None,
     plot: str | None,
     overwrite: bool,
     **given: Any,
@@ -43,7 +44,7 @@ def fitted(
     its speed in m/s. The options of the device give what is known of it, and where the search begins.
     """
     with process.door():
-        report, picture = targets(out, plot, _FILES, overwrite, ".json")
+        report, picture, rows = targets(out, plot, _FILES, overwrite, ".json", csv=csv)
         excitation = take_excitation(given)
         _, known = at_one_point(take_axes(given, _DEVICE), device(constants))
         time, side, *speed = columns("IMPACTS", impacts, _COLUMNS)
@@ -67,16 +68,24 @@ def fitted(
                 wall=wall,  # type: ignore[arg-type] # checked there
             )
             show(1, 1)
-    _write(found, report, picture)
-    close(str(found), report, picture)
+    _write(found, report, rows, picture)
+    close(str(found), report, rows, picture)
 
 
-def _write(found: "Fit", report: Path | None, picture: Path | None) -> None:
+def _write(found: "Fit", report: Path | None, rows: Path | None, picture: Path | None) -> None:
     from vijax import plots
     from vijax.runtime.files import write_json
 
     if report is not None:
         write_json(found.report(), report)
+    if rows is not None:
+        import pandas as pd
+
+        from vijax.runtime.tables import write_table
+
+        units = found.report()["units"]
+        listed = [(name, value, found.stderr[name], units[name]) for name, value in found.values.items()]
+        write_table(pd.DataFrame(listed, columns=["name", "value", "stderr", "unit"]), {}, rows)
     if picture is not None:
         plots.save(plots.fit(found), picture)
 
@@ -99,7 +108,7 @@ def _sections() -> Sections:
         ],
         "Device": [*options.axis_options(axes), *options.device_options()],
         "Excitation": excitation_options(noise=False),
-        "Files": options.file_options(".json", "report"),
+        "Files": options.file_options(".json", "report", row="fitted quantity"),
     }
 
 
@@ -114,5 +123,6 @@ fit = Page(
     fitted,
     _sections(),
     _EXAMPLES,
-    f"{options.VALUES} Each is one number here. With neither --out nor --plot, fit.json and fit.png are written.",
+    f"{options.VALUES} Each is one number here. With none of --out, --csv and --plot, fit.json and fit.png are "
+    "written.",
 )

@@ -96,10 +96,11 @@ def quantity_option(quantities: Sequence[str]) -> click.Parameter:
     return click.Option(["--quantity"], type=chosen, metavar="NAME", default="v_in", show_default=True, help=text)
 
 
-def file_options(ending: str = ".zarr", what: str = "store") -> list[click.Parameter]:
-    """Make the options for the store (or what is written in its place), the picture, and whether to replace either."""
+def file_options(ending: str = ".zarr", what: str = "store", row: str = "cell") -> list[click.Parameter]:
+    """Make the options for the store (or what is written in its place), the table, the picture, and to replace them."""
     return [
         click.Option(["--out"], type=NewFile(), metavar=f"FILE{ending}", help=f"{what} to write"),
+        click.Option(["--csv"], type=NewFile(), metavar="FILE.csv", help=f"table to write, a row a {row}"),
         click.Option(["--plot"], type=NewFile(), metavar="FILE.png", help="picture to write"),
         click.Option(["--overwrite"], is_flag=True, help="replace what is there"),
     ]

@@ -33,6 +33,7 @@ def diagram(
     constants: tuple[str, ...],
     quantity: str,
     out: str | None,
+    csv: str | None,
     plot: str | None,
     overwrite: bool,
     yes: bool,
@@ -43,7 +44,7 @@ def diagram(
     Each point starts where the last one ended. Besides the axis swept one may have several values, a colour each.
     """
     with process.door():
-        store, picture = targets(out, plot, _FILES, overwrite)
+        store, picture, rows = targets(out, plot, _FILES, overwrite, csv=csv)
         planned = _plan(along, take_axes(given, {}), device(constants), given)
         if picture is not None:
             _check_picture(picture, planned, quantity)
@@ -57,7 +58,8 @@ def diagram(
 
         plots.save(plots.orbit_diagram(in_given_units(dataset), quantity), path)
 
-    finish(dataset, _summary(dataset, planned.count, seconds), store, picture, draw, overwrite)
+    said = _summary(dataset, planned.count, seconds)
+    finish(dataset, said, store, picture, draw, overwrite, table=rows, rows_of="phase")
 
 
 def _check_picture(path: Path, planned: "Diagram", quantity: str) -> None:
@@ -128,7 +130,7 @@ def _sections() -> Sections:
             options.dtype_option(),
         ],
         "Excitation": harmonic_options(),
-        "Files": [options.quantity_option(POINT_QUANTITIES), *options.file_options()],
+        "Files": [options.quantity_option(POINT_QUANTITIES), *options.file_options(row="impact")],
         "Large runs": [options.size_option()],
     }
 
@@ -145,5 +147,5 @@ orbit_diagram = Page(
     diagram,
     _sections(),
     _EXAMPLES,
-    f"{options.VALUES} With neither --out nor --plot, orbit_diagram.zarr and orbit_diagram.png are written.",
+    f"{options.VALUES} With none of --out, --csv and --plot, orbit_diagram.zarr and orbit_diagram.png are written.",
 )

@@ -24,14 +24,16 @@ _PERIODS = "forcing periods measured; all of a record"
 _FILES = ("response.zarr", "response.png")
 
 
-def realisations(constants: tuple[str, ...], out: str | None, plot: str | None, overwrite: bool, **given: Any) -> None:
+def realisations(
+    constants: tuple[str, ...], out: str | None, csv: str | None, plot: str | None, overwrite: bool, **given: Any
+) -> None:
     """Measure a device under noise or a measured record.
 
     It runs from many starts, each with noise of its own: how much it harvests, how fast and how deep its impacts are,
     and which of the attractors that it has without the noise it visits, for how long.
     """
     with process.door():
-        store, picture = targets(out, plot, _FILES, overwrite)
+        store, picture, rows = targets(out, plot, _FILES, overwrite, csv=csv)
         excitation = take_excitation(given)
         _, made = at_one_point(take_axes(given, _DEVICE), device(constants), given["wall"])
         if picture is not None:
@@ -42,7 +44,8 @@ def realisations(constants: tuple[str, ...], out: str | None, plot: str | None, 
 
         with progress(2, "stages") as show:
             dataset = response(made, excitation, **given, progress=show)
-    finish(dataset, _summary(dataset), store, picture, _draw, overwrite)
+    of = "time_share" if "time_share" in dataset else "P"
+    finish(dataset, _summary(dataset), store, picture, _draw, overwrite, table=rows, rows_of=of)
 
 
 def _draw(dataset: "xr.Dataset", path: Path) -> None:
@@ -90,7 +93,7 @@ def _sections() -> Sections:
             click.Option(["--transient"], type=Whole(0), default=100, show_default=True, help="periods to drop before"),
             click.Option(["--bins"], type=Whole(1), default=50, show_default=True, help="of the distributions"),
         ],
-        "Files": options.file_options(),
+        "Files": options.file_options(row="attractor"),
     }
 
 
@@ -106,6 +109,6 @@ response = Page(
     realisations,
     _sections(),
     _EXAMPLES,
-    f"{options.VALUES} Each is one number here. With neither --out nor --plot, response.zarr and response.png are "
-    "written.",
+    f"{options.VALUES} Each is one number here. With none of --out, --csv and --plot, response.zarr and response.png "
+    "are written.",
 )

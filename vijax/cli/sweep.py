@@ -44,7 +44,7 @@ def power_map(
         _check_show(show, given["until"], given["starts"])
         files = _FILES.get(show, (f"{show}_map.zarr", f"{show}_map.png"))
         picture = given.pop("plot")
-        out, plot = targets(given.pop("out"), picture, files, overwrite, goes_on=True)
+        out, plot, rows = targets(given.pop("out"), picture, files, overwrite, goes_on=True, csv=given.pop("csv"))
         axes, made = take_axes(given, PLANE), device(constants)
         planned = _plan(axes, made, _wanted(outputs, show, given["starts"]), given)
         plot = drawn(plot, picture, planned.cells.sizes)
@@ -64,7 +64,7 @@ def power_map(
     if curves:
         over, told = _curves(dataset)
         said += f"\n{told}"
-    finish(dataset, said, out, plot, partial(_draw, show, over), overwrite, kept=True)
+    finish(dataset, said, out, plot, partial(_draw, show, over), overwrite, kept=True, table=rows)
     if over is not None and over.attrs["ended"] == "stopped":
         process.stop("the map and the curves found until then are kept")
 
@@ -313,8 +313,8 @@ def sections() -> Sections:
 
 
 NEITHER = (
-    f"{options.VALUES} With neither --out nor --plot, power_map.zarr and power_map.png are written, or the same of "
-    "label_map or NAME_map, by what is shown."
+    f"{options.VALUES} With none of --out, --csv and --plot, power_map.zarr and power_map.png are written, or the same "
+    "of label_map or NAME_map, by what is shown."
 )
 GOES_ON = (
     "A map is written as it is made: stopped in whatever way, the same command goes on with it, and --overwrite begins "

@@ -12,16 +12,30 @@ def targets(
     overwrite: bool,
     ending: str = ".zarr",
     goes_on: bool = False,
-) -> tuple[Path | None, Path | None]:
-    """Name the store and the picture to write, both by default where neither was given; raise unless they can be.
+    csv: str | None = None,
+) -> tuple[Path | None, Path | None, Path | None]:
+    """Return the store, the picture and the table to write; without any the defaults of the first two.
 
     With `goes_on` a store that is there is left to `tiled_store.check`; its picture is drawn again if vijax drew it.
+
+    Raises:
+        ValueError, OSError: One of them cannot be written.
     """
-    if out is None and plot is None:
+    if out is None and plot is None and csv is None:
         out, plot = defaults
     store = None if out is None else _store(out, ending, overwrite, goes_on)
     again = goes_on and not overwrite and store is not None and store.exists()
-    return store, None if plot is None else _picture(plot, overwrite, again)
+    return store, None if plot is None else _picture(plot, overwrite, again), table_target(csv, overwrite)
+
+
+def table_target(csv: str | None, overwrite: bool) -> Path | None:
+    """Return the table to write, if there is one; raise unless it can be written."""
+    from vijax.runtime.files import check_ending, check_output
+
+    if csv is None:
+        return None
+    check_ending("csv", csv, ".csv")
+    return check_output("csv", csv, overwrite)
 
 
 def drawn(plot: Path | None, given: str | None, sizes: Mapping[str, int]) -> Path | None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from vijax.runtime import checks
 from vijax.runtime.context import door
-from vijax.runtime.files import replacing
+from vijax.runtime.tables import write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -99,6 +99,4 @@ def write_rows(dataset: "xr.Dataset", path: Path) -> None:
     """Write the table of `curve_rows` as CSV, whole or not at all; units stand in the header."""
     rows = curve_rows(dataset)
     units = {name: dataset[name].attrs.get("units", "1") for name in dataset.attrs["along"].split()}
-    rows = rows.rename(columns={name: f"{name} [{unit}]" for name, unit in units.items() if unit != "1"})
-    with replacing(path) as part:
-        rows.to_csv(part, index=False)
+    write_table(rows, units, path)
