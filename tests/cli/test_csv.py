@@ -20,7 +20,7 @@ def test_every_command_with_files_writes_a_table(name):
     page = command.vijax.get_command(click.Context(command.vijax), name)
     options = {option.name for option in page.params}
     assert ("csv" in options) == ("out" in options)
-    assert "csv" in options or name in ("docs", "explore")
+    assert "csv" in options or name in ("docs", "doctor", "explore")
 
 
 def test_a_map_has_a_row_a_cell(tmp_path, monkeypatch, capsys):

@@ -190,7 +190,7 @@ def test_a_long_run_asks_and_wants_yes(kept, folder, capsys, begun):
     plane = ["--d", "0.1:0.3:30000", "--kappa", "3:40:30000", "--out", "map.zarr"]
     assert script.main(plane) == 2
     said = capsys.readouterr().err
-    assert said.startswith("error: yes must be given beyond an hour or 10 GB; got 900,000,000 cells, up to 130 GB")
+    assert said.startswith("error: yes must be given beyond an hour or 10 GB; got 900,000,000 cells, up to 137 GB")
     assert said.count("\n") == 1
     assert not begun
     assert not list(folder.glob("*.zarr"))

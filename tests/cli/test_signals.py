@@ -55,10 +55,20 @@ def interrupted(code: str, seconds: float, folder: Path, arguments=(), which=sig
     return started.returncode, err
 
 
-@pytest.mark.parametrize("seconds", [0.15, 0.5, 1.0, 1.5])
-def test_ctrl_c_while_a_line_is_checked_is_one_line(tmp_path, seconds):
+@pytest.fixture(scope="module")
+def refusal():
+    """The seconds of processor time that a line takes which is refused."""
+    environment, before = os.environ | {"PYTHONPATH": str(ROOT)}, os.times()
+    command = [sys.executable, "-c", INTERRUPTIBLE, *REFUSED]
+    assert subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 2
+    after = os.times()
+    return after.children_user - before.children_user + after.children_system - before.children_system
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5, 0.75])
+def test_ctrl_c_while_a_line_is_checked_is_one_line(tmp_path, refusal, share):
     """Of a line that would be refused, too: an exception would be lost in some callback of an import."""
-    assert interrupted(INTERRUPTIBLE, seconds, tmp_path, REFUSED) == (130, STOPPED)
+    assert interrupted(INTERRUPTIBLE, share * refusal, tmp_path, REFUSED) == (130, STOPPED)
     assert not list(tmp_path.iterdir())
 
 

@@ -23,6 +23,7 @@ from vijax.model.device import Harvester
 from vijax.model.records import Status
 from vijax.planes import dataset, tiled_store
 from vijax.planes import sweep as sweeps
+from vijax.planes.outputs import default_outputs
 from vijax.planes.sweep import load, sweep
 
 AXES = {"d": np.linspace(0.1, 0.3, 5), "kappa": np.geomspace(3, 400, 4)}
@@ -645,6 +646,14 @@ def test_a_store_of_an_earlier_version_opens_and_goes_on(calls, out):
             load(out)
         assert "\n" not in str(error.value)
     sweep(**AXES, out=out, overwrite=True)
+
+
+def test_a_store_goes_on_without_outputs_that_came_in_a_later_version(calls, out):
+    earlier = [name for name in default_outputs(1) if name != "violated_limits"]
+    whole = sweep(**AXES, outputs=earlier)
+    stopped_after(8, out, **AXES, outputs=earlier)
+    xr.testing.assert_identical(sweep(**AXES, out=out).load(), whole)
+    assert "violated_limits" in sweep(**AXES, out=out, overwrite=True)
 
 
 def test_a_store_opens_anywhere_without_a_warning(calls, out):

@@ -91,14 +91,13 @@ def _asked(overwrite: bool, given: dict[str, Any]) -> CurvesRequest:
 
 def _planned(given: dict[str, Any]) -> "tuple[SweepPlan, list[str]]":
     """Plan the map that is to be run, and name what it will hold."""
-    from vijax.planes.outputs import ON_REQUEST, OUTPUTS
+    from vijax.planes.outputs import default_outputs
     from vijax.planes.sweep import check_room, plan
 
     # Where two others have several values d and kappa are the device's.
     several = [name for name in AXES if set(given[name] or "") & set(":,@")]
     axes, made = take_axes(given, PLANE if len(several) < 2 else {}), device(given.pop("constants"))
-    outputs = [name for name in OUTPUTS if name not in ON_REQUEST or name == "lyapunov"]
-    planned = plan(axes, outputs, made, SweepSettings(**given))
+    planned = plan(axes, [*default_outputs(1), "lyapunov"], made, SweepSettings(**given))
     check_room(planned)
     check_map(planned)
     return planned, [*planned.outputs]

@@ -1,6 +1,7 @@
 """`vijax sweep`: a map over a plane of parameters."""
 
 import math
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -46,7 +47,10 @@ def power_map(
         picture = given.pop("plot")
         out, plot, rows = targets(given.pop("out"), picture, files, overwrite, goes_on=True, csv=given.pop("csv"))
         axes, made = take_axes(given, PLANE), device(constants)
-        planned = _plan(axes, made, _wanted(outputs, show, given["starts"]), given)
+        from vijax.planes import tiled_store
+
+        wanted = _wanted(outputs, show, given["starts"], tiled_store.begun(out, overwrite))
+        planned = _plan(axes, made, wanted, given)
         plot = drawn(plot, picture, planned.cells.sizes)
         if plot is not None:
             _check_picture(plot, planned, show)
@@ -131,13 +135,12 @@ def _check_show(show: str, until: str, starts: int) -> None:
         raise ValueError(f"show must not be label unless cells are run until their attractor; got until {until}")
 
 
-def _wanted(outputs: str | None, show: str, starts: int) -> list[str] | None:
+def _wanted(outputs: str | None, show: str, starts: int, begun: Collection[str] | None) -> list[str]:
     if outputs is not None:
         return [name.strip() for name in outputs.split(",")]
-    from vijax.planes.outputs import ON_REQUEST, table
+    from vijax.planes.outputs import default_outputs
 
-    shown = "lyapunov" if show == "label" else show
-    return [name for name in table(starts) if name not in ON_REQUEST or name == shown]
+    return [*dict.fromkeys((*default_outputs(starts, begun), "lyapunov" if show == "label" else show))]
 
 
 def _plan(axes: dict[str, Any], device: Any, outputs: list[str] | None, given: dict[str, Any]) -> "SweepPlan":

@@ -193,6 +193,7 @@ def asked(planned: SweepPlan) -> dict[str, Any]:
     """Tell what a map holds besides its coordinates: settings, outputs, constants, tolerances."""
     # The constants that axes stand for are coordinates.
     constants = [name for name in CONSTANTS if name not in AXES]
+    limit = float(planned.device.energy_ratio_limit)
     return {
         **planned.settings.told,
         **record(planned.method, planned.settings.excitation),
@@ -207,7 +208,8 @@ def asked(planned: SweepPlan) -> dict[str, Any]:
             f"harvester_{argument}": float(value)
             for argument, value in named("penetration_limit", planned.device.depth_limit).items()
         },
-        "harvester_energy_ratio_limit": float(planned.device.energy_ratio_limit),
+        # Stores of earlier versions have no such limit, and go on.
+        **({} if limit == 1 else {"harvester_energy_ratio_limit": limit}),
         **{f"tolerance_{name}": value for name, value in simulate.tolerances(planned.settings.dtype).items()},
     }
 

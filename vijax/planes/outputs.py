@@ -1,7 +1,7 @@
 """The outputs of a map: what each variable is, its unit, what it needs of a `Summary`, and how it follows from that."""
 
 import enum
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from functools import reduce
 from operator import or_
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -151,6 +151,19 @@ VARIED = {
 }
 # Variables that few ask for, and that cost something: a tangent map along the motion, or another sum.
 ON_REQUEST = ("asymmetry", "lyapunov")
+# Variables that stores of earlier versions lack: a run that goes on with such a store does without them.
+_ADDED = ("violated_limits",)
+
+
+def default_outputs(starts: int, begun: Container[str] | None = None) -> tuple[str, ...]:
+    """Return the outputs of a map for which none are given.
+
+    Args:
+        starts: How many every cell has.
+        begun: The variables of the store with which the run goes on; None for a new map.
+    """
+    lacking = () if begun is None else [name for name in _ADDED if name not in begun]
+    return tuple(name for name in table(starts) if name not in ON_REQUEST and name not in lacking)
 
 
 def flagged(values: Any, kinds: type[enum.IntEnum]) -> Any:

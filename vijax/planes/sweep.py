@@ -21,7 +21,7 @@ from vijax.planes.axes import Axes, counted_periods, units_of_record
 from vijax.planes.cells import Cells, cells
 from vijax.planes.dataset import DEFAULT, SweepPlan, label, warn_if_held
 from vijax.planes.dispatch import Fields
-from vijax.planes.outputs import ON_REQUEST, table
+from vijax.planes.outputs import default_outputs, table
 from vijax.planes.store import load, save, view
 from vijax.planes.store_folder import check_store
 from vijax.planes.sweep_settings import MOST_STARTS, SweepSettings
@@ -162,6 +162,9 @@ def sweep(
         dtype=dtype,
         excitation=excitation,
     )
+    starts = checks.whole("starts", starts, 1, MOST_STARTS)
+    if outputs is None:
+        outputs = default_outputs(starts, tiled_store.begun(out, checks.flag("overwrite", overwrite)))
     return run(plan(axes, outputs, device, settings, refine, starts), progress, out, overwrite, workers)
 
 
@@ -187,7 +190,7 @@ def plan(
     tile_size.largest()  # what is wrong with the environment is said before anything runs
     starts = checks.whole("starts", starts, 1, MOST_STARTS)
     if outputs is None:
-        outputs = (name for name in table(starts) if name not in ON_REQUEST)
+        outputs = default_outputs(starts)
     wanted = checks.words("outputs", outputs, table(starts))
     device = one_device(device)
     given = {name: values for name, values in axes.items() if values is not None}

@@ -11,7 +11,7 @@ import math
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -249,6 +249,13 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
         if (listed := inventory.read(path)) and "birth" in listed and listed["birth"] != _birth(path):
             lock(path).write_text(listed["birth"], encoding="utf-8")
         yield
+
+
+def begun(out: str | Path | None, overwrite: bool) -> Collection[str] | None:
+    """Return the names of the variables of a study with which a run will go on; None if it begins a new one."""
+    if out is None or overwrite or not inventory.is_study(path := checks.path("out", out)):
+        return None
+    return store_names.layouts(path)
 
 
 def _check_same(planned: SweepPlan, path: Path) -> None:
