@@ -83,9 +83,11 @@ def test_a_process_that_has_to_ignore_ctrl_c_does(tmp_path):
 
 # Interrupts itself where Python drops an exception, and would then sleep for a minute.
 DROPPED = """
-import os, signal, time, weakref
+import os, signal, time
 import click
 from vijax.cli import process
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in the background
 
 class Dropped:
     def __del__(self):
@@ -112,6 +114,8 @@ TWICE = """
 import os, signal, time
 import click
 from vijax.cli import process
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in the background
 
 def work():
     with process.door():
