@@ -52,6 +52,9 @@ QUESTIONS = {
     "trajectory": _PAIR + "vijax.trajectory(pair, 0.0, 0.3, periods=20)",
     "trajectory by steps": _PAIR + "vijax.trajectory(pair, 0.0, 0.3, periods=20, method='ode')",
     "trajectory's gradient": _PAIR + "jax.grad(lambda v: vijax.trajectory(pair, 0.0, v, periods=20).states.u[-1])(0.3)",
+    "trajectory's jitted hessian": "def place(x):\n"
+    "    return vijax.trajectory(vijax.impact_pair(0.2, x[0], x[1]), 0.02, x[2], periods=12).states.u[-1]\n"
+    "jax.jit(jax.hessian(place))(np.array([50.0, 0.5, 0.3]))",
     "find_orbits": _ORBIT,
     "find_orbits of a law": "pair = vijax.impact_pair(0.2, 40.0, None)\n"
     "vijax.find_orbits(pair, 'LR', membrane=vijax.HuntCrossley(0.3))",
@@ -62,6 +65,10 @@ QUESTIONS = {
     "steady": _PAIR + "device = vijax.Harvester()\n"
     "orbit = vijax.find_orbits(device.pair(), '1:1')[1]\n"
     "jax.grad(lambda omega0: vijax.steady(dataclasses.replace(device, omega0=omega0), orbit).P)(device.omega0)",
+    "steady under harmonics": "device, pair = vijax.Harvester(), vijax.impact_pair(0.2, 40.0, 0.5, 0.02)\n"
+    "waves = vijax.Harmonics([1.0, 0.3, 0.1], [0.0, 0.7, -1.0])\n"
+    "orbit = vijax.orbits_from_states(pair, 0.0, 0.1, settle=100, excitation=waves)[0]\n"
+    "jax.grad(lambda kappa: vijax.steady(device, orbit, pair=dataclasses.replace(pair, kappa=kappa)).P)(40.0)",
     "sweep": f"vijax.sweep({_MAP})",
     "compare": f"found = vijax.compare({_MAP})\nvijax.rigid_from(vijax.cheapest_model(found, 0.1))",
     "basins": "vijax.basins(d=0.2, kappa=50.0, r=0.5, u0=np.linspace(-0.09, 0.09, 8), v0=np.linspace(-0.5, 0.5, 8))",
@@ -157,9 +164,9 @@ def main() -> None:
         ratios = [
             statistics.median(answers[which].processor / answers[2].processor for answers in every) for which in (0, 1)
         ]
-        print(f"{question:22} cold {cold:6.2f} s {ratios[0]:6.2f}     kept {kept:6.2f} s {ratios[1]:6.2f}")
+        print(f"{question:27} cold {cold:6.2f} s {ratios[0]:6.2f}     kept {kept:6.2f} s {ratios[1]:6.2f}")
     peers = [answers[2].clock for every in found.values() for answers in every]
-    print(f"{'peer':22} cold {statistics.median(peers):6.2f} s")
+    print(f"{'peer':27} cold {statistics.median(peers):6.2f} s")
 
 
 if __name__ == "__main__":
