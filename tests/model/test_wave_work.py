@@ -85,3 +85,15 @@ def test_nothing_is_lost_without_damping_but_what_a_little_would_lose_is_known()
     lost = duration * float(WEIGHTS @ np.asarray(rate) ** 2)
     assert float(work(jnp.asarray(0.0))) == 0.0
     assert float(jax.grad(work)(jnp.asarray(0.0))) == pytest.approx(lost, rel=1e-9)
+
+
+def test_more_harmonics_make_no_larger_program():
+    """All pairs of harmonics share one closed form."""
+    m = flow.membrane(vijax.impact_pair(0.2, 40.0, 0.5))
+
+    def size(waves):
+        slope = jax.jacfwd(lambda s: wave_work(m, waves, 0.02, 1.0, s, (0.3, -0.2)))
+        return str(jax.make_jaxpr(slope)(0.1)).count(" = ")
+
+    five = under(*((order, 0.1 + 0.1j) for order in range(1, 6)))
+    assert size(five) < 1.1 * size(five[:2])

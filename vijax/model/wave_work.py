@@ -1,13 +1,12 @@
 """The energy that a contact under several harmonics gives to a linear membrane."""
 
-import math
-
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from vijax.model.energy import SHORT_REACH, short_contact_work
 from vijax.model.flow import PI, Membrane, half_turn, phasor
-from vijax.model.waves import Wave, Waves, later, pushing
+from vijax.model.waves import Waves, stacked
 from vijax.runtime.arrays import Values
 
 
@@ -35,67 +34,53 @@ def wave_work(
         duration: Time from onset to exit.
         z: Rate of the penetration at onset and at exit, where the penetration is 0.
     """
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves((waves, side, duration))))
+    orders, c, q = stacked([wave.times(side) for wave in waves], shape)
+    n = PI * orders
+    sine, cosine = phasor(orders * duration)
+    turned = c * cosine - q * sine, q * cosine + c * sine
+    ends = _jet(n, (c, q), side * gamma), _jet(n, turned, side * gamma)
     z_in, z_out = z
-    first = tuple(wave.times(side) for wave in waves)
-    last = later(first, duration)
-    push_in, push_out = (pushing(part, side * gamma) for part in (first, last))
-    bends = push_in - m.mu * z_in, push_out - m.mu * z_out
-    given = 0.5 * (z_in - z_out) * (z_in + z_out)
-    for wave in first:
-        given = given + _received(m, wave, first, duration, z, bends)
-    fastest = PI * max((wave.order for wave in waves), default=1)
-    short = jnp.maximum(m.kappa, fastest) * duration < SHORT_REACH
-    jets = _jet(first, push_in), _jet(last, push_out)
-    work = jnp.where(short, short_contact_work(m.kappa, m.mu, jets, z, jnp.where(short, duration, 0.0)), given)
+    bends = ends[0][0] - m.mu * z_in, ends[1][0] - m.mu * z_out
+    cos_f, sin_f = _against_slopes(orders, (c, q), duration)
+    cos_side = cos_f - (cosine * bends[1] - bends[0] + n * sine * z_out + m.mu * (cosine * z_out - z_in))
+    sin_side = sin_f - (sine * bends[1] - n * (cosine * z_out - z_in) + m.mu * sine * z_out)
+    stiffness, loss = (m.kappa - n) * (m.kappa + n), m.mu * n
+    square = stiffness * stiffness + loss * loss
+    # At the undamped resonance (square = 0) the result is multiplied by mu = 0.
+    square = jnp.where(square > 0, square, 1.0)
+    by_cos, by_sin = stiffness * cos_side - loss * sin_side, stiffness * sin_side + loss * cos_side
+    received = ((c * by_cos - q * by_sin) / square).sum(axis=0)
+    short = jnp.maximum(m.kappa, PI * max(wave.order for wave in waves)) * duration < SHORT_REACH
+    given = 0.5 * (z_in - z_out) * (z_in + z_out) + received
+    work = jnp.where(short, short_contact_work(m.kappa, m.mu, ends, z, jnp.where(short, duration, 0.0)), given)
     # Exactly zero without damping, with the derivative in mu kept.
     return jnp.where(m.mu > 0, work, work - lax.stop_gradient(work))
 
 
-def _jet(waves: Waves, push: Values) -> list[Values]:
-    """List the forcing and its first two derivatives."""
-    rate = sum((-(wave.order * PI) * wave.q for wave in waves), start=jnp.zeros_like(push))
-    bend = sum((-((wave.order * PI) ** 2) * wave.c for wave in waves), start=jnp.zeros_like(push))
-    return [push, rate, bend]
+def _jet(n: Values, wave: tuple[Values, Values], gravity: Values) -> list[Values]:
+    """Compute the forcing and its first two derivatives from the cosine and sine parts [order, ...] of harmonics."""
+    c, q = wave
+    return [c.sum(axis=0) - gravity, -(n * q).sum(axis=0), -(n * n * c).sum(axis=0)]
 
 
-def _received(
-    m: Membrane,
-    wave: Wave,
-    waves: Waves,
-    duration: Values,
-    z: tuple[Values, Values],
-    bends: tuple[Values, Values],
-) -> Values:
-    """Integrate one harmonic's push times the velocity; `bends` is the acceleration at onset and at exit."""
-    n = wave.order * PI
-    sine, cosine = phasor(wave.order * duration)
-    (z_in, z_out), (bend_in, bend_out) = z, bends
-    cos_f, sin_f = _against_slopes(wave.order, waves, duration)
-    cos_side = cos_f - (cosine * bend_out - bend_in + n * sine * z_out + m.mu * (cosine * z_out - z_in))
-    sin_side = sin_f - (sine * bend_out - n * (cosine * z_out - z_in) + m.mu * sine * z_out)
-    stiffness, loss = (m.kappa - n) * (m.kappa + n), m.mu * n
-    square = stiffness * stiffness + loss * loss
-    # At the undamped resonance (square = 0) the answer is zero by mu.
-    square = jnp.where(square > 0, square, 1.0)
-    by_cos, by_sin = stiffness * cos_side - loss * sin_side, stiffness * sin_side + loss * cos_side
-    return (wave.c * by_cos - wave.q * by_sin) / square
+def _against_slopes(orders: Values, wave: tuple[Values, Values], s: Values) -> tuple[Values, Values]:
+    """Integrate cos(n x) and sin(n x), n = order pi, times the derivative of the forcing from 0 to s, for every order.
+
+    Products of two harmonics are harmonics of the sum and of the difference of both orders: axes [order of the
+    integral, order of the forcing, ...].
+    """
+    c, q = wave
+    more, less = _integrals(orders[None] + orders[:, None], s), _integrals(orders[None] - orders[:, None], s)
+    pace = 0.5 * PI * orders
+    by_cos = (pace * (c * (more[1] + less[1]) + q * (less[0] + more[0]))).sum(axis=1)
+    by_sin = (pace * (c * (less[0] - more[0]) + q * (more[1] - less[1]))).sum(axis=1)
+    return -by_cos, -by_sin
 
 
-def _against_slopes(order: int, waves: Waves, duration: Values) -> tuple[Values, Values]:
-    """Integrate cos(n s) and sin(n s), n = order pi, times the derivative of what harmonics push with."""
-    cos_f, sin_f = jnp.zeros_like(duration), jnp.zeros_like(duration)
-    for wave in waves:
-        # Integrals of the cosine and the sine of the sum and of the difference of both paces.
-        (even, rest), (even_gap, rest_gap) = (_integrals(wave.order + sign * order, duration) for sign in (1, -1))
-        pace = wave.order * PI
-        cos_f = cos_f - 0.5 * pace * (wave.c * (rest + rest_gap) + wave.q * (even_gap + even))
-        sin_f = sin_f - 0.5 * pace * (wave.c * (even_gap - even) + wave.q * (rest - rest_gap))
-    return cos_f, sin_f
-
-
-def _integrals(order: int, s: Values) -> tuple[Values, Values]:
-    """Integrate cos(n x) and sin(n x), n = order pi, from 0 to s."""
-    if order == 0:
-        return s, jnp.zeros_like(s)
-    sine, _, versine, _ = half_turn(abs(order) * s)
-    return sine / (abs(order) * PI), math.copysign(1.0, order) * versine / (abs(order) * PI)
+def _integrals(orders: Values, s: Values) -> tuple[Values, Values]:
+    """Integrate cos(n x) and sin(n x), n = order pi, from 0 to s; of order 0 that is s and 0."""
+    size = jnp.abs(orders)
+    sine, _, versine, _ = half_turn(size * s)
+    n = PI * jnp.where(size > 0, size, 1.0)
+    return jnp.where(size > 0, sine / n, s), jnp.sign(orders) * versine / n

@@ -1,5 +1,7 @@
 """The harmonics of the forcing, and what a ball does under them that meets no wall, or never leaves one."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -66,14 +68,11 @@ def pushing(waves: Waves, gamma: Values) -> Values:
 
 def drift(waves: Waves, gamma: Values, v: Values, s: Values) -> tuple[Values, Values]:
     """Compute how far a ball of velocity v flies in a time s that meets no wall, and its velocity then."""
-    zero = jnp.zeros_like(s)
-    first = next((wave for wave in waves if wave.order == 1), Wave(1, zero, zero))
-    rise, speed = flight(Force(first.c, first.q, gamma), v, s)
-    if others := _higher(waves):
-        k, force = _on_own_clocks(others, s)
-        further, faster = flight(force, jnp.zeros_like(s), k * s)
-        rise, speed = rise + (further / k**2).sum(axis=0), speed + (faster / k).sum(axis=0)
-    return rise, speed
+    if _is_first(waves):
+        return flight(Force(waves[0].c, waves[0].q, gamma), v, s)
+    k, (c, q, g, start) = _on_own_clocks(waves, gamma, v, s)
+    rise, speed = flight(Force(c, q, g), start, k * s)
+    return (rise / k**2).sum(axis=0), (speed / k).sum(axis=0)
 
 
 def mean_velocity(waves: Waves, v: Values) -> Values:
@@ -96,30 +95,38 @@ def held_response(m: Membrane, waves: Waves, side: Values, gamma: Values) -> tup
 
 def pressed(m: Membrane, waves: Waves, side: Values, gamma: Values, z: Values, s: Values) -> tuple[Values, Values]:
     """Compute penetration and rate of a ball that entered a membrane at rate z a time s ago; waves from the onset."""
-    zero = jnp.zeros_like(s)
-    first = next((wave for wave in waves if wave.order == 1), Wave(1, zero, zero))
-    w, rate = oscillate(m, Force(side * first.c, side * first.q, side * gamma), zero, z, s)
-    if others := _higher(waves):
-        k, force = _on_own_clocks([wave.times(side / wave.order**2) for wave in others], s)
-        deeper, faster = oscillate(_slowed(m, k), force, zero, zero, k * s)
-        w, rate = w + deeper.sum(axis=0), rate + (k * faster).sum(axis=0)
-    return w, rate
+    if _is_first(waves):
+        return oscillate(m, Force(side * waves[0].c, side * waves[0].q, side * gamma), jnp.zeros_like(s), z, s)
+    k, (c, q, g, start) = _on_own_clocks([wave.times(side / wave.order**2) for wave in waves], side * gamma, z, s)
+    w, rate = oscillate(_slowed(m, k), Force(c, q, g), jnp.zeros_like(c), start, k * s)
+    return w.sum(axis=0), (k * rate).sum(axis=0)
 
 
-def _higher(waves: Waves) -> list[Wave]:
-    return [wave for wave in waves if wave.order != 1]
+def _is_first(waves: Waves) -> bool:
+    return len(waves) == 1 and waves[0].order == 1
 
 
-def _on_own_clocks(waves: list[Wave], s: Values) -> tuple[Values, Force]:
-    """Stack harmonics, so that a program holds the closed forms once for all; each is the first on its own clock.
+def _on_own_clocks(
+    waves: Sequence[Wave], gravity: Values, start: Values, s: Values
+) -> tuple[Values, tuple[Values, ...]]:
+    """Stack harmonics, each the first harmonic on its own clock, so that a program contains the closed forms once.
 
     Returns:
-        The orders, shaped to go before the axes of s, and the harmonics along a new first axis.
+        The orders, with axes that broadcast against s; the cosine and sine parts along a new first axis, gravity, and
+        the rate at the start. Gravity and rate belong to the first harmonic and are 0 for the others.
     """
-    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves((waves, s))))
-    k = jnp.reshape(jnp.array([wave.order for wave in waves], s.dtype), (-1, *(1 for _ in shape)))
+    zero = jnp.zeros_like(s)
+    waves = waves if any(wave.order == 1 for wave in waves) else [Wave(1, zero, zero), *waves]
+    shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves((waves, gravity, start, s))))
+    orders, c, q = stacked(waves, shape)
+    first = orders == 1
+    return orders, (c, q, jnp.where(first, gravity, 0.0), jnp.where(first, start, 0.0))
+
+
+def stacked(waves: Sequence[Wave], shape: tuple[int, ...]) -> tuple[Values, Values, Values]:
+    """Stack harmonics of a shape along a new first axis: their orders, which broadcast, cosine and sine parts."""
     c, q = (jnp.stack([jnp.broadcast_to(getattr(wave, part), shape) for wave in waves]) for part in ("c", "q"))
-    return k, Force(c, q, jnp.zeros_like(c))
+    return jnp.reshape(jnp.array([wave.order for wave in waves], c.dtype), (-1, *(1 for _ in shape))), c, q
 
 
 def _slowed(m: Membrane, k: Values | int) -> Membrane:
