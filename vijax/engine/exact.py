@@ -73,7 +73,7 @@ def _soft_contact(
         exits = which == 0
         # Where there is none, the harmless time 1 stands there meanwhile; a crest that is not known is NaN.
         known, s = jnp.where(exits, ends, turned), jnp.where(exits, duration, when)
-        found, state = implicit_state(_exit_or_crest, jnp.where(known, s, 1.0), (which, args))
+        found, state = implicit_state(_exit_or_crest, _contact_rates, jnp.where(known, s, 1.0), (which, args))
         s, state = jnp.where(known, found, s), jnp.where(known, state, jnp.where(exits, z0, w0 + 0.0 * when))
         return jnp.where(exits, s, seen[0]), jnp.where(exits, state, seen[1]), state
 
@@ -89,10 +89,25 @@ def _exit_or_crest(s, of):
     return jnp.where(which == 0, w, z), jnp.where(which == 0, z, w)
 
 
+def _contact_rates(s, of, state):
+    """Compute the derivatives of `_exit_or_crest` in s: w' and w'' at the exit, w'' and w' = 0 at the crest."""
+    which, (m, force, _, _) = of
+    exits = which == 0
+    # At the exit w = 0 and the state is w'; at the crest w' = 0 and the state is w.
+    acceleration = force.at(s) - jnp.where(exits, m.mu, m.kappa * m.kappa) * state
+    return jnp.where(exits, state, acceleration), jnp.where(exits, acceleration, 0.0)
+
+
 def _crossing(s, args):
     force, side, distance, v0 = args
     rise, v = flow.flight(force, v0, s)
     return distance - side * rise, v
+
+
+def _flight_rates(s, args, v):
+    """Compute the derivatives of `_crossing` in s: of the distance to the wall, and of the velocity."""
+    force, side, _, _ = args
+    return -side * v, force.at(s)
 
 
 def _rigid_contact(pair: ImpactPair, side: Scalar, t: Scalar, speed: Scalar, held: Flag):
@@ -127,7 +142,7 @@ def _onset(pair: ImpactPair, state: State, horizon: Scalar, wanted: Flag) -> tup
     reached = wanted & (side != 0)
     side = jnp.where(state.mode != 0, state.mode.astype(flight.dtype), jnp.where(reached, side, 1.0))
     args = (force, side, jnp.where(side > 0, room[1], room[0]), state.v)
-    flight, v_in = implicit_state(_crossing, jnp.where(reached, flight, 1.0), args)
+    flight, v_in = implicit_state(_crossing, _flight_rates, jnp.where(reached, flight, 1.0), args)
     return jnp.where(reached, flight, 0.0), side, jnp.where(reached, v_in, state.v), reached
 
 
