@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import monitoring
+from jax import lax, monitoring
 
 from vijax.runtime.derivatives import differentiable, differentiable_rows
 
@@ -215,3 +215,34 @@ def test_what_no_row_moves_and_what_counts_has_no_slope():
     np.testing.assert_array_equal(zero, 0.0)
     np.testing.assert_allclose(slope, np.sin(Y)[:, None] * TIMES, rtol=1e-15)
     np.testing.assert_allclose(moved, X[:, None] * slope, rtol=1e-15)
+
+
+def test_derivatives_of_rows_in_a_traced_program_take_one_forward_pass():
+    """In reverse, a run needs a loop forward and a loop backward."""
+
+    def swing(weights, x, y, *, room):
+        def step(x, _):
+            x = jnp.sin(x) * y
+            return x, x
+
+        return lax.scan(step, x, length=room)[1].swapaxes(0, 1) * weights
+
+    swinging = differentiable_rows(swing, (1, 4))
+
+    def total(x):
+        return swinging(2.0, x[None, 0], x[None, 1], room=3).sum()
+
+    def plain(x):
+        a, found = x[0], 0.0
+        for _ in range(3):
+            a = jnp.sin(a) * x[1]
+            found += 2 * a
+        return found
+
+    x = np.array([0.3, 1.2])
+    for derivative in (jax.grad, jax.jacfwd, jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
+        assert str(jax.make_jaxpr(derivative(total))(x)).count("scan[") == 1
+        np.testing.assert_allclose(jax.jit(derivative(total))(x), jax.jit(derivative(plain))(x), rtol=1e-13)
+    np.testing.assert_allclose(jax.hessian(total)(x), jax.hessian(plain)(x), rtol=1e-13)
+    third = jax.jit(jax.jacfwd(jax.hessian(total)))(x)
+    np.testing.assert_allclose(third, jax.jacfwd(jax.hessian(plain))(x), rtol=1e-13)

@@ -2,13 +2,13 @@
 
 What JAX differentiates it compiles anew, with its own options, as a part of whatever `jax.grad` makes of the program
 around it: of a steady state that takes three times as long as the program here, and happens for every kind of
-derivative that is asked for. Where the arguments are traced themselves, under `jit`, `vmap` or a second derivative, the
-function is differentiated as JAX does.
+derivative that is asked for. Where the arguments are traced themselves, under `jit`, `vmap` or a second derivative, JAX
+compiles the derivative: of a function of rows a forward one, of any other as JAX differentiates it.
 """
 
 import math
 from collections.abc import Callable, Hashable
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from typing import Any, TypeVar
 
 import jax
@@ -89,11 +89,12 @@ def differentiable(work: Callable[..., T], first: Callable[..., Any], like: Call
 
 
 def differentiable_rows(work: Callable[..., T], sizes: tuple[int, ...]) -> Callable[..., T]:
-    """Make a function of rows, none of which hangs on another, whose derivatives at numbers are one compiled program.
+    """Return a function of independent rows that computes derivatives of every order forward.
 
-    All slopes of a row are computed forward, which are as many as it has variables: few, where what JAX makes of a
-    derivative in reverse remembers a whole run. Of more rows than the largest size, and where a program is traced, JAX
-    differentiates the function.
+    A row has few variables and many results. Forward, all derivatives of a row take one pass; in reverse, JAX stores
+    the whole run. The function that returns result and slopes is differentiable in the same way, so that second
+    derivatives take one pass, too. At numbers, the slopes by all variables are one program, compiled with the options
+    of vijax. If there are more rows than the largest size, JAX differentiates the function.
 
     Args:
         work: Function of a module, of what is not varied (hashable), of variables (pytrees of arrays [row]), and of
@@ -102,17 +103,14 @@ def differentiable_rows(work: Callable[..., T], sizes: tuple[int, ...]) -> Calla
     """
     part = jax.jit(work, static_argnames="room")
 
+    @cache
+    def rows_with_slopes(which: tuple[int, ...]) -> Callable[..., tuple[T, list[jax.Array]]]:
+        return differentiable_rows(_with_slopes(work, which), sizes)
+
     @partial(jitted, static=("room",), name=f"slopes by row of {work.__module__}.{work.__qualname__}")
     def slopes(fixed: Any, variables: Any, *, room: Hashable) -> tuple[T, list[jax.Array]]:
-        leaves, tree = jax.tree.flatten(variables)
-
-        def along(direction):
-            moved = [jnp.broadcast_to(step, leaf.shape) for step, leaf in zip(direction, leaves, strict=True)]
-            result, moves = jax.jvp(lambda *rows: work(fixed, *tree.unflatten(rows), room=room), leaves, moved)
-            both = zip(*map(jax.tree.leaves, (result, moves)), strict=True)
-            return result, [move for leaf, move in both if _varies(leaf)]
-
-        return jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(leaves), dtype=leaves[0].dtype))
+        every = tuple(range(len(jax.tree.leaves(variables))))
+        return _with_slopes(work, every)(fixed, *variables, room=room)
 
     @partial(jax.custom_jvp, nondiff_argnums=(0, 2))
     def call(fixed: Any, variables: Any, room: Hashable) -> T:
@@ -121,26 +119,61 @@ def differentiable_rows(work: Callable[..., T], sizes: tuple[int, ...]) -> Calla
     @partial(call.defjvp, symbolic_zeros=True)
     def derivative(fixed: Any, room: Hashable, primals: Any, tangents: Any) -> tuple[T, T]:
         (variables,), (moved,) = primals, tangents
-        rows = jax.tree.leaves(variables)
-        if not _numbers(rows) or len(rows[0]) > sizes[-1]:
-            steps = jax.tree.map(_dense, moved, is_leaf=_is_zero)
-            return jax.jvp(lambda *variables: part(fixed, *variables, room=room), variables, steps)
-        told, own = partial(slopes, fixed, room=room), tiles.library(rows)
-        if own is np:
+        rows, steps = jax.tree.leaves(variables), jax.tree.leaves(moved, is_leaf=_is_zero)
+        own = tiles.library(rows)
+        if len(rows[0]) > sizes[-1]:
+            dense = jax.tree.map(_dense, moved, is_leaf=_is_zero)
+            return jax.jvp(lambda *variables: part(fixed, *variables, room=room), variables, dense)
+        if not _numbers(rows):
+            # At least one: `jax.vmap` takes no empty axis.
+            which = tuple(k for k, step in enumerate(steps) if not _is_zero(step)) or (0,)
+            result, columns = rows_with_slopes(which)(fixed, *variables, room=room)
+            steps = [steps[k] for k in which]
+        elif own is np:
             # In a thread of its own, as above.
             with context.pool(1) as elsewhere:
+                told = partial(slopes, fixed, room=room)
                 result, columns = elsewhere.submit(tiles.map_tiles, told, variables, sizes).result()
             result = tiles.arrays(result)
         else:
-            result, columns = of_few_lengths(told)(variables)
-        each, steps = (own.moveaxis(column, -1, 0) for column in columns), jax.tree.leaves(moved, is_leaf=_is_zero)
+            result, columns = of_few_lengths(partial(slopes, fixed, room=room))(variables)
+        each = (own.moveaxis(column, -1, 0) for column in columns)
         return result, jax.tree.map(lambda leaf: _along(leaf, each, steps, _row_by_row), result)
 
     @wraps(work)
     def run(fixed: Any, *variables: Any, room: Hashable) -> T:
-        return part(fixed, *variables, room=room) if tracing() else call(fixed, variables, room)
+        return call(fixed, variables, room)
 
     return run
+
+
+def _with_slopes(work: Callable[..., T], which: tuple[int, ...]) -> Callable[..., tuple[T, list[jax.Array]]]:
+    """Return a function of rows that returns the result and its derivatives, along a new last axis.
+
+    Args:
+        work: As in `differentiable_rows`.
+        which: Leaves of the variables by which the result is differentiated.
+    """
+
+    def both(fixed: Any, *variables: Any, room: Hashable) -> tuple[T, list[jax.Array]]:
+        leaves, tree = jax.tree.flatten(variables)
+
+        def of_rows(*rows: Any) -> T:
+            return work(fixed, *jax.tree.unflatten(tree, rows), room=room)
+
+        def along(direction: Any) -> tuple[T, list[jax.Array]]:
+            moved = [jnp.zeros_like(leaf) for leaf in leaves]
+            for k, step in zip(which, direction, strict=True):
+                moved[k] = jnp.broadcast_to(step, leaves[k].shape)
+            result, moves = jax.jvp(of_rows, leaves, moved)
+            pairs = zip(*map(jax.tree.leaves, (result, moves)), strict=True)
+            return result, [move for leaf, move in pairs if _varies(leaf)]
+
+        return jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(which), dtype=leaves[0].dtype))
+
+    # A compiled program is kept by its name.
+    both.__module__, both.__qualname__ = work.__module__, f"{work.__qualname__} with slopes by {which}"
+    return both
 
 
 def of_few_lengths(work: Callable[..., T]) -> Callable[..., T]:
