@@ -40,12 +40,12 @@ def last_period(plan: Plan, settings: Settings, cell: Cell) -> Lane:
 
 
 def few_impacts(cell: Cell, window: Lane, enough: int) -> Mask:
-    """Return which cells have fewer than `enough` impacts in their window, or in shorter ones a share of those.
+    """Return which cells have too few impacts in their window.
 
     Args:
         cell: Lanes.
-        window: Its length in periods.
-        enough: How many impacts a window of `FULL_WINDOW` periods, or more, must have.
+        window: Length of the window in periods.
+        enough: Impacts that a window of at least `FULL_WINDOW` periods needs; a shorter one needs fewer, in proportion.
     """
     return cell.tally.left + cell.tally.right < enough * jnp.minimum(window / FULL_WINDOW, 1.0)
 
