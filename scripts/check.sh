@@ -1,5 +1,9 @@
 #!/usr/bin/env bash
-# Everything a change must pass, in an environment of its own (.venv, made at need): bash scripts/check.sh [pytest arguments]
+# Everything a change must pass, in an environment of its own (.venv, made at need):
+#   bash scripts/check.sh [pytest arguments]   as CI does: what is quick and compiles quickly
+#   bash scripts/check.sh --long               with the long tests
+#   bash scripts/check.sh --shipped            engine, batch, orbits, design and planes compiled as users compile them, and
+#                                              a million impacts of each kind compared between options of the compiler
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python3 -m venv .venv
@@ -7,6 +11,11 @@ export PATH="$PWD/.venv/bin:$PATH"
 # Python compiles a module when it first imports it; pip would compile ten thousand, of which most are never imported.
 export PYTHONDONTWRITEBYTECODE=
 python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[test]'
+if [ "${1:-}" = --shipped ]; then
+  shift
+  VIJAX_TEST_FLAGS=shipped pytest -n 2 --dist loadfile --no-loadscope-reorder "$@" tests/{engine,batch,orbits,design,planes}
+  exec python benchmarks/compiler_options.py
+fi
 ruff check .
 ruff format --check .
 lint-imports
