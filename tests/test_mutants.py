@@ -64,10 +64,10 @@ def test_a_mutant_is_caught_by_the_first_test_that_fails_and_is_undone(file, mon
         f"from gap import LIMIT\n\n\ndef test_limit():\n    assert {noticed} is (LIMIT == 3.0)\n"
     )
     (tmp_path / "test_more.py").write_text("def test_more():\n    pass\n")
-    files = [DependentFile("test_gap.py", 1, 0.0), DependentFile("test_more.py", 2, 5.0)]
+    files = [DependentFile("test_gap.py", 1, 0.0), DependentFile("test_more.py", 2, 500.0)]
     monkeypatch.setattr(mutants, "dependent_files", lambda module: files)
     (mutant,) = [one for one in mutants.mutants(file) if one.line == 3]
-    outcome = mutants.run(mutant, tmp_path, most_seconds=1.0)
+    outcome = mutants.run(mutant, tmp_path, most_seconds=100.0)
     assert outcome.caught_by == ("FAILED test_gap.py::test_limit" if noticed else "")
     assert outcome.files == 1
     assert file.read_text() == SOURCE
