@@ -134,7 +134,7 @@ def test_the_wheel_alone_knows_its_version(installed, tmp_path):
 
 
 def test_the_wheel_alone_maps_a_plane(installed, tmp_path):
-    plane = ["--d", "0.05:0.3:32", "--kappa", "3:400:32:log", "--plot", "map.png"]
+    plane = ["--d", "0.05:0.3:8", "--kappa", "3:400:8:log", "--plot", "map.png"]
     done = alone([str(installed.parent / "vijax"), "sweep", *plane], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "largest admissible P" in done.stdout
@@ -151,6 +151,7 @@ def test_the_wheel_alone_asks_for_all_that_it_imports(installed, tmp_path):
     assert {"jax", "matplotlib", "vijax"} < set(asked)
 
 
+@pytest.mark.long
 def test_types_reach_a_user_of_the_wheel(installed, tmp_path):
     (tmp_path / "user.py").write_text(USER)
     (tmp_path / "mistakes.py").write_text(MISTAKES)

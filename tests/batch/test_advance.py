@@ -52,6 +52,7 @@ def declined():
     return some, cell, sampled.event.impact, careful.event.impact
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "wall", [ImpactPair(0.2, 20.0, 0.5, 0.9), ImpactPair(0.2, None, 0.5, 0.9)], ids=["soft", "rigid"]
 )

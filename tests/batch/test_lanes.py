@@ -151,7 +151,7 @@ def test_every_cell_ends_as_in_a_plain_loop_of_its_own(kinds):
     assert np.array_equal(results(cells, width=256), [plain(row) for row in cells])
 
 
-@pytest.mark.parametrize("width", [1, 7, 128, 200, 1024])
+@pytest.mark.parametrize("width", [7, 200, *(pytest.param(width, marks=pytest.mark.long) for width in (1, 128, 1024))])
 def test_results_do_not_depend_on_the_number_of_lanes(width):
     cells = draw(600, [EASY, DECLINES, HARD])
     assert np.array_equal(results(cells, width), [plain(row) for row in cells])
@@ -201,7 +201,7 @@ def test_lanes_that_stay_in_registers_give_the_same_results(interpreted):
     assert np.array_equal(in_registers(PROGRAM._replace(service=None, step=moves_on), cells), list(map(easily, cells)))
 
 
-@pytest.mark.parametrize("number", [32, 128, 160, 100])
+@pytest.mark.parametrize("number", [100, *(pytest.param(number, marks=pytest.mark.long) for number in (32, 128, 160))])
 def test_a_batch_of_lanes_in_registers_is_of_whole_blocks(interpreted, number):
     """Else a kernel would leave some out, who would ask for ever; 100 lanes are held by no kernel."""
     cells = draw(200, [EASY, DECLINES, HARD])
@@ -279,7 +279,10 @@ def run_rest(rows, count):
     return lanes.run(accelerator_lanes.resumed(PROGRAM, like), rows, count, OUTPUTS, 16)
 
 
-@pytest.mark.parametrize(("count", "few"), [(600, 1), (600, 40), (600, 128), (30, 40), (0, 40)])
+@pytest.mark.parametrize(
+    ("count", "few"),
+    [*(pytest.param(600, few, marks=pytest.mark.long) for few in (1, 128)), (600, 40), (30, 40), (0, 40)],
+)
 def test_the_last_cells_go_on_elsewhere_and_end_alike(count, few):
     cells = draw(600, [EASY, DECLINES, HARD])
     found, left = jax.tree.map(np.array, run_most(jnp.asarray(cells), jnp.asarray(count, jnp.int32), few))

@@ -110,6 +110,7 @@ CREEPING = [
 ]
 
 
+@pytest.mark.long
 def test_a_slow_cell_is_decided_by_the_orbit_that_it_creeps_to():
     found = summarise([cell(d, kappa, u0=0.0, v0=0.4) for d, kappa, *_ in CREEPING], 400, variants=ALONE)
     assert np.all(found.status == Status.CONVERGING)
@@ -143,6 +144,7 @@ def test_aperiodic_cells_have_the_known_power_within_their_errors(plane):
     assert np.median(z) <= 1.2
 
 
+@pytest.mark.long
 def test_longer_windows_have_smaller_errors(plane):
     aperiodic = [PLANE[i] for i in np.flatnonzero(~PERIODIC)]
     longer = summarise(aperiodic, periods=2000)
@@ -170,6 +172,7 @@ def wide():
     return summarise(wide_cells(240), 400, variants=ALONE)
 
 
+@pytest.mark.long
 def test_a_cell_with_few_impacts_runs_on_as_a_longer_run_does(wide):
     """Up to 16 times the periods, until the window has 200 impacts; with fewer than 100 the status says so."""
     for periods in (1600, 6400):
@@ -186,6 +189,7 @@ def test_a_cell_with_few_impacts_runs_on_as_a_longer_run_does(wide):
     np.testing.assert_array_equal((wide.status == Status.FEW_IMPACTS)[chaos], hits[chaos] < 99.5)
 
 
+@pytest.mark.long
 def test_errors_hold_where_flights_are_long(wide):
     far = summarise(wide_cells(240), 25_600, variants=ALONE)
     both = (wide.period == 0) & (wide.status == Status.OK) & (far.period == 0)
@@ -225,6 +229,7 @@ def test_a_cells_result_does_not_depend_on_its_place_in_the_batch(plane):
         assert np.array_equal(there, here, equal_nan=True), name
 
 
+@pytest.mark.long
 def test_halved_units_and_a_variant_of_half_are_the_same(plane):
     half = summarise(PLANE, length=0.5)
     for name in ("P", "P_stderr", "energy_ratio"):
@@ -306,6 +311,7 @@ def test_window_counts_the_impacts_with_their_onset_in_it(recorded):
     assert np.all(found.period == -1)
 
 
+@pytest.mark.long
 def test_power_is_the_same_where_nothing_is_set_against_it(plane):
     alone = summarise(PLANE, outputs={"P"}, variants=ALONE)
     assert alone.energy_ratio is None
@@ -313,6 +319,7 @@ def test_power_is_the_same_where_nothing_is_set_against_it(plane):
     np.testing.assert_allclose(alone.P[PERIODIC, 0], plane.P[PERIODIC, 0], rtol=1e-11)
 
 
+@pytest.mark.long
 def test_a_mirrored_start_half_a_period_later_ends_on_the_mirrored_attractor(plane, recorded):
     calm = [i for i, known in enumerate(FEW) if known["p"] and known["converged_after"] < 50]
     state = recorded.states
@@ -341,14 +348,13 @@ def test_motion_that_fits_between_the_walls_has_no_impact():
     assert np.all(np.isnan(found.lyapunov))
 
 
-def test_gravity_beyond_the_forcing_ends_in_permanent_contact():
-    cells = [cell(0.3, 40.0, gamma=-2.0, u0=0.0, v0=0.1), cell(0.3, 40.0, gamma=2.0, u0=0.0, v0=0.1)]
-    for wall in ({}, {"kappa": None}):
-        found = summarise([c | wall for c in cells], 60, variants=ALONE)
-        assert np.all(found.status == Status.PERMANENT_CONTACT)
-        assert np.all(found.P == 0)
-        assert np.all(found.contact_fraction == 1)
-        assert np.all(found.impacts_per_period == 0)
+@pytest.mark.parametrize("kappa", [40.0, pytest.param(None, marks=pytest.mark.long)])
+def test_gravity_beyond_the_forcing_ends_in_permanent_contact(kappa):
+    found = summarise([cell(0.3, kappa, gamma=gamma, u0=0.0, v0=0.1) for gamma in (-2.0, 2.0)], 60, variants=ALONE)
+    assert np.all(found.status == Status.PERMANENT_CONTACT)
+    assert np.all(found.P == 0)
+    assert np.all(found.contact_fraction == 1)
+    assert np.all(found.impacts_per_period == 0)
 
 
 def test_chatter_on_rigid_walls_ends_in_sticking():
@@ -378,6 +384,7 @@ def test_a_start_inside_a_soft_wall_is_a_contact_without_onset():
 # --- other programs --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_window_has_an_exponent_too():
     orbit = next(orbit for orbit in ORBITS if orbit["gamma"] == 0)
     window = summarise([orbit_cell(orbit)], 200, until="window", outputs={"lyapunov"}, variants=ALONE)
@@ -394,6 +401,7 @@ def test_inclined_cells_know_the_50_digit_orbit_and_run_into_attractors():
     np.testing.assert_allclose(found.P[0, 0], float(orbit["P_J"]), rtol=1e-11)
 
 
+@pytest.mark.long
 def test_what_recurs_to_rounding_and_is_no_orbit_does_not_hold_a_cell():
     """Its rounds failed again and again, each beginning its window anew: 7,678 periods for 400."""
     counts = ["period", "impacts_left", "impacts_right"]
@@ -413,6 +421,7 @@ def test_single_precision_finds_the_same_periods():
     assert (single != double)[periodic].mean() < 0.01
 
 
+@pytest.mark.long
 def test_a_long_period_is_kept_by_a_flight_of_thousands():
     # Orbits that attract from so near that chaos passes them: Newton alone would find them from there.
     for d, kappa, r in (

@@ -18,7 +18,7 @@ OTHER = vijax.Harmonics([1.0, 0.3])
 STIFF, SOFT = 40.0, 4.0
 
 
-@pytest.fixture(scope="module", params=["soft", "rigid"])
+@pytest.fixture(scope="module", params=["soft", pytest.param("rigid", marks=pytest.mark.long)])
 def jets(request):
     rigid = request.param == "rigid"
     return rigid, *derivatives(rigid)
@@ -40,7 +40,8 @@ def test_reverse_is_forward(jets):
     assert np.allclose(pushed, first, rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("kappa", [pytest.param(50.0, marks=pytest.mark.long), None])
+@pytest.mark.long
+@pytest.mark.parametrize("kappa", [50.0, None])
 def test_a_hessian_is_forward_derivatives_of_forward_ones(kappa):
     def place(x):
         return vijax.trajectory(impact_pair(x[0], kappa, x[1]), 0.02, 0.3, 2, max_impacts=4).states.u[-1]
@@ -51,7 +52,7 @@ def test_a_hessian_is_forward_derivatives_of_forward_ones(kappa):
     np.testing.assert_allclose(jax.jit(jax.hessian(place))(x), forward, rtol=1e-9)
 
 
-@pytest.mark.parametrize("kappa", [50.0, pytest.param(None, marks=pytest.mark.long)])
+@pytest.mark.parametrize("kappa", [pytest.param(50.0, marks=pytest.mark.long), None])
 def test_derivatives_of_a_few_starts_at_numbers_are_those_of_differences(kappa):
     def told(d, r, v):
         run = vijax.trajectory(impact_pair(d, kappa, r), 0.02, v, 4)
@@ -69,6 +70,7 @@ def test_derivatives_of_a_few_starts_at_numbers_are_those_of_differences(kappa):
                 np.testing.assert_allclose(slopes[place][which], np.diag(known), rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.long
 def test_sums_that_mask_the_padding_have_derivatives():
     """0 times NaN stays within the padding; both ways."""
 
@@ -131,6 +133,7 @@ def test_too_few_impacts_are_said():
     assert np.isnan(np.asarray(short.states.u))[-1]
 
 
+@pytest.mark.long
 def test_all_impacts_of_a_chatter_are_recorded_where_all_are_wanted():
     pair = impact_pair(0.117, None, 0.676, 0.952)
     for excitation in (None, OTHER):
@@ -168,6 +171,7 @@ def test_an_impact_that_is_not_recorded_is_in_the_status(kappa, u0, v0, excitati
         np.testing.assert_array_equal(cut.impacts.t[: int(cut.filled)], whole.impacts.t[: int(cut.filled)])
 
 
+@pytest.mark.long
 def test_a_ball_that_stays_in_contact_from_the_start_has_met_a_wall():
     kappa, r = Sides(0.75266, 0.72614), Sides(0.0298176, 0.9945921)
     u0, v0, t0, gamma = 0.00223157, 0.72340384, 1.66827912, -1.245353

@@ -47,6 +47,7 @@ def test_order():
     assert tsit5 > 4.5
 
 
+@pytest.mark.long
 def test_speeds():
     (median, worst), vijax = measured("speeds")
     assert median > 0.1
@@ -54,6 +55,7 @@ def test_speeds():
     assert np.all(vijax < 1e-12)
 
 
+@pytest.mark.long
 def test_labels():
     (miscounts, restless, _, restless_finer), (miscounted, slow, *_) = measured("labels")
     assert miscounts > 0.05
@@ -62,6 +64,7 @@ def test_labels():
     assert slow < 0.1  # within 400 periods; the rest are still on their way
 
 
+@pytest.mark.long
 def test_gradients():
     (*blind, _), (*seen, exact) = measured("gradients")
     assert min(blind) > 0.3  # from 500 to 32,000 steps
@@ -114,6 +117,7 @@ def test_chaos():
     assert average < 0.01
 
 
+@pytest.mark.long
 def test_windows():
     (many, cells), (found, _) = measured("windows")
     assert cells >= 4
@@ -121,6 +125,7 @@ def test_windows():
     assert found == 0  # each of these cells has one attractor
 
 
+@pytest.mark.long
 def test_resonance():
     usual, vijax = measured("resonance")
     assert usual[-1] > 1e-6

@@ -18,7 +18,7 @@ import pytest
 import xarray as xr
 
 from scripts import grid as script
-from tests.helpers import stand_in
+from tests.helpers import cases, stand_in
 from vijax import plots
 from vijax.batch import simulate
 from vijax.cli.process import leave
@@ -228,7 +228,7 @@ def test_a_damaged_chunk_is_run_again(folder, caplog, damage):
 # --- what is not the run's own ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["map.png", "map.pdf", "map.svg", "map.eps"])
+@pytest.mark.parametrize("name", cases(["map.png", "map.pdf", "map.svg", "map.eps"], long=("map.pdf", "map.eps")))
 def test_a_picture_is_drawn_again_unless_it_is_somebody_elses(folder, capsys, name):
     assert script.main([*ARGUMENTS, "--plot", name]) == 0
     drawn = (folder / name).read_bytes()

@@ -14,6 +14,7 @@ def peer(tmp_path_factory):
     return tool.answer(tool.PEER, tmp_path_factory.mktemp("peer")).processor
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("question", MOST)
 def test_a_first_answer_takes_no_longer_than_it_did(peer, tmp_path, question):
     assert tool.answer(tool.program(question), tmp_path).processor < MOST[question] * peer

@@ -23,6 +23,7 @@ def test_a_branch_begins_within_its_bounds_where_the_device_does_not_lie_there(f
     assert {str(found[f"end_{end}"].values[0]) for end in ("first", "last")} == {"low", "high"}
 
 
+@pytest.mark.long
 def test_a_branch_of_another_membrane_says_which(folder, capsys):
     told = ["--kappa", "40", "--along", "d=0.19:0.21", "--membrane", "hunt-crossley", "--chi", "0.3"]
     assert script.main([*told, "--guesses", "32", "--max-switches", "0", "--out", "branch.zarr"]) == 0

@@ -369,6 +369,7 @@ def test_the_compiler_leaves_loops_as_they_are_while_a_command_runs(said, meanwh
     assert os.environ.get("XLA_FLAGS") == said
 
 
+@pytest.mark.long
 def test_bash_completes_after_the_line_of_the_pages(tmp_path):
     """By a command of the name that a wheel installs."""
     (line,) = set(re.findall(r'`(eval "[^`]*")`', (ROOT / "docs/maps.md").read_text(encoding="utf-8")))

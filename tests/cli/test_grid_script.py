@@ -292,6 +292,7 @@ def test_a_summary_counts_inadmissible_cells_by_limit():
     assert not closing.limit_lines(xr.Dataset())
 
 
+@pytest.mark.long
 def test_a_wide_gap_from_one_start_says_that_starts_matter():
     d = xr.DataArray([0.2, 0.21], dims="d")
     level, inclined = (xr.Dataset(coords={"d": d, "gamma": gamma}) for gamma in (0.0, 0.1))
@@ -335,6 +336,7 @@ def test_the_best_cell_is_in_hertz_where_they_were_given():
     assert said["7:12:3"].endswith("at omega = 12.5664 rad s-1")
 
 
+@pytest.mark.long
 def test_several_starts_from_arguments_to_store_and_picture(folder, capsys):
     names = ["--out", "expected.zarr", "--plot", "expected.png"]
     assert script.main([*TINY, "--starts", "5", *names]) == 0
@@ -412,6 +414,7 @@ def test_ctrl_c_leaves_what_is_done(folder):
     assert (sweep.load(folder / "map.zarr")["status"] == Status.NOT_RUN).all()
 
 
+@pytest.mark.long
 def test_the_bar_says_what_is_waited_for(folder, capsys):
     assert script.main([*TINY, "--out", "map.zarr"]) == 0
     err = capsys.readouterr().err
@@ -435,6 +438,7 @@ def test_what_to_do_is_said_where_a_status_is_printed():
     assert lines[2:] == [f"    slow: {Status(4).advice}; see docs: status"]
 
 
+@pytest.mark.long
 def test_any_variable_is_shown(folder):
     assert script.main([*TINY, "--show", "max_penetration", "--outputs", "P,max_penetration"]) == 0
     assert {path.name for path in folder.iterdir()} == {"max_penetration_map.zarr", "max_penetration_map.png"}

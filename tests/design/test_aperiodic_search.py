@@ -78,6 +78,7 @@ def test_what_is_told_is_what_other_balls_give(found):
     assert 0 < best.gradient_stderr["kappa"] < 0.1
 
 
+@pytest.mark.long
 def test_chaos_goes_on_beside_the_design_and_every_ball_arrives(found):
     (extent,) = off_design.extents(found.best)
     assert extent.below.lasts
@@ -97,6 +98,7 @@ def test_tolerances_break_the_limits_of_a_design_that_sits_on_one(found):
     assert spread.worst < spread.mean / (1 - spread.inadmissible) < 1.02 * found.best.P
 
 
+@pytest.mark.long
 def test_a_reliable_design_keeps_the_limits_in_the_share_of_devices_asked():
     tolerance = [Tolerance("omega0", 0.02)]
     most = sought("expected", tolerances=tolerance, reliability=0.7).best

@@ -141,6 +141,7 @@ def traced_anew():
     perturbed._traced.clear_cache()
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("traced_anew")
 @pytest.mark.parametrize("beta", [0.0, 0.02])
 def test_a_traced_ensemble_runs_the_program_of_its_ground(monkeypatch, beta):
@@ -186,6 +187,7 @@ def test_what_cannot_be_is_said_at_the_door(given, said):
         average(**{"device": DEVICE, **given})
 
 
+@pytest.mark.long
 def test_walls_that_differ_have_derivatives_of_their_own(monkeypatch):
     """Of a surface that is known: each wall's stiffness and restitution, and what its membrane is made of."""
     device = dataclasses.replace(DEVICE, omega0=Sides(50.0, 70.0), r=Sides(0.4, 0.6), V=Sides(1500.0, 2000.0))

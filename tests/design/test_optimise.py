@@ -81,6 +81,7 @@ def test_the_small_fast_device(found):
     assert abs(best.gradient["omega0"]) < 1e-5
 
 
+@pytest.mark.long
 def test_a_device_that_loses_its_orbit_does_not_widen_the_margins(found):
     best = found[0].best
     cloud, none = nodes((Tolerance("omega0", 0.05),), None), jnp.zeros((1, 1))
@@ -141,6 +142,7 @@ def test_every_optimum_is_admissible_attracting_and_what_a_simulation_says(found
     assert bool(swept["admissible"].all())
 
 
+@pytest.mark.long
 def test_where_any_motion_may_win_the_best_orbit_is_the_same(found):
     any_motion = optimise.optimise(FAST, survey_points=128, starts=2, max_impacts=2)
     assert any_motion.best.values["omega0"] == pytest.approx(found[0].best.values["omega0"], rel=1e-9)
@@ -181,6 +183,7 @@ def test_a_supremum_is_no_maximum(found):
     assert all(one.height < found[0].best.height for one in ends)
 
 
+@pytest.mark.long
 def test_tolerances_of_a_design(found):
     best = found[0].best
     narrow = optimise.under(best, [Tolerance("omega0", 0.05)])
@@ -192,6 +195,7 @@ def test_tolerances_of_a_design(found):
     assert wide.worst == 0
 
 
+@pytest.mark.long
 def test_optima_are_ranked_by_what_their_devices_give_whatever_their_motion(found):
     fast = found[0]
     ranking = off_design.ranked(fast.optima, [Tolerance("omega0", 0.05)])
@@ -239,6 +243,7 @@ def test_what_only_your_limit_forbids_is_called_physical(found, depth, ratio, sa
     assert says in "\n".join(lines(describe(found[0], diagram=diagram)))
 
 
+@pytest.mark.long
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = optimise.optimise(
@@ -298,6 +303,7 @@ WIDE = Harvester(
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("device", "swept"), [(SHAKER, 27e-9), (WIDE, 21.6e-9)])
 def test_in_a_wide_gap_a_design_gives_more_than_a_sweep(device, swept):
     # Most starts stay on slow aperiodic motion, which gives less the longer it lasts.
@@ -307,6 +313,7 @@ def test_in_a_wide_gap_a_design_gives_more_than_a_sweep(device, swept):
     assert (best.state.energy <= best.state.work).all()
 
 
+@pytest.mark.long
 def test_weighing_basins_moves_away_from_where_few_starts_lead(found):
     nominal = found[0].best
     best = around.weighted(found[0], starts=16, points=5)
@@ -390,6 +397,7 @@ def test_a_report_is_strict_json_whole_or_not_at_all(folder):
     assert [path.name for path in folder.iterdir()] == ["one.json"]
 
 
+@pytest.mark.long
 def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys):
     assert script.main(["--d", "0.2", *SMALL, *FEW, *SHOWN, "--tolerance", "omega0=5%"]) == 0
     assert sorted(path.name for path in folder.iterdir()) == ["design.json", "design.png"]
@@ -419,6 +427,7 @@ def test_the_small_device_has_its_optimum_beside_the_cliff(folder, capsys):
         assert text in said
 
 
+@pytest.mark.long
 def test_designs_along_an_axis(folder, capsys):
     arguments = [
         *SMALL,
@@ -445,6 +454,7 @@ def test_designs_along_an_axis(folder, capsys):
     assert max(int(left) + int(right) for left, right in found) > 2
 
 
+@pytest.mark.long
 def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder, capsys):
     assert script.main(["--d", "0.2", "--out", "paper.json", *FEW, *SHOWN]) == 0
     report, said = strict(folder / "paper.json"), capsys.readouterr().out
@@ -456,6 +466,7 @@ def test_an_optimum_on_the_penetration_limit_says_so_and_what_lies_beyond(folder
     assert not (folder / "design.png").exists()
 
 
+@pytest.mark.long
 def test_chaos_is_a_design_with_its_standard_error(folder, capsys):
     chaos = ["--d", "0.12", "--tune", "kappa", "--bounds", "kappa=390:410", "--survey-points", "4", "--starts", "2"]
     assert script.main([*chaos, *SHOWN, "--max-impacts", "2"]) == 0

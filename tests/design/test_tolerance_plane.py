@@ -45,6 +45,7 @@ def test_the_nearest_bifurcation_is_where_a_branch_meets_it(plane):
     assert min(abs(value / near.values[0] - 1) for value in folds) < 1e-4
 
 
+@pytest.mark.long
 def test_the_report_says_how_far_it_is(plane):
     told = {
         "names": ["omega0", "s"],

@@ -245,6 +245,7 @@ def looked_at(built: Path, pages: list[str]) -> dict[str, list[str]]:
     return json.loads(html.unescape(found))
 
 
+@pytest.mark.long
 @pytest.mark.browser
 @browser
 def test_pages_fit_and_show_their_pictures_and_formulas(built):

@@ -252,6 +252,7 @@ def rigid_runs():
     return pair, march(pair, state)
 
 
+@pytest.mark.long
 def test_a_second_derivative_is_the_same_either_way():
     def speed(x):
         zero = jnp.zeros((), jnp.int32)

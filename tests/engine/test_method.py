@@ -87,6 +87,7 @@ def exact():
     return sweep(**PLANE, periods=200)
 
 
+@pytest.mark.long
 def test_attractors_by_steps_are_those_of_the_exact_engine(exact):
     found = sweep(**PLANE, periods=200, method="ode", solver="Dopri8", rtol=1e-10, atol=1e-12)
     assert set(found) == set(exact)
@@ -111,6 +112,7 @@ def test_windows_by_steps(exact):
         assert float(abs(found["max_impact_speed"] / true["max_impact_speed"] - 1).max()) < tolerance
 
 
+@pytest.mark.long
 def test_a_cell_does_not_depend_on_its_company():
     window = {"until": "window", "periods": 5, "outputs": ["max_impact_speed"], "method": "ode"}
     many = sweep(**PLANE, **window)["max_impact_speed"].values
@@ -231,6 +233,7 @@ def test_a_run_is_stopped_after_so_many_steps():
         np.testing.assert_array_equal(np.isfinite(runs.states.u), [[True] + [False] * 5] * 3)
 
 
+@pytest.mark.long
 def test_a_plane_by_a_method_of_ones_own():
     d = jnp.asarray([0.1, 0.2, 0.3])
     one = jnp.ones_like(d)
@@ -307,6 +310,7 @@ def test_contacts_of_a_membrane_without_closed_form():
             assert np.allclose(got, true, rtol=2e-6), (got, true)
 
 
+@pytest.mark.long
 def test_hunt_crossley_maps():
     axes = {"d": [0.2, 0.25, 0.3], "kappa": [60.0, 200.0]}
     found = sweep(**axes, method="ode", membrane=HuntCrossley(0.8))
@@ -351,7 +355,11 @@ def test_a_law_holds_arrays_and_names():
     assert str(series) == "Series with name measured, odd [1.0, 500.0]"
 
 
-@pytest.mark.parametrize("options", [{"method": "ode"}, {"method": "rk4", "steps": 100}], ids=["ode", "rk4"])
+@pytest.mark.parametrize(
+    "options",
+    [pytest.param({"method": "ode"}, marks=pytest.mark.long), {"method": "rk4", "steps": 100}],
+    ids=["ode", "rk4"],
+)
 def test_the_linear_law_by_hand_is_the_linear_membrane(options):
     pair = impact_pair([0.2, 0.25], [40.0, 100.0], 0.5, [0.0, 0.1])
     plain, own = (vijax.trajectory(pair, 0.02, 0.3, 4, membrane=law, **options) for law in (None, Plain()))
@@ -365,6 +373,7 @@ def test_rk4_puts_no_law_into_a_kernel_that_may_call_a_library():
     assert not choose("rk4", {"membrane": Plain()}).arithmetic
 
 
+@pytest.mark.long
 def test_a_map_is_made_with_a_law_of_ones_own_and_names_it():
     axes = {"d": [0.2, 0.25], "kappa": [40.0, 100.0], "r": 0.5, "periods": 60, "method": "ode"}
     plain, own = sweep(**axes), sweep(**axes, membrane=Plain())
@@ -408,6 +417,7 @@ def test_a_motion_has_derivatives_in_the_numbers_of_a_law():
     np.testing.assert_allclose(slope, (end(505.0) - end(495.0)) / 10, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_a_law_without_restitution_is_given_none():
     pair = ImpactPair(0.2, 40.0, None, 0.0)
     ran = vijax.trajectory(pair, 0.02, 0.3, 4, method="ode", membrane=Elastic(), rtol=1e-11, atol=1e-13)

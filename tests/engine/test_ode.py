@@ -7,6 +7,7 @@ import pytest
 
 import vijax
 from benchmarks.yardstick import reference_trajectories
+from tests.helpers import cases
 from vijax.engine.ode import Ode
 from vijax.engine.rk4 import Rk4
 from vijax.model import flow
@@ -82,7 +83,7 @@ def slope(steps, sizes):
     return -np.polyfit(np.log(steps), np.log(sizes), 1)[0]
 
 
-@pytest.mark.parametrize("solver", LADDERS)
+@pytest.mark.parametrize("solver", cases(LADDERS, long=("Bosh3", "Tsit5")))
 def test_located_events_keep_the_order_of_the_solver(solver):
     sizes = [errors(Ode(solver, 1e-11, 1e-11, dt=2.0 / steps)) for steps in LADDERS[solver]]
     assert slope(LADDERS[solver], sizes) > ORDERS[solver] - 0.3, sizes
@@ -216,6 +217,7 @@ def test_tangent_maps_hold_flight_contact_and_saltation():
         assert np.allclose(np.reshape(outcome.tangent, (2, 2)), matrix, rtol=0, atol=1e-9 * np.abs(matrix).max())
 
 
+@pytest.mark.long
 def test_what_is_not_asked_for_does_not_change_the_steps():
     case = (0.2, 40.0, 0.5, 0.05, 0.02, 0.3)
     _, plain = outcomes(FINE, case, 3, deep=False, tangent=False)

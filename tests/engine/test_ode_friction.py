@@ -91,6 +91,7 @@ def test_a_ball_that_sets_off_and_turns_within_a_step_is_seen():
     assert seen.aim == 2.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("friction", [0.1, 0.5])
 def test_no_motion_is_lost(friction):
     """Two solvers count the same impacts of 300 balls, a fifth of them at rest at first."""
@@ -131,7 +132,14 @@ def impact_after(pair, friction, u, v, number):
     return outcome.after, whole_map, stuck
 
 
-@pytest.mark.parametrize(("d", "friction", "sticks"), [(0.095, 0.05, 0), (0.095, 0.3, 2), (0.2, 0.1, 1)])
+@pytest.mark.parametrize(
+    ("d", "friction", "sticks"),
+    [
+        pytest.param(0.095, 0.05, 0, marks=pytest.mark.long),
+        (0.095, 0.3, 2),
+        pytest.param(0.2, 0.1, 1, marks=pytest.mark.long),
+    ],
+)
 def test_tangent_maps_are_differences_of_motions(d, friction, sticks):
     pair, start, h = vijax.impact_pair(d, 12.0, 0.5), np.array([0.01, -0.4]), 1e-6
     ball, found, stuck = impact_after(pair, friction, *start, 3)
@@ -152,6 +160,7 @@ def test_tangent_maps_are_differences_of_motions(d, friction, sticks):
 PLANE = {"d": [0.08, 0.2, 0.3], "kappa": [10.0, 60.0], "r": 0.5, "method": "ode"}
 
 
+@pytest.mark.long
 def test_orbits_that_are_found_are_what_the_motion_comes_to():
     found = vijax.sweep(**PLANE, friction=0.3, outputs=("P", "period"))
     assert (found.period == 1).all()
@@ -160,6 +169,7 @@ def test_orbits_that_are_found_are_what_the_motion_comes_to():
     assert found.attrs["friction"] == 0.3
 
 
+@pytest.mark.long
 def test_friction_that_holds_the_ball_leaves_no_impact_and_none_is_none():
     held = vijax.sweep(**PLANE, friction=1.5, u0=0.0, v0=0.05, outputs=("P", "period"))
     assert (held.status == Status.NO_IMPACT).all()
@@ -188,6 +198,8 @@ def test_friction_takes_what_slides_and_mirror_images_stay_such():
     np.testing.assert_allclose(b, a * [1, -1, -1, -1, 1, 1] + [1, 0, 0, 0, 0, 0], atol=1e-10)
 
 
+@pytest.mark.long
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["sticks once", "sticks each time"])
 def test_derivatives_are_those_of_differences(name):
     d, kappa, r, gamma, friction, u0, v0, _ = CASES[name]
@@ -200,13 +212,14 @@ def test_derivatives_are_those_of_differences(name):
         return jnp.stack([i.t[last], i.v_in[last], i.depth[last], i.v_out[last]])
 
     x = jnp.array([d, kappa, r, gamma, friction, u0, v0])
-    forward, reverse = jax.jacfwd(first)(x), jax.jacrev(first)(x)
-    h = 1e-6
-    differences = np.stack([(first(x + h * e) - first(x - h * e)) / (2 * h) for e in np.eye(7)], axis=1)
+    forward, reverse = (jax.jit(of(first))(x) for of in (jax.jacfwd, jax.jacrev))
+    h, at = 1e-6, jax.jit(first)
+    differences = np.stack([(at(x + h * e) - at(x - h * e)) / (2 * h) for e in np.eye(7)], axis=1)
     np.testing.assert_allclose(forward, differences, atol=1e-6 * np.abs(differences).max())
     np.testing.assert_allclose(reverse, forward, atol=1e-11 * np.abs(differences).max())
 
 
+@pytest.mark.long
 def test_a_membrane_of_any_law_may_have_friction_beside_it():
     pair = vijax.impact_pair(0.2, 12.0, None)
     told = {"method": "ode", "membrane": vijax.HuntCrossley(chi=0.3)}

@@ -31,6 +31,7 @@ def test_it_says_what_shakes_it():
         np.testing.assert_allclose((one.c, one.q), (other.c, other.q), rtol=0, atol=1e-15)
 
 
+@pytest.mark.long
 def test_its_derivatives_are_those_of_the_exact_method():
     def speed(pair, how):
         return vijax.trajectory(pair, 0.0, 0.1, 3, excitation=ROUGH, **how).impacts.v_in[2]
@@ -41,6 +42,7 @@ def test_its_derivatives_are_those_of_the_exact_method():
         assert other == pytest.approx(one, rel=1e-7), name
 
 
+@pytest.mark.long
 def test_attractors_have_the_labels_and_the_power_of_the_exact_method():
     axes = {"d": np.linspace(0.15, 0.25, 3), "kappa": np.array([30.0, 60.0]), "r": 0.5, "gamma": 0.02}
     exact = vijax.sweep(**axes, excitation=ROUGH)

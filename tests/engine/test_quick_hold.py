@@ -112,6 +112,7 @@ def test_a_contact_that_ends_slowly_is_sure():
     assert np.max(hit.v_out / hit.v_in) < 0  # It leaves the wall that it meets.
 
 
+@pytest.mark.long
 def test_a_contact_that_just_ends_at_the_first_low_has_no_later_end():
     """One of three million: its w is below zero for a moment, and would be said to end where it is so again."""
     d, kappa, r, gamma = 0.20003687089776961, 17.661471184654324, 0.08972374016170381, 0.48703763561527846

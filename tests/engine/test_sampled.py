@@ -152,6 +152,7 @@ def off_the_left_wall(kappas, speeds, count=512):
     return sample(pair, Ball(*at, jnp.zeros(count))), step(pair, State(*at, still, still)).impact
 
 
+@pytest.mark.long
 def test_close_to_resonance_few_contacts_are_in_doubt():
     """There a large swing and a large response all but cancel, and bounds that add them up say nothing: 13 % were."""
     (hit, sure), impact = off_the_left_wall(kappas=(2.6, 3.8), speeds=(0.1, 0.5))
@@ -159,6 +160,7 @@ def test_close_to_resonance_few_contacts_are_in_doubt():
     np.testing.assert_allclose(hit.depth[sure], impact.depth[sure], rtol=1e-12)
 
 
+@pytest.mark.long
 def test_on_an_accelerator_no_slow_exit_is_in_doubt(monkeypatch):
     """Where the ball all but stays, the chord between two samples is a poor guess of when it leaves: 9 % were."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
@@ -169,6 +171,7 @@ def test_on_an_accelerator_no_slow_exit_is_in_doubt(monkeypatch):
     np.testing.assert_allclose(hit.v_out[slow], impact.v_out[slow], rtol=1e-11)
 
 
+@pytest.mark.long
 def test_an_accelerator_finds_the_same_lane_by_lane(monkeypatch):
     """There the step is a kernel that knows single lanes alone, and looks samples up in another way."""
     pair, u, v, t = pressed(np.random.default_rng(4))

@@ -122,8 +122,17 @@ def quickly(pair, ball):
     return hit.side, told, sure
 
 
-@pytest.mark.parametrize("step", [careful, by_samples, quickly])
-@pytest.mark.parametrize("walls", ["soft", "rigid", "rigid_right"])
+# Each step once, and each kind of wall; the other pairs are long tests.
+FEW = [(careful, "soft"), (by_samples, "rigid"), (quickly, "rigid_right")]
+MORE = [
+    (step, walls)
+    for step in (careful, by_samples, quickly)
+    for walls in ("soft", "rigid", "rigid_right")
+    if (step, walls) not in FEW
+]
+
+
+@pytest.mark.parametrize(("step", "walls"), [*FEW, *(pytest.param(*one, marks=pytest.mark.long) for one in MORE)])
 def test_every_impact_is_that_of_a_pair_with_two_such_walls(step, walls):
     pair, alike, ball = drawn(walls)
     side, found, sure = jax.tree.map(np.asarray, jax.jit(step)(pair, ball))

@@ -221,6 +221,7 @@ def test_a_second_click_within_300_ms_counts(one, dataset):
     assert one.shown().heading() == said_of(dataset, PICK)
 
 
+@pytest.mark.long
 def test_a_slider_changes_the_motion_and_a_plane_of_its_value_is_made(tab, dataset):
     one = tab().shown().click(PICK).shown()
     one.page.fill('[data-name="r"] input[type="number"]', "0.6")
@@ -250,6 +251,7 @@ def test_a_value_beyond_its_bounds_is_refused_in_a_line(one, dataset):
     assert one.heading() == said_of(dataset, PICK)
 
 
+@pytest.mark.long
 def test_basin_and_branch_are_computed_on_demand_and_cancelled(one):
     one.click(PICK).shown()
     one.compute("basin")
@@ -296,6 +298,7 @@ def red(one: Tab) -> int:
     return int((np.abs(255 * shot - [0xD6, 0x27, 0x28]).max(axis=2) < 12).sum())
 
 
+@pytest.mark.long
 def test_curves_lie_over_the_map_are_told_and_can_be_hidden(one):
     one.click((5, 6)).shown()
     assert f"fold of {ORBITS}" in one.page.inner_text("#rows")
@@ -317,6 +320,7 @@ def test_curves_lie_over_the_map_are_told_and_can_be_hidden(one):
     one.page.wait_for_function("!location.search.includes('curves')", timeout=WAIT)
 
 
+@pytest.mark.long
 def test_two_tabs_do_not_disturb_each_other(one, tab, dataset):
     other = tab().shown()
     one.click(PICK)
@@ -376,6 +380,7 @@ def test_screen_readers_find_names_and_colours_have_contrast(one):
     assert found == []
 
 
+@pytest.mark.long
 def test_a_store_that_is_written_is_shown_as_it_grows(tab, server):
     """A tile that is not done yet: its cells are not run, and come while the page is open."""
     record, chunk = tile(server.store)
@@ -398,8 +403,8 @@ def test_a_store_that_is_damaged_is_told_and_the_map_stays(one, tab, server):
     try:
         chunk.write_bytes(b"\0" * len(before))
         os.utime(record)
-        one.page.wait_for_selector("#note:not([hidden])", timeout=WAIT)
-        assert "cannot be read any more" in one.page.inner_text("#note")
+        shown = "(note => !note.hidden && note.textContent.includes('cannot be read any more'))"
+        one.page.wait_for_function(f"{shown}(document.getElementById('note'))", timeout=WAIT)
         broken = tab()
         broken.page.wait_for_selector("#problem", timeout=WAIT)
         assert "plane.zarr" in broken.page.inner_text("#problem")
@@ -416,6 +421,7 @@ def tile(store: Path) -> tuple[Path, list[Path]]:
     return record, sorted(chunks, key=lambda chunk: chunk.parts[-4] != "P")
 
 
+@pytest.mark.long
 def test_a_server_that_is_lost_is_told_and_comes_back(one, server):
     one.click(PICK).shown()
     said = one.heading()

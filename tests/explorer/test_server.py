@@ -254,6 +254,7 @@ def test_a_process_that_is_cancelled_ends_and_the_next_work_has_another():
     one.close()
 
 
+@pytest.mark.long
 def test_a_notebook_shows_the_page_in_a_frame(dataset, tmp_path):
     vijax.save(dataset, tmp_path / "plane.zarr")
     code = f"import vijax\nds = vijax.load({str(tmp_path / 'plane.zarr')!r})\nvijax.explore(ds, port=0)"

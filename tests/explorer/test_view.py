@@ -130,6 +130,7 @@ def test_how_a_branch_ends_is_a_sentence(ends, said):
     assert answers.branch_rows(found) == [["met", "\u03ba"], ["flip", "0.1"], ["fold", "0.2"]]
 
 
+@pytest.mark.long
 def test_the_lines_to_copy_give_what_the_page_shows(physical, tmp_path, capsys, monkeypatch):
     from vijax.explorer.motion import motion
 

@@ -31,12 +31,18 @@ def timed():
     return measured(DEVICE, 100, error=ERROR, seed=1)
 
 
+@pytest.fixture(scope="module")
+def fitted(timed):
+    """The fit of those times from the guess."""
+    return vijax.fit(timed.times, timed.sides, timing_error=ERROR, device=GUESS)
+
+
 def pulls(found, **truth):
     return np.array([(found.values[name] - value) / found.stderr[name] for name, value in truth.items()])
 
 
-def test_a_device_comes_back_from_its_times(timed):
-    found = vijax.fit(timed.times, timed.sides, timing_error=ERROR, device=GUESS)
+def test_a_device_comes_back_from_its_times(timed, fitted):
+    found = fitted
     assert found.converged
     assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
     assert found.stderr["omega0"] < 0.05
@@ -58,15 +64,14 @@ def test_without_errors_it_is_exact():
     assert found.values["r"] == pytest.approx(0.6, rel=1e-7)
 
 
-def test_speeds_add_to_what_is_known(timed):
+def test_speeds_add_to_what_is_known(timed, fitted):
     error = 0.01
     speeds = timed.speeds + error * np.random.default_rng(2).normal(size=timed.speeds.size)
-    told = {"timing_error": ERROR, "device": GUESS}
-    found = vijax.fit(timed.times, speeds=timed.sides * speeds, speed_error=error, **told)
-    plain = vijax.fit(timed.times, timed.sides, **told)
+    told = {"speed_error": error, "timing_error": ERROR, "device": GUESS}
+    found = vijax.fit(timed.times, speeds=timed.sides * speeds, **told)
     assert np.abs(pulls(found, omega0=60.0, r=0.6)).max() < 3
-    assert found.stderr["r"] < plain.stderr["r"]
-    assert found.misfit.freedom == plain.misfit.freedom + timed.times.size - 1
+    assert found.stderr["r"] < fitted.stderr["r"]
+    assert found.misfit.freedom == fitted.misfit.freedom + timed.times.size - 1
 
 
 def test_impacts_that_the_bench_missed_or_invented_are_left_out(timed):
@@ -80,6 +85,7 @@ def test_impacts_that_the_bench_missed_or_invented_are_left_out(timed):
     assert "impacts left out: 3 of 257; false: 151" in str(found)
 
 
+@pytest.mark.long
 def test_many_faults_of_the_bench_are_found_at_once(timed):
     # Two false impacts follow each other, one is next to a missed impact, one is the last but one.
     last = timed.times.size - 2
@@ -97,6 +103,7 @@ def test_many_faults_of_the_bench_are_found_at_once(timed):
     assert found.misfit.p_value > 0.001
 
 
+@pytest.mark.long
 def test_a_false_impact_does_not_lead_the_search_away():
     pair = vijax.impact_pair(d=0.256921516, kappa=58.7548623, r=0.61585343, gamma=-0.0484533)
     device = with_pair(vijax.Harvester(A=1.79495762790131, omega=35.819029154), pair)
@@ -111,6 +118,7 @@ def test_a_false_impact_does_not_lead_the_search_away():
     assert np.abs(pulls(found, omega0=device.omega0, r=device.r)).max() < 3
 
 
+@pytest.mark.long
 def test_a_value_that_rests_on_one_false_impact_is_not_stated():
     # A motion of two kinds of impact does not tell four unknowns; these can adapt to a false impact, which then holds.
     device = vijax.Harvester(
@@ -130,6 +138,7 @@ def test_a_value_that_rests_on_one_false_impact_is_not_stated():
     assert found.untold or found.false.any()
 
 
+@pytest.mark.long
 def test_a_wrong_speed_is_left_out(timed):
     error = 0.01
     speeds = timed.speeds + error * np.random.default_rng(2).normal(size=timed.speeds.size)
@@ -141,13 +150,12 @@ def test_a_wrong_speed_is_left_out(timed):
     assert np.flatnonzero(found.astray).tolist() == [30]
 
 
-def test_units_of_pint(timed):
+def test_units_of_pint(timed, fitted):
     # Not dropped: milliseconds are no seconds, and metres no times.
     ureg = pint.UnitRegistry()
     told = {"device": GUESS}
-    plain = vijax.fit(timed.times, timed.sides, timing_error=ERROR, **told)
     with_units = vijax.fit(timed.times * 1e3 * ureg.ms, timed.sides, timing_error=ERROR * 1e6 * ureg.us, **told)
-    assert with_units.values["r"] == pytest.approx(plain.values["r"], rel=1e-6)
+    assert with_units.values["r"] == pytest.approx(fitted.values["r"], rel=1e-6)
     with pytest.raises(ValueError, match="times must be in s"):
         vijax.fit(timed.times * ureg.m, timed.sides, timing_error=ERROR, **told)
     record = vijax.Record(np.arange(5) * 1e3 * ureg.ms, np.ones(5) * ureg.cm / ureg.s**2)
@@ -166,6 +174,7 @@ def test_a_fit_that_says_nothing_prints():
     assert found.report()["misfit"]["freedom"] == found.misfit.freedom
 
 
+@pytest.mark.long
 def test_errors_that_are_larger_than_was_said_are_those_of_the_values_too(timed):
     right = vijax.fit(timed.times, timed.sides, timing_error=ERROR, device=GUESS)
     bold = vijax.fit(timed.times, timed.sides, timing_error=ERROR / 4, device=GUESS)
@@ -177,6 +186,7 @@ def test_errors_that_are_larger_than_was_said_are_those_of_the_values_too(timed)
     assert not vijax.fit(timed.times, timed.sides, timing_error=ERROR / 16, device=GUESS).converged
 
 
+@pytest.mark.long
 def test_a_sum_that_rises_more_slowly_than_its_derivatives_say_widens_the_errors(monkeypatch):
     impacts = measured(DEVICE, 60, wall="rigid", error=ERROR, seed=4)
     told = {"timing_error": ERROR, "device": DEVICE, "unknown": ("s", "r"), "wall": "rigid"}
@@ -187,6 +197,7 @@ def test_a_sum_that_rises_more_slowly_than_its_derivatives_say_widens_the_errors
     assert wider.stderr["r"] == pytest.approx(2 * plain.stderr["r"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_value_that_runs_to_its_limit_is_not_told():
     # One kind of impact cannot tell four unknowns: r runs to 1, where nothing is lost.
     device = vijax.Harvester(s=0.08, omega=10.0, A=3.0, r=0.4)
@@ -197,6 +208,7 @@ def test_a_value_that_runs_to_its_limit_is_not_told():
     assert found.stderr["r"] == np.inf
 
 
+@pytest.mark.long
 def test_of_devices_that_fit_as_well_the_nearest_to_what_was_known_is_taken():
     # A motion of few kinds of impact has two devices, which differ by a factor of two in stiffness.
     pair = vijax.impact_pair(d=0.2619, kappa=9.993, r=0.6963, gamma=0.0396)
@@ -232,6 +244,7 @@ def test_what_cannot_be_told_apart_is_named():
     assert np.abs(pulls(with_speeds, r=0.6, s=0.02, A=3.0)).max() < 3
 
 
+@pytest.mark.long
 def test_a_motion_of_one_kind_of_impact_does_not_tell_two_unknowns():
     # On level ground both impacts of a 1:1 motion are alike: one equation for stiffness and restitution.
     device = vijax.Harvester(s=0.08, omega=10.0, A=3.0, omega0=60.0, r=0.4)
@@ -244,12 +257,14 @@ def test_a_motion_of_one_kind_of_impact_does_not_tell_two_unknowns():
     assert found.constancy.stderr > 1
 
 
+@pytest.mark.long
 def test_rigid_walls():
     impacts = measured(DEVICE, 80, wall="rigid", error=ERROR, seed=4)
     found = vijax.fit(impacts.times, impacts.sides, timing_error=ERROR, device=GUESS, unknown=("s", "r"), wall="rigid")
     assert np.abs(pulls(found, s=0.02, r=0.6)).max() < 3
 
 
+@pytest.mark.long
 def test_two_walls_and_a_clock_that_is_late():
     impacts = measured(SIDES, 60, wall="rigid", error=ERROR, seed=5)
     unknown = ("r_left", "r_right", "delay")

@@ -51,7 +51,7 @@ def flown_in_si(law, device, u0, v0, periods):
     return y
 
 
-@pytest.mark.parametrize("omega", [40.0, 60.0])
+@pytest.mark.parametrize("omega", [40.0, pytest.param(60.0, marks=pytest.mark.long)])
 @pytest.mark.parametrize("law", [RUBBER, HERTZ], ids=["rubber", "hertz"])
 def test_the_motion_is_that_of_the_equation_in_si(law, omega):
     device = replace(DEVICE, omega=omega)
@@ -133,6 +133,7 @@ def orbits():
     return vijax.find_orbits(DEVICE.pair(), "LR", guesses=32, membrane=RUBBER.nondimensional(DEVICE))
 
 
+@pytest.mark.long
 def test_a_branch_along_the_frequency_has_one_membrane(orbits):
     (branch,) = vijax.follow_orbits(orbits[:1], "omega", (59.0, 61.0), direction="up", device=DEVICE)
     end = replace(DEVICE, omega=float(branch.values[-1]))
@@ -141,6 +142,7 @@ def test_a_branch_along_the_frequency_has_one_membrane(orbits):
     assert branch.values[-1] > 60.5
 
 
+@pytest.mark.long
 def test_derivatives_of_a_steady_state_move_the_membrane_in_si(orbits):
     def power(omega, law):
         return vijax.steady(replace(DEVICE, omega=omega), orbits[0], membrane=law).power

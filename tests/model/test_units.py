@@ -180,6 +180,7 @@ def _stop():
     raise _StopError
 
 
+@pytest.mark.long
 def test_while_another_thread_imports_pint_numbers_pass(monkeypatch):
     """A module is known before what is in it: tracing beside an import of zarr, which imports pint, once failed."""
     monkeypatch.setitem(sys.modules, "pint", types.ModuleType("pint"))

@@ -171,6 +171,7 @@ def test_a_quantity_of_the_device_moves_the_pair_as_it_does_the_device(along, wa
         assert float(own) == pytest.approx(float(expected), rel=1e-14, abs=1e-17)
 
 
+@pytest.mark.long
 def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     found = orbit_search.search(DEVICE.pair("rigid"), "RL", guesses=32)
     (one,) = continuation.follow(found[:1], "A", (1, 2), device=DEVICE, direction="up", points=8)
@@ -186,6 +187,7 @@ def test_a_branch_along_the_forcing_moves_gap_and_gravity_together():
     assert float(table["P"][0, -1]) == pytest.approx(float(orbit_properties.power(one.orbit[-1:], last)[0]), rel=1e-12)
 
 
+@pytest.mark.long
 def test_branches_can_be_followed_from_their_folds():
     """No orbit beside a fold has its parameter. Newton found nearly none of these, on which 1:1 orbits almost fade."""
     half = Sequence(jnp.array([[1]], jnp.int32), jnp.array([1.0]), jnp.array([True]))
@@ -198,7 +200,7 @@ def test_branches_can_be_followed_from_their_folds():
         assert np.abs(branch.values - d).min() < 1e-14
 
 
-@pytest.mark.parametrize("kappa", [None, 40.0])
+@pytest.mark.parametrize("kappa", [None, pytest.param(40.0, marks=pytest.mark.long)])
 def test_a_branch_that_starts_at_a_bound_stays_within(kappa):
     """It used to set out across the bound, where rounding had the start beyond it already."""
     start = orbit_search.search(impact_pair(0.2, kappa, 0.5), "RL", guesses=32)[:1]
@@ -235,7 +237,7 @@ def test_an_orbit_closed_half_way_folds_where_a_multiplier_passes_one():
         assert events.kind_of(arc, event, np.repeat(y, 2, axis=0), ContinuationSettings()) == kind
 
 
-@pytest.mark.parametrize("r", [0.479, 0.48])
+@pytest.mark.parametrize("r", [pytest.param(0.479, marks=pytest.mark.long), 0.48])
 def test_two_events_within_one_arclength_step_are_located_apart(r):
     """The flip and the graze are closer than a step (2e-3). Unstable orbits lie between them."""
     found = orbit_search.search(impact_pair(0.2, None, r), "RL", guesses=256)

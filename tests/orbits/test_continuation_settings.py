@@ -75,6 +75,7 @@ def test_what_some_settings_change_is_what_they_say(starts):
         ContinuationSettings().max_step = 1.0  # type: ignore[misc]
 
 
+@pytest.mark.long
 def test_those_that_begin_on_a_branch_are_followed_alike(starts):
     plain, longer = (
         switching.family(starts["asymmetry"], "d", SPAN, settings=settings)

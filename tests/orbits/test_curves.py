@@ -103,6 +103,7 @@ def grown(found):
     return curves.follow_curves([start], "d", {"d": (0.05, 0.35), "r": (0.2, 0.55)}, max_switches=1)
 
 
+@pytest.mark.long
 def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
     told = sorted((one.kind, int(one.orbit.count[0]), int(one.orbit.sequence.span[0])) for one in grown)
     # At the flip-graze the flip and the graze of the doubled orbit, at the resonant graze orbits with an impact more.
@@ -115,6 +116,7 @@ def test_curves_begin_where_others_meet_points_of_codimension_2(grown):
         assert (np.asarray(curve.orbit.status)[off > 1e-12] == Status.OK).all()
 
 
+@pytest.mark.long
 def test_a_fold_and_a_flip_touch_their_graze_at_its_resonance(grown):
     """Their distance grows as the square of the way along it (Simpson, Ghosh, arXiv 2602.22797)."""
     graze = next(one for one in grown if (one.kind, one.points[0].test) == ("grazing", "") and one.orbit.count[0] == 2)
@@ -155,6 +157,7 @@ def test_a_curve_begins_at_a_bound_of_its_plane(met, r):
     assert len(np.unique(curve.values[:, 1])) == len(curve.values)
 
 
+@pytest.mark.long
 def test_branches_lead_on_from_where_their_orbits_graze(found):
     """Rounding decides on which side of its graze such an orbit is. One way ends there, the other leads on."""
     graze = found["grazing"].orbit
@@ -183,6 +186,7 @@ def tilted():
     return curves.follow_curves(points, "d", {"d": (0.05, 0.35), "gamma": (-0.2, 0.2)})
 
 
+@pytest.mark.long
 def test_gravity_unfolds_the_pitchfork_to_a_cusp(tilted):
     (fold,) = (curve for curve in tilted if curve.kind == "fold")
     (cusp,) = (point for point in fold.points if point.kind == "cusp")
@@ -194,6 +198,7 @@ def test_gravity_unfolds_the_pitchfork_to_a_cusp(tilted):
     assert power == pytest.approx(1.5, abs=0.01)
 
 
+@pytest.mark.long
 def test_folds_end_at_their_graze_and_the_graze_goes_on(tilted):
     fold, graze = sorted(tilted, key=lambda curve: curve.kind)
     assert fold.ends == ("fold-graze", "fold-graze")
@@ -237,6 +242,7 @@ def test_bad_input_is_told(met, change, message):
         curves.follow_curves(**{"points": met, "along": "d", "within": PLANE} | change)
 
 
+@pytest.mark.long
 def test_a_curve_of_the_device_moves_what_the_device_does(met):
     """Along omega and s the pitchfork is where d is: d = s omega^2 / (A pi^2)."""
     device = Harvester(s=0.2)
@@ -298,6 +304,7 @@ def test_a_map_is_explained_by_the_curve_on_its_border():
     np.testing.assert_allclose(np.sort(curve.values[[0, -1], 1]), [0.3, 0.6], rtol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("d", "basins"), [((0.2, 0.2001), True), ((0.2001, 0.202), False)])
 def test_a_border_of_basins_is_told_from_one_of_a_bifurcation(d, basins):
     """Rigid 1:1 and 1:2 attract both until the fold of 1:2 at d = 0.20158 (docs/accuracy.md)."""
@@ -335,6 +342,7 @@ def test_a_search_without_time_says_what_is_left():
     assert len(found.largest) == found.borders
 
 
+@pytest.mark.long
 def test_ctrl_c_keeps_the_curves_found_until_then():
     def stop(explained, borders):
         if explained:
@@ -393,6 +401,7 @@ def deep_gap(r):
     return 0.5 * (1 + r) * speed - 2 / np.pi**2 * np.sqrt(1 - (0.5 * np.pi * (1 - r) * speed) ** 2)
 
 
+@pytest.mark.long
 def test_a_limit_of_penetration_is_where_it_is_known_to_be(limited):
     curve, _ = limited
     d, r = curve.values.T
@@ -413,6 +422,7 @@ def test_limits_of_a_map_begin_at_its_cells():
     assert found.explained == vijax.bifurcation_curves(told, max_rounds=0).explained
 
 
+@pytest.mark.long
 def test_impacts_at_a_limit_are_flown_as_deep(limited):
     curve, device = limited
     load = limits.loads(curve.orbit, device)["penetration limit"].max(axis=1)

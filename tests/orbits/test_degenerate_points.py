@@ -51,6 +51,7 @@ def normal_form(kind, orbit, row=0):
     return criticality.normal_form(case)
 
 
+@pytest.mark.long
 def test_the_point_has_its_name_and_the_normal_form_changes_sign_there(followed):
     name, place, curve = followed
     (point,) = (point for point in curve.points if point.kind == name)
@@ -62,6 +63,7 @@ def test_the_point_has_its_name_and_the_normal_form_changes_sign_there(followed)
     assert abs(normal_form(curve.kind, point.orbit)) < 1e-6 * max(map(abs, sides))
 
 
+@pytest.mark.long
 def test_folds_of_the_orbits_that_begin_there_end_at_a_point_of_the_same_name(followed):
     name, _, curve = followed
     (point,) = (point for point in curve.points if point.kind == name)

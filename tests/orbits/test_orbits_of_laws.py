@@ -52,7 +52,8 @@ def test_a_spring_of_ones_own_has_the_orbits_of_the_linear_membrane(springs):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("transform", [jax.jacfwd, pytest.param(jax.grad, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("transform", [jax.jacfwd, jax.grad])
 def test_its_steady_state_has_the_derivatives_of_the_linear_one(springs, transform):
     slopes = [
         transform(lambda pair, orbit=orbit: vijax.steady(DEVICE, orbit[0], pair=pair).P)(PAIR) for orbit in springs
@@ -72,6 +73,7 @@ def test_its_second_derivatives_are_those_of_the_linear_one(springs):
     assert float(curved[1]) == pytest.approx(float(curved[0]), rel=1e-9)
 
 
+@pytest.mark.long
 def test_the_orbit_of_hertz_is_the_attractor_that_ode_finds(hertz):
     assert len(hertz) == 1
     assert np.abs(hertz.multipliers).max() < 1
@@ -86,30 +88,37 @@ def test_the_orbit_of_hertz_is_the_attractor_that_ode_finds(hertz):
         np.testing.assert_allclose(ends, known, rtol=0, atol=2e-9, err_msg=name)
 
 
+@pytest.mark.long
 def test_a_state_leads_to_the_same_orbit(hertz):
     found = vijax.orbits_from_states(LOSSY, 0.0, 0.1, settle=100, membrane=HERTZ)
     np.testing.assert_array_equal(found.status, Status.OK)
     np.testing.assert_allclose(np.sort(found.knots[..., 1]), np.sort(hertz.knots[..., 1]), rtol=0, atol=1e-11)
 
 
-def test_derivatives_by_numbers_of_the_law_are_those_of_differences(cubic, hertz):
+def difference(of, x, h):
+    """Return the derivative of a function by central differences of fourth order."""
+    return float((8 * (of(x + h) - of(x - h)) - (of(x + 2 * h) - of(x - 2 * h))) / (12 * h))
+
+
+def test_the_derivative_by_a_number_of_the_law_is_that_of_differences(cubic):
     def stiffer(beta):
         return vijax.steady(DEVICE, cubic[0], pair=PAIR, membrane=Cubic(beta)).P
 
-    def lossier(chi, exponent):
-        return vijax.steady(DEVICE, hertz[0], pair=LOSSY, membrane=vijax.HuntCrossley(chi, exponent)).P
-
-    def difference(of, x, h):
-        return (8 * (of(x + h) - of(x - h)) - (of(x + 2 * h) - of(x - 2 * h))) / (12 * h)
-
-    assert float(jax.grad(stiffer)(500.0)) == pytest.approx(float(difference(stiffer, 500.0, 20.0)), rel=1e-7)
-    by_chi, by_exponent = jax.grad(lossier, argnums=(0, 1))(0.3, 1.5)
-    assert float(by_chi) == pytest.approx(float(difference(lambda x: lossier(x, 1.5), 0.3, 0.01)), rel=1e-6)
-    assert float(by_exponent) == pytest.approx(float(difference(lambda x: lossier(0.3, x), 1.5, 0.01)), rel=1e-6)
+    assert float(jax.grad(stiffer)(500.0)) == pytest.approx(difference(stiffer, 500.0, 20.0), rel=1e-7)
     # Left out, the membrane is the orbit's.
     known = stiffer(500.0)
     for pair in (PAIR, cubic[0].pair):
         np.testing.assert_array_equal(vijax.steady(DEVICE, cubic[0], pair=pair).P, known)
+
+
+@pytest.mark.long
+def test_derivatives_by_two_numbers_of_the_law_are_those_of_differences(hertz):
+    def lossier(chi, exponent):
+        return vijax.steady(DEVICE, hertz[0], pair=LOSSY, membrane=vijax.HuntCrossley(chi, exponent)).P
+
+    by_chi, by_exponent = jax.grad(lossier, argnums=(0, 1))(0.3, 1.5)
+    assert float(by_chi) == pytest.approx(difference(lambda x: lossier(x, 1.5), 0.3, 0.01), rel=1e-6)
+    assert float(by_exponent) == pytest.approx(difference(lambda x: lossier(0.3, x), 1.5, 0.01), rel=1e-6)
 
 
 @pytest.mark.long
@@ -129,6 +138,7 @@ def test_walls_that_differ_have_a_law_each(springs):
             assert other == pytest.approx(one, rel=1e-9)
 
 
+@pytest.mark.long
 def test_contacts_that_steps_do_not_resolve_make_no_orbit():
     """Of 13 swings in a contact of so few steps nothing is known."""
     stiff = vijax.impact_pair(0.2, 40.0, 0.5, -0.9)
@@ -142,11 +152,12 @@ def test_contacts_that_steps_do_not_resolve_make_no_orbit():
 def test_what_is_uncertain_of_a_contact_is_part_of_the_residual(springs, monkeypatch):
     orbit = springs[1]
     told = orbit.pair, orbit.sequence, orbit.knots
-    assert float(shooting.measured(*told)[0][0]) < 1e-11
+    assert float(jax.jit(shooting.measured)(*told)[0][0]) < 1e-11
     monkeypatch.setattr(contacts, "uncertainty", lambda *of: jnp.asarray(0.25))
-    assert float(shooting.measured(*told)[0][0]) == 0.25
+    assert float(jax.jit(lambda *of: shooting.measured(*of))(*told)[0][0]) == 0.25
 
 
+@pytest.mark.long
 def test_a_ball_that_meets_a_wall_between_is_seen():
     """Impacts on one wall know nothing of the other, which stands in the way of a narrow gap."""
     wide = vijax.find_orbits(vijax.impact_pair(0.9, 40.0, 0.5, 0.2), "L", guesses=64, membrane=Plain())
@@ -194,6 +205,7 @@ def uneven():
     return vijax.find_orbits(PAIR, "LR", guesses=64, membrane=UNEVEN)
 
 
+@pytest.mark.long
 def test_walls_have_a_law_each(uneven):
     fine = {"method": "ode", "solver": "Dopri8", "rtol": 1e-11, "atol": 1e-13}
     run = vijax.trajectory(PAIR, 0.0, 0.1, 60, membrane=UNEVEN, **fine)
@@ -205,6 +217,7 @@ def test_walls_have_a_law_each(uneven):
         np.testing.assert_allclose(ends, known, rtol=0, atol=2e-9, err_msg=name)
 
 
+@pytest.mark.long
 def test_the_mirror_image_of_walls_with_laws_is_that_of_the_motion(uneven):
     turned = vijax.find_orbits(
         vijax.impact_pair(0.2, 40.0, 0.5, -0.05), "LR", guesses=64, membrane=vijax.Sides(UNEVEN.right, UNEVEN.left)
@@ -229,6 +242,7 @@ def test_each_wall_has_a_derivative(uneven):
         assert float(mine) == pytest.approx(float((one - other) / (2 * h)), rel=1e-5)
 
 
+@pytest.mark.long
 def test_a_map_knows_the_law_of_each_wall(uneven):
     found = vijax.sweep(d=0.2, kappa=40.0, r=0.5, gamma=0.05, method="ode", rtol=1e-10, atol=1e-12, membrane=UNEVEN)
     assert found.attrs["membrane"] == "left Cubic with beta 100, right Cubic with beta 2000"
@@ -255,6 +269,6 @@ def test_laws_of_two_kinds_are_refused():
 
 def test_what_a_contact_loses_is_the_determinant_of_its_tangent_map():
     onset = [jnp.asarray(x) for x in (1.0, 0.3, 0.7, 0.08)]
-    lost = [float(contacts.loss(replace(PAIR, law=law), *onset)) for law in (None, Plain())]
+    lost = [float(jax.jit(contacts.loss)(replace(PAIR, law=law), *onset)) for law in (None, Plain())]
     assert lost[1] == pytest.approx(lost[0], rel=1e-10)
     assert lost[0] == pytest.approx(float(jnp.exp(-PAIR.mu * 0.08)), rel=1e-14)

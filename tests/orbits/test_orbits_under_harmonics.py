@@ -40,7 +40,11 @@ def test_the_sine_is_one_of_them():
         np.testing.assert_allclose(getattr(nearly, name), getattr(sine, name), rtol=0, atol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize("kappa", [40.0, None, vijax.Sides(40.0, None)], ids=["soft", "rigid", "one rigid"])
+@pytest.mark.parametrize(
+    "kappa",
+    [40.0, pytest.param(None, marks=pytest.mark.long), pytest.param(vijax.Sides(40.0, None), marks=pytest.mark.long)],
+    ids=["soft", "rigid", "one rigid"],
+)
 def test_an_attractor_is_the_motion_that_a_run_comes_to(kappa):
     pair = vijax.impact_pair(0.2, kappa, 0.5, 0.02)
     found = vijax.orbits_from_states(pair, 0.0, 0.1, settle=200, excitation=ROUGH)
@@ -75,6 +79,7 @@ def test_a_search_finds_the_attractor_and_what_repels(rough):
     assert apart[5] / apart[4] == pytest.approx(growth, rel=1e-3)
 
 
+@pytest.mark.long
 def test_a_later_start_of_the_clock_is_the_same_orbit_earlier(rough):
     shift = 0.37
     later = vijax.Harmonics(ROUGH.amplitudes, [p + (k + 1) * np.pi * shift for k, p in enumerate(ROUGH.phases)])
@@ -86,6 +91,7 @@ def test_a_later_start_of_the_clock_is_the_same_orbit_earlier(rough):
     np.testing.assert_allclose(moved.work, rough.work, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_a_steady_state_harvests_what_a_map_says(rough):
     found = vijax.steady(DEVICE, rough[0], pair=PAIR)
     known = vijax.sweep(d=0.2, kappa=40.0, r=0.5, gamma=0.02, excitation=ROUGH)
@@ -121,6 +127,7 @@ def test_the_harmonics_have_derivatives_too(rough):
     assert slope == pytest.approx((one - other) / (2 * h), rel=1e-5)
 
 
+@pytest.mark.long
 def test_a_capsule_that_is_shaken_harder_has_the_orbits_of_a_smaller_one():
     """Of five times the amplitude: all lengths and speeds are five times as large, guesses of speeds too."""
     small = vijax.find_orbits(PAIR, "LR", guesses=64)
@@ -133,7 +140,7 @@ def test_a_capsule_that_is_shaken_harder_has_the_orbits_of_a_smaller_one():
     assert orbit_search._strength(with_harmonics(wide, vijax.Harmonics([0.1]))) == 1.0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_the_nearest_turn_of_a_flight_is_that_of_a_scan(seed):
     draw = np.random.default_rng(seed)
     pair, side, speed, t = with_harmonics(PAIR, ROUGH), -1.0, draw.uniform(0.1, 0.4), draw.uniform(0, 2)
@@ -175,6 +182,7 @@ def test_mirror_images_are_orbits_under_odd_harmonics_alone():
     )
 
 
+@pytest.mark.long
 def test_a_ball_that_meets_a_wall_between_is_seen():
     wide = vijax.find_orbits(vijax.impact_pair(0.9, 40.0, 0.5, 0.2), "L", guesses=64, excitation=ROUGH)
     assert (np.asarray(wide.status) == Status.OK).all()

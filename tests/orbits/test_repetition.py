@@ -30,7 +30,7 @@ def once():
     return vijax.orbits_from_states(DESIGN, *STATE)
 
 
-@pytest.mark.parametrize("period", [2, 4])
+@pytest.mark.parametrize("period", [2, pytest.param(4, marks=pytest.mark.long)])
 def test_an_orbit_found_with_a_multiple_of_its_period_is_reduced(once, period):
     found = vijax.orbits_from_states(DESIGN, *STATE, period=period)
     assert (float(found.sequence.span[0]), int(found.count[0]), int(found.status[0])) == (2.0, 2, Status.OK)
@@ -79,7 +79,8 @@ def beside(flip, doubled, share):
     return *rows, guess
 
 
-@pytest.mark.parametrize("along", [pytest.param("kappa", marks=pytest.mark.long), "d"])
+@pytest.mark.long
+@pytest.mark.parametrize("along", ["kappa", "d"])
 def test_doubled_orbits_and_two_turns_of_one_orbit_are_distinguished_on_both_sides_of_a_flip(along):
     """At relative distances of 1e-3 to 1e-8 from the flip, where turns of the doubled orbit differ by 1e-2 to 4e-5."""
     flip, doubled, place = flip_along(along)
@@ -115,6 +116,7 @@ def test_an_orbit_closed_half_way_after_three_half_turns_is_closed_after_one():
     np.testing.assert_allclose(found.multipliers, once.multipliers, rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_a_search_finds_orbits_of_a_lesser_period_at_that_period_and_each_once():
     """At this gap both orbits of a mirror pair have just doubled; the symmetric one between them never does."""
     found = vijax.find_orbits(vijax.impact_pair(0.1868, None, 0.5), "RLRL", 2, guesses=1024)
@@ -152,6 +154,7 @@ def test_a_curve_begins_at_the_flip_that_doubled_orbits_meet(doubled_branch):
     assert (curve.kind, float(curve.orbit.sequence.span[0])) == ("flip", 2.0)
 
 
+@pytest.mark.long
 def test_a_family_does_not_switch_back_to_the_branch_that_has_met_the_flip():
     _, doubled, place = flip_along("d")
     branches = switching.family(doubled, "d", (place - 2e-4, 0.2))
@@ -159,6 +162,7 @@ def test_a_family_does_not_switch_back_to_the_branch_that_has_met_the_flip():
     assert [point.kind for point in branches[0].points] == ["flip"]
 
 
+@pytest.mark.long
 def test_the_first_bifurcation_above_a_design_is_its_flip(once):
     device = with_pair(vijax.Harvester(A=3.82897, omega=11.33991), DESIGN)
     design = dataclasses.replace(an_optimum(), orbit=symmetry.doubled(once), device=device)

@@ -48,6 +48,7 @@ def test_every_orbit_on_both_sides_of_a_graze_is_one(loop):
         assert abs(loop.values[place + 1] - point.value) < 1e-5
 
 
+@pytest.mark.long
 def test_the_next_bifurcation_beyond_is_that_of_the_orbit_found_there(orbits, loop):
     (graze, *_) = grazes(branch := followed(orbits[1], max_grazings=1))
     assert (graze.kind, graze.onward) == ("grazing flight", f"one impact more at the {side_of(graze)} wall")
@@ -101,6 +102,7 @@ def test_no_graze_is_gone_through_where_none_is_asked_for(orbits):
     assert set(np.asarray(branch.orbit.count)) == {2}
 
 
+@pytest.mark.long
 def test_a_symmetric_orbit_gains_an_impact_at_both_walls_at_once(orbits):
     full, half = followed(orbits[0], max_grazings=1), followed(symmetry.halved(orbits[0]), max_grazings=1)
     (whole,), (one,) = ([point for point in grazes(branch) if point.gained] for branch in (full, half))
@@ -110,6 +112,7 @@ def test_a_symmetric_orbit_gains_an_impact_at_both_walls_at_once(orbits):
     assert vijax.orbit_labels(full.orbit[-1:]) == ["2:2"]
 
 
+@pytest.mark.long
 def test_contacts_join_and_part_again(orbits):
     half, low = symmetry.halved(orbits[0]), (0.02, 0.3)
     (down,) = vijax.follow_orbits(half, "d", low, direction="down")

@@ -80,6 +80,7 @@ def test_derivatives_in_every_parameter_are_those_of_differences(found):
         np.testing.assert_allclose(mine, wanted, rtol=2e-6, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.long
 def test_reverse_is_forward_and_second_derivatives_are_differences_of_first(found):
     guess, slope, slopes, _ = found
     one, pair = guess[1], jax.tree.map(lambda x: x[1], guess.pair)
@@ -174,6 +175,7 @@ def pressed():
     return pair, sequence, jnp.asarray(knots)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("off", [1.0, 1.05])
 def test_a_pressed_contact_is_what_the_impact_map_flies(pressed, off):
     pair, sequence, knots = pressed

@@ -108,16 +108,19 @@ def soft():
     return dict(zip([0.11, 0.12, 0.2, 0.3], attractors(np.array([0.11, 0.12, 0.2, 0.3]), kappa=12.65), strict=True))
 
 
+@pytest.mark.long
 def test_f8_one_to_one_for_gaps_from_0_106_at_kappa_12_65(soft):
     assert all(set(labels) == {"1:1/1T"} for labels, _ in soft.values())
 
 
+@pytest.mark.long
 def test_e1_soft_walls_near_the_rigid_limit_give_the_same_energy():
     ((labels, power),) = attractors(np.array([0.3]), kappa=400.0)
     assert set(labels) == {"1:1/1T"}
     assert power == pytest.approx(1.699e-6, rel=1e-3)
 
 
+@pytest.mark.long
 def test_f11b_asymmetric_one_to_one():
     ds = sweep(d=0.12, kappa=np.array([10.5, 12.65]), outputs=("period", "restitution_left", "restitution_right"))
     gap = np.abs(ds.restitution_left - ds.restitution_right).values

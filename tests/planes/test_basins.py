@@ -183,6 +183,7 @@ def known():
     return basin_fractions(d=[0.2, 0.3], kappa=3.0, r=0.5, starts=500, periods=200)
 
 
+@pytest.mark.long
 def test_three_attractors_coexist_in_known_shares():
     found = known().isel(d=0)
     shares = dict(zip(found.label.values, found.fraction.values, strict=True))
@@ -206,6 +207,7 @@ def test_the_sign_of_the_mean_impact_velocity_tells_mirror_images_apart():
     np.testing.assert_allclose(both, 0.0, atol=1e-9)
 
 
+@pytest.mark.long
 def test_merged_mirror_images_are_the_sum_of_both():
     apart = known().isel(d=0)
     merged = basin_fractions(d=[0.2, 0.3], kappa=3.0, r=0.5, starts=500, periods=200, merge_mirrors=True).isel(d=0)

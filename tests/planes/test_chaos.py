@@ -44,6 +44,7 @@ def test_a_known_exponent_and_its_error():
     assert (told[0], told[-1]) == ((0, 128), (128, 128))
 
 
+@pytest.mark.long
 def test_the_growth_from_the_identity_does_not_bias_a_short_window():
     short = lyapunov(d=0.12, kappa=400.0, r=0.5, wall="rigid", starts=1024, periods=20)
     error = float(np.hypot(short.lyapunov_stderr, chaos()[0].lyapunov_stderr))
@@ -51,6 +52,7 @@ def test_the_growth_from_the_identity_does_not_bias_a_short_window():
     assert abs(float(short.lyapunov - chaos()[0].lyapunov)) < 4 * error
 
 
+@pytest.mark.long
 def test_chaos_that_ends_at_random_has_its_mean_lifetime(monkeypatch):
     mean = 3000.0
     random = np.random.default_rng(6)
@@ -88,13 +90,16 @@ def test_an_attractor_survives():
 INTERMITTENT = [(3.55, 11.1, 0.32), (9.063, 29.9, 0.5), (5.318, 11.2, 0.29), (0.893, 6.7, 0.43)]
 
 
-@pytest.mark.parametrize(("d", "kappa", "r"), INTERMITTENT)
+@pytest.mark.parametrize(
+    ("d", "kappa", "r"), [*(pytest.param(*cell, marks=pytest.mark.long) for cell in INTERMITTENT[:3]), INTERMITTENT[3]]
+)
 def test_the_share_of_survivors_never_rises(d, kappa, r):
     found = survival(d=d, kappa=kappa, r=r, starts=128, periods=1600)
     assert (np.diff(found.survival) <= 0).all()
     assert found.survival[0] > 0.9
 
 
+@pytest.mark.long
 def test_survivors_are_those_of_trajectories():
     """Chaos that ends on an orbit of period 3, after some 2000 periods; a motion is seen to be chaotic for 200 more."""
     d, kappa, r, starts, periods, ahead = 7.129, 23.5, 0.93, 160, 2000, 300

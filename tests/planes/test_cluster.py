@@ -99,7 +99,7 @@ with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **options) as m
 """
 
 
-@pytest.mark.parametrize("seconds", [0, 1])
+@pytest.mark.parametrize("seconds", [pytest.param(0, marks=pytest.mark.long), 1])
 def test_a_scheduler_that_is_lost_is_one_line(capfd, seconds):
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     with subprocess.Popen([sys.executable, "-c", SCHEDULER], **pipes) as process:
@@ -163,6 +163,7 @@ def fragile(folder: Path, lives: int, task: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signal there")
 def test_a_lost_worker_is_replaced(tmp_path):
     assert sorted(cluster.done(partial(fragile, tmp_path, 1), range(6), 2)) == list(range(6))
@@ -194,6 +195,7 @@ def blocks_ctrl_c() -> bool:
     return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
+@pytest.mark.long
 def test_only_this_run_can_connect_to_its_scheduler_and_workers():
     """Any user of this machine reaches the ports, and whoever connects runs code."""
     with cluster._local(1) as client:

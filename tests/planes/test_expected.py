@@ -47,6 +47,7 @@ def test_level_cells_are_those_of_the_table_with_mirror_images_merged(level):
     np.testing.assert_array_equal(level.expected_over_best, level.P / level.P_greatest)
 
 
+@pytest.mark.long
 def test_inclined_cells_and_variants_are_those_of_the_table():
     axes = {**PLANE, "gamma": 0.05, "A": [1.0, 2.0]}
     assert_agrees(vijax.sweep(**axes, starts=12), vijax.basin_fractions(**axes, starts=12))
@@ -130,6 +131,7 @@ def test_bad_input_is_told(change, message):
         vijax.sweep(**{**PLANE, "starts": 4, **change})
 
 
+@pytest.mark.long
 def test_settings_that_are_read_change_the_map():
     axes = {"d": 0.1, "kappa": 60.0, "r": 0.5, "starts": 4}
     soft, short = vijax.sweep(**axes), vijax.sweep(**axes, periods=SweepSettings.periods // 40)

@@ -39,12 +39,14 @@ def test_falling_d_leaves_period_one_where_published(rigid):
     assert at(down, 0.150, 0.168) == {"2:3/2T"}
 
 
+@pytest.mark.long
 def test_rising_d_stays_on_the_other_branch(rigid):
     up = rigid.sel(direction="up")
     assert at(up, 0.188, 0.200) == {"1:2"}
     assert at(up, 0.202, 0.25) == {"1:1"}
 
 
+@pytest.mark.long
 def test_rising_omega_changes_orbit_where_published():
     """Start of Fig. 12's period-1 range, one device with soft walls; claim F12a."""
     values = np.round(np.arange(3.02, 3.2, 0.03), 3)
@@ -64,7 +66,7 @@ def followed(d, kappa, u0, v0, periods):
     return record(pair, State(u0, v0, zero, whole, whole), periods, np.ones(d.shape, bool))
 
 
-@pytest.mark.parametrize("wall", ["soft", "rigid"])
+@pytest.mark.parametrize("wall", [pytest.param("soft", marks=pytest.mark.long), "rigid"])
 def test_a_chain_of_equal_points_is_one_long_run(wall):
     """Onsets, speeds and states of three points of 4 periods, against one run of 12."""
     kappa = np.array([4.0, 12.65, 40.0, 400.0])
@@ -122,7 +124,7 @@ def test_a_round_that_comes_to_nothing_leaves_no_trace():
     assert float(ds.u_strobe[1, -1]) == pytest.approx(run.u[0, -1], abs=1e-7)
 
 
-@pytest.mark.parametrize("periods", [100, 101])
+@pytest.mark.parametrize("periods", [pytest.param(100, marks=pytest.mark.long), 101])
 def test_an_orbit_is_taken_to_the_end_of_its_periods(periods):
     """Of a period-2 orbit the state after an odd number of periods is another than after an even one."""
     ds = orbit_diagram(

@@ -374,6 +374,7 @@ def test_a_refined_map_is_drawn_and_stored_as_any_other(both, tmp_path):
     assert back.identical(found)
 
 
+@pytest.mark.long
 def test_variants_are_filled_along_and_other_outputs_left_out():
     found = sweep(d=np.linspace(0.25, 0.3, 18), A=[1.0, 2.0], kappa=300.0, outputs=["P"], periods=PERIODS, refine=1)
     assert set(found.data_vars) == {"P", "status", "computed"}

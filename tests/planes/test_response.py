@@ -31,6 +31,7 @@ def test_densities_are_those_of_all_impacts(found):
         assert (found[f"{of}_density_stderr"].values >= 0).all()
 
 
+@pytest.mark.long
 def test_power_is_that_of_sweeps_from_the_same_starts(found):
     """The noise of a start is that of the cell in a map: every realisation is a cell of one."""
     from vijax.planes.start_places import start_places
@@ -44,6 +45,7 @@ def test_power_is_that_of_sweeps_from_the_same_starts(found):
     assert float(found["P"]) == pytest.approx(found["P_realisation"].values.mean())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wall", ["rigid", "rigid_right"])
 def test_rigid_walls_are_those_of_sweeps(wall):
     """Power, depth and limit by the membrane that rigid walls are lent, or by the one wall that has one."""
@@ -61,6 +63,7 @@ def test_rigid_walls_are_those_of_sweeps(wall):
     assert float(found["time_share"].sum()) == pytest.approx(1)
 
 
+@pytest.mark.long
 def test_the_error_is_how_far_other_seeds_are(found):
     others = [
         response(
@@ -75,6 +78,7 @@ def test_the_error_is_how_far_other_seeds_are(found):
     assert "time_share" not in others[0]
 
 
+@pytest.mark.long
 def test_errors_of_quantiles_hold_in_the_tails():
     """Impacts of a realisation are alike: in 200 draws of 64 realisations quantiles scatter as their errors say."""
     asked = SimpleNamespace(realisations=64)

@@ -456,6 +456,7 @@ def test_a_stiff_wide_gap_has_symmetric_orbits(plane):
     assert plane["admissible"].all()
 
 
+@pytest.mark.long
 def test_a_transient_is_dropped_before_a_window_alone():
     cells = {"d": [0.12, 0.3], "kappa": 400.0, "r": 0.5, "periods": 40, "outputs": ["P", "period"]}
     with pytest.raises(ValueError, match=r"transient must be 0 with until='attractor'.*got 30"):
@@ -494,6 +495,7 @@ def optimised(monkeypatch):
     simulate.compiled.cache_clear()
 
 
+@pytest.mark.long
 def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
     d, kappa = MIXED["d"], MIXED["kappa"]
     mixed = sweep(d=d, kappa=kappa, r=0.6)
@@ -512,6 +514,7 @@ def test_cells_have_the_same_bits_in_every_plane(optimised, tmp_path):
             np.testing.assert_array_equal(got, wanted, err_msg=f"{name}, {where}")
 
 
+@pytest.mark.long
 def test_planes_of_every_size_share_two_programs(tmp_path, monkeypatch):
     """One for few cells, one for all others."""
     made, jitted = [], export_cache.TracedProgram._jitted
@@ -539,6 +542,7 @@ def test_periodic_cells_hardly_depend_on_what_else_is_wanted():
         np.testing.assert_allclose(other[name].where(periodic), mixed[name].where(periodic), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_physical_and_dimensionless_axes_give_the_same_map(plane):
     # d = s omega^2 / (A pi^2) and kappa = omega0 pi / omega, at A = 1 and omega = pi.
     physical = sweep(s=[0.2, 0.25, 0.3], omega0=[100.0, 400.0], periods=LONG)
@@ -555,6 +559,7 @@ def test_variants_are_what_separate_sweeps_give(plane):
         np.testing.assert_allclose(both[name].sel(A=2.0), louder[name], rtol=1e-12, err_msg=name)
 
 
+@pytest.mark.long
 def test_rigid_walls_in_single_precision():
     found = sweep(d=[0.25, 0.3], kappa=[200.0, 400.0], wall="rigid", dtype="float32", periods=LONG)
     assert found["P"].dtype == np.float32
@@ -566,6 +571,7 @@ def test_rigid_walls_in_single_precision():
     np.testing.assert_allclose(found["restitution"], 0.5, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_a_flight_that_drifts_beyond_the_last_period_is_not_silence():
     # Each of these was called silent, with P = 0, for a flight that only ends long after the last period.
     found = [

@@ -683,6 +683,7 @@ vijax.sweep(**axes, outputs=["impacts_per_period", "restitution"], out=sys.argv[
 """
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_the_number_of_devices(tmp_path):
     stores = []
     for number in (1, 2):

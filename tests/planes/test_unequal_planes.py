@@ -38,6 +38,7 @@ def test_walls_of_one_kappa_are_equal_walls():
     assert not {"kappa", "r"} & set(own[0].coords)
 
 
+@pytest.mark.long
 def test_cells_are_the_orbits_that_the_equations_have(found):
     seen = 0
     for i, d in enumerate(D):
@@ -93,6 +94,7 @@ def test_each_wall_has_a_limit_of_its_own(found):
     assert float(softer["max_penetration"]) == pytest.approx(depth, rel=1e-12)
 
 
+@pytest.mark.long
 def test_exchanged_walls_give_the_same_with_sides_exchanged():
     # Attractors that many starts share: which of several one start meets is no mirror image of the other's.
     one = sides(d=0.25, kappa_left=[60.0, 90.0], r_left=0.4, r_right=0.6, starts=8)
@@ -101,9 +103,10 @@ def test_exchanged_walls_give_the_same_with_sides_exchanged():
     np.testing.assert_allclose(one["P"], other["P"], rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("told", "near"),
-    [({"method": "ode"}, 1e-6), pytest.param({"method": "rk4", "steps": 500}, 0.08, marks=pytest.mark.long)],
+    [({"method": "ode"}, 1e-6), ({"method": "rk4", "steps": 500}, 0.08)],
     ids=["ode", "rk4"],
 )
 def test_other_methods_meet_the_same_walls(told, near):
@@ -114,6 +117,7 @@ def test_other_methods_meet_the_same_walls(told, near):
         assert float(found[name]) == pytest.approx(float(exact[name]), rel=near), name
 
 
+@pytest.mark.long
 def test_a_diagram_along_one_wall_has_the_cells_of_the_map(found):
     """Of a device that harvests at the right wall alone."""
     told = {"kappa_right": 40.0, "periods": 200, "device": vijax.Harvester(V=Sides(0.0, 2000.0))}
@@ -164,6 +168,7 @@ def test_what_cannot_be_is_told_before_anything_runs(given, words):
         vijax.sweep(**({"d": 0.2} | given))
 
 
+@pytest.mark.long
 def test_mirror_images_that_yield_apart_are_two_attractors():
     """Of walls that are alike but for what their membranes yield."""
     told = {"d": 0.14, "kappa": 60.0, "starts": 8}

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import vijax
+from tests.helpers import cases
 from vijax.design import report, tolerance
 from vijax.model import device as devices
 from vijax.model import energy, restitution, variables
@@ -35,7 +36,7 @@ SETTINGS = {
 SECONDS = 120  # a process that takes so long hangs
 
 
-@pytest.fixture(params=SETTINGS)
+@pytest.fixture(params=cases(SETTINGS, long=("jax_debug_infs", "jax_numpy_dtype_promotion", "jax_transfer_guard")))
 def setting(request) -> Iterator[str]:
     """One of the settings, while a test runs."""
     name = request.param
@@ -102,6 +103,7 @@ def plain_slopes() -> list[Any]:
     return slopes()
 
 
+@pytest.mark.long
 def test_settings_of_a_program_change_no_derivative(plain_slopes, setting):
     if setting == "jax_transfer_guard":
         pytest.skip("jax.grad itself transfers between host and device: jax.grad(jnp.sin)(0.3) raises, too")

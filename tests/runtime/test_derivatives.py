@@ -114,7 +114,9 @@ def test_at_numbers_a_program_of_its_own_is_compiled():
     assert sorted(name for name in compiled if "call" in name or "double" in name) == ["jit(call)", "jit(double)"]
 
 
-@pytest.mark.parametrize("derivative", [jax.grad, jax.value_and_grad, jax.jacfwd])
+@pytest.mark.parametrize(
+    "derivative", [jax.grad, *(pytest.param(of, marks=pytest.mark.long) for of in (jax.value_and_grad, jax.jacfwd))]
+)
 def test_other_numbers_and_other_derivatives_trace_nothing_anew(derivative):
     jax.grad(product)(GIVEN)
     before = len(traced)
@@ -174,6 +176,7 @@ def test_rows_and_derivatives_of_any_number_share_a_program_until_they_are_many(
     assert 5 in rows_traced[before:]
 
 
+@pytest.mark.long
 def test_batches_of_any_length_share_a_program():
     """Those of a few; a batch that JAX makes outside of a program is padded."""
 

@@ -25,8 +25,8 @@ WITHOUT = (
     "curve",
 )
 PROGRAMS = [name for name in CALLS if name not in WITHOUT]
-# What CI lowers, the others taking minutes: a plane, a motion, an orbit, its search.
-FEW = ("sweep", "trajectory, periods", "steady", "orbit_search.search")
+# What CI lowers, the others taking minutes: a plane and an orbit.
+FEW = ("sweep", "steady")
 # Of the inclined ones half are those on which gravity holds the ball, which a GPU once never came back from.
 PLANES = {
     "rigid": {"wall": "rigid"},
@@ -76,6 +76,7 @@ def check_lowered(program, shapes):
     return text
 
 
+@pytest.mark.long
 def test_the_program_that_leaves_its_last_cells_is_lowered_for_a_gpu(known, called, on_gpu):  # noqa: F811
     """Public functions call it there, and the program of a whole tile here: the same arguments go into both."""
     CALLS["sweep"](0, known)
