@@ -1,12 +1,13 @@
 """Where the scripts are, a stand-in for the engine, and cases of which some are long."""
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
 import vijax
 from vijax.batch import simulate
@@ -31,6 +32,11 @@ def no_cell_runs() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "summarise", stand_in)
         yield
+
+
+def described_gpu() -> AbstractContextManager[Any]:
+    """Return a context to trace in before a kernel of Triton is lowered where no GPU is; JAX 0.12 asks for which."""
+    return use_abstract_mesh(AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H100", None, "gpu")))
 
 
 def cases(every: Iterable[str], long: tuple[str, ...]) -> list[Any]:

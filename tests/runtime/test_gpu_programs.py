@@ -6,7 +6,7 @@ import pytest
 from jax import export
 
 import vijax
-from tests.helpers import cases
+from tests.helpers import cases, described_gpu
 from tests.runtime.test_programs import CALLS, known  # noqa: F401  a fixture
 from vijax.batch import lanes, stragglers
 from vijax.batch.cell import Plan
@@ -66,7 +66,8 @@ def check_lowered(program, shapes):
     def flat(*leaves):
         return jax.tree.leaves(program._work(*jax.tree.unflatten(tree, leaves)))
 
-    made = export.export(jax.jit(flat), platforms=["cuda"], disabled_checks=[export_cache.KERNEL])(*leaves)
+    with described_gpu():
+        made = export.export(jax.jit(flat), platforms=["cuda"], disabled_checks=[export_cache.KERNEL])(*leaves)
     text = made.mlir_module()
     assert "callback" not in text  # the host is never called
     assert "lapack" not in text

@@ -161,9 +161,10 @@ def test_derivatives_and_batches_of_other_periods_compile_slices_alone():
 
 def test_what_is_traced_flies_the_same():
     starts = np.linspace(-0.3, 0.3, 3)
-    for wall, settings in ((40.0, {}), (40.0, {"method": "rk4", "steps": 100})):
+    # The motion by rk4 is aperiodic: within 40 periods it amplifies a difference in rounding to another impact.
+    for wall, settings in ((40.0, {}), (40.0, {"method": "rk4", "steps": 100, "periods": 10})):
         flat = vijax.impact_pair(0.2, wall, 0.5, 0.05)
-        fly = partial(vijax.trajectory, flat, 0.02, periods=40, **settings)
+        fly = partial(vijax.trajectory, flat, 0.02, **{"periods": 40} | settings)
         plain, traced = fly(v0=starts), jax.vmap(lambda v, fly=fly: fly(v0=v))(starts)
         assert jax.tree.structure(plain) == jax.tree.structure(traced)
         for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(traced), strict=True):

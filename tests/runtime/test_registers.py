@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
+from tests.helpers import described_gpu
 from vijax.runtime import registers, xla
 from vijax.runtime.registers import LANES, fit, layout, pack, stay, unpack
 
@@ -146,7 +147,8 @@ def test_lanes_are_as_many_as_whole_blocks_have(lanes, whole):
 def test_a_cuda_gpu_has_one_kernel_and_others_none():
     laid, tables = laid_out(some_lanes())
     work = jax.jit(lambda tables: stay(falls(0.5), laid, numbers(), tables))
-    traced = work.trace(tables)
+    with described_gpu():
+        traced = work.trace(tables)
     assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 1
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
     np.testing.assert_array_equal(unpack(laid, work(tables))["trips"], 9)
@@ -206,7 +208,8 @@ def test_elsewhere_each_lane_is_done_as_it_stands():
     given = pairs(COUNT)
     laid, tables = laid_out(given, "x", "least")
     work = jax.jit(lambda tables: stay(sums_up, laid, numbers(), tables, jnp.int32(LANES)))
-    traced = work.trace(tables)
+    with described_gpu():
+        traced = work.trace(tables)
     assert traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.triton") == 1
     assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
     np.testing.assert_array_equal(unpack(laid, work(tables))["many"], most_of(given)["many"])

@@ -93,7 +93,14 @@ def again(given):
     return (lax.fori_loop(0, 2, loop_body(body), x),)
 
 
-@pytest.mark.parametrize("work", [powers, turns, halves, inner, own, trips, again])
+def parts(given):
+    """Take rows apart, each of which is a lane's worth."""
+    x, y, z = given
+    first, second = jnp.unstack(jnp.stack([x, y]) * z)
+    return first - second, first * second
+
+
+@pytest.mark.parametrize("work", [powers, turns, halves, inner, own, trips, again, parts])
 def test_lane_by_lane_it_comes_out_the_same(work):
     given = lanes()
     found = jax.jit(lambda *given: unrolled(work, list(given)))(*given)

@@ -89,7 +89,7 @@ def _done(eqn: Any, count: int, args: list[Rows]) -> list[Rows]:
         # That of a body which is computed again for its derivative (`xla.loop_body`) holds no constants.
         return _follow(inner if isinstance(inner, core.ClosedJaxpr) else core.ClosedJaxpr(inner, ()), count, args)
     if name == "unstack":
-        return list(np.moveaxis(args[0], params["axis"], 0))
+        return _along_first(np.moveaxis(args[0], params["axis"], 0))
     if name in _REDUCTIONS:
         return [_reduced(eqn, count, args[0])]
     if name in _SHAPES:
@@ -101,6 +101,11 @@ def _done(eqn: Any, count: int, args: list[Rows]) -> list[Rows]:
         each = zip(args, eqn.invars, strict=True)
         args = [rows if _wide(var.aval) or not rows.ndim else rows[..., 0] for rows, var in each]
     return [_each(partial(eqn.primitive.bind, **params), count, args)]
+
+
+def _along_first(rows: Rows) -> list[Rows]:
+    """Return the rows at each place of the first axis; NumPy's own iteration would unwrap those of one axis."""
+    return [rows[i, ...] for i in range(len(rows))]
 
 
 def _beyond(what: str) -> NotImplementedError:
@@ -170,7 +175,7 @@ def _reduced(eqn: Any, count: int, rows: Rows) -> Rows:
         laid = np.moveaxis(rows, own, range(len(own)))
         laid = laid.reshape(-1, *laid.shape[len(own) :])
         join = partial(_each, _REDUCTIONS[name], count)
-        rows = reduce(lambda one, other: join([one, other]), (laid[i, ...] for i in range(len(laid))))
+        rows = reduce(lambda one, other: join([one, other]), _along_first(laid))
     if len(own) == len(axes):
         return rows
     if name != "reduce_or":
@@ -196,12 +201,21 @@ def _one(work: Callable[..., Any], count: int, values: list[Any]) -> Any:
 
 def _trips(params: dict[str, Any], count: int, args: list[Rows]) -> list[Rows]:
     """Do a loop whose trips are known as so many pieces of work; one over rows is none of these."""
-    consts, carry = args[: params["num_consts"]], args[params["num_consts"] :]
-    if len(carry) > params["num_carry"] or len(params["jaxpr"].out_avals) > params["num_carry"]:
+    consts, carry, scanned = _parts(params, args)
+    if scanned or len(params["jaxpr"].out_avals) > len(carry):
         raise _beyond("scan rows")
     for _ in range(params["length"]):
         carry = _follow(params["jaxpr"], count, [*consts, *carry])
     return carry
+
+
+def _parts(params: dict[str, Any], args: list[Rows]) -> tuple[list[Rows], list[Rows], list[Rows]]:
+    """Return the constants, the carry and the scanned rows among the arguments of a scan."""
+    if "ft_in" in params:  # JAX 0.12 names the three parts by a tree, earlier ones by their lengths
+        consts, carry, scanned = map(list, params["ft_in"].update(args).unpack())
+        return consts, carry, scanned
+    first, second = params["num_consts"], params["num_consts"] + params["num_carry"]
+    return args[:first], args[first:second], args[second:]
 
 
 def _loop(params: dict[str, Any], count: int, args: list[Rows], shapes: list[Any]) -> list[Rows]:
