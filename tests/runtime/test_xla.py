@@ -189,6 +189,62 @@ def test_without_kernels_the_same_comes_out(tmp_path):
         np.testing.assert_allclose(plain[name][settled], found[variable].values[settled], rtol=1e-12)
 
 
+@pytest.fixture
+def measured_anew():
+    """Forget whether XLA makes kernels, and what was traced by it, before a test and after it."""
+
+    def forget():
+        xla.kernel_failure.cache_clear()
+        jax.clear_caches()
+
+    forget()
+    yield
+    forget()
+
+
+@pytest.fixture
+def everything_is_kept():
+    """Keep compiled programs however briefly they compile."""
+    before = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    yield
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
+
+
+@ON_CPU
+@pytest.mark.parametrize("_", ["compiled", "read"])
+def test_kernels_are_used_where_xla_makes_them(measured_anew, everything_is_kept, _):
+    assert xla.kernel_failure() == ""
+    assert xla.uses_kernels()
+
+
+@ON_CPU
+@pytest.mark.parametrize("_", ["compiled", "read"])
+def test_without_a_known_mark_the_plain_form_is_traced(measured_anew, everything_is_kept, monkeypatch, _):
+    """A mark that XLA does not know stands for an XLA that no longer knows ours."""
+    monkeypatch.setattr(xla, "_ONE_KERNEL", {"no_such_mark": "true"} | xla._STAYS)
+    assert xla.kernel_failure() == "XLA ignores the mark of kernels"
+    text = jax.jit(lambda x: kernel(several)(x)).lower(X).as_text()
+    assert "no_such_mark" not in text
+    assert "inlineable" not in text
+    assert whole_blocks(65) == 65
+
+
+@ON_CPU
+def test_a_mark_that_the_compiler_rejects_is_not_used(measured_anew, monkeypatch):
+    """XLA cannot compile a kernel that sorts."""
+    monkeypatch.setattr(xla, "_kept", lambda value: jnp.sort(value))
+    assert xla.kernel_failure().startswith("XLA rejects the mark of kernels: ")
+    assert not xla.uses_kernels()
+
+
+@ON_CPU
+def test_kernels_are_measured_while_a_program_is_traced(measured_anew):
+    traced = []
+    jax.vmap(lambda x: traced.append(xla.uses_kernels()) or x)(X)
+    assert traced == [True]
+
+
 def test_a_misspelt_switch_is_named():
     done = without_kernels("import vijax.public", switch="off")
     assert done.returncode == 1

@@ -7,15 +7,17 @@ calls and memory cost as much as the arithmetic. It can emit a computation of ma
 so by itself for loops of a few bytes; `kernel` asks for it by the same mark. An XLA that does not know the mark, and
 any accelerator, runs the same arithmetic without it.
 
-The mark is XLA's own and documented nowhere. Should an XLA stumble over it, set `VIJAX_KERNELS=0` in the environment
-before vijax is imported: `kernel`, `share`, `in_blocks` and `put` then say nothing that XLA's compiler for CPUs alone
-knows, as on an accelerator, and lanes do not stay in a GPU's registers (`registers`). Results agree to rounding
-(periodic cells to 1e-12), and planes take three to five times as long.
+The mark is XLA's own and documented nowhere. Before the first program is traced for a CPU, `kernel_failure` compiles a
+small program with the mark and examines what XLA made of it. If XLA ignores or rejects the mark, or if the environment
+has `VIJAX_KERNELS=0` when vijax is imported, then `kernel`, `share`, `in_blocks` and `put` use no construct that only
+XLA's compiler for CPUs knows, as on an accelerator. `VIJAX_KERNELS=0` also keeps lanes out of a GPU's registers
+(`registers`). Results agree to rounding (periodic cells to 1e-12), and planes take three to five times as long.
 """
 
 import os
+import re
 from collections.abc import Callable
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -71,20 +73,20 @@ once = jax.jit
 before a program compiles to a third. XLA sees through it."""
 
 
-def _asked_for() -> bool:
-    """Say whether the environment leaves kernels on.
+def _kernels_wanted() -> bool:
+    """Return False if the environment turns kernels off.
 
     Raises:
-        ValueError: It says what is neither 0 nor 1.
+        ValueError: If VIJAX_KERNELS is neither 0 nor 1.
     """
-    said = os.environ.get("VIJAX_KERNELS", "1")
-    if said not in ("0", "1"):
-        raise ValueError(see("limits", f"VIJAX_KERNELS must be 0 (no kernels) or 1; got {said[:20]!r}"))
-    return said == "1"
+    value = os.environ.get("VIJAX_KERNELS", "1")
+    if value not in ("0", "1"):
+        raise ValueError(see("limits", f"VIJAX_KERNELS must be 0 (no kernels) or 1; got {value[:20]!r}"))
+    return value == "1"
 
 
 # Read once: programs that are compiled already would not follow.
-KERNELS = _asked_for()
+KERNELS = _kernels_wanted()
 
 
 def platform() -> str:
@@ -98,8 +100,33 @@ def on_cpu() -> bool:
     return platform() == "cpu"
 
 
-def _in_kernels() -> bool:
-    return KERNELS and on_cpu()
+def uses_kernels() -> bool:
+    """Return True if programs traced now contain kernels made by XLA's mark."""
+    return KERNELS and on_cpu() and not kernel_failure()
+
+
+@cache
+def kernel_failure() -> str:
+    """Return why XLA makes no kernel of a marked computation on the CPU; "" if it makes one.
+
+    Compiles a marked computation of two stored values, without running it. This takes about 40 ms, once per process
+    that traces a program; kept programs need no answer. A kernel of a whole computation has the name of that
+    computation, others have names of its operations.
+    """
+
+    def two_values(x: Any) -> Any:
+        return _kept(jnp.sin(_kept(jnp.tan(_kept(x)))))
+
+    def marked(x: Any) -> Any:
+        return set_xla_metadata(jax.jit(two_values)(x), **_ONE_KERNEL)
+
+    program = jax.jit(marked, compiler_options=compiler_options(brief=True))
+    try:
+        made = program.lower(jax.ShapeDtypeStruct((4,), jnp.float32)).compile().runtime_executable().serialize()
+    except Exception as error:  # whatever a later JAX raises here, planes can be computed without kernels
+        return f"XLA rejects the mark of kernels: {str(error).partition(chr(10))[0][:200]}"
+    # JAX keeps this program too; read back, it has the names of kernels, not of the parts of XLA that made them.
+    return "" if re.search(rb"two_values[\w.]*_kernel", made) else "XLA ignores the mark of kernels"
 
 
 def compiler_options(*, brief: bool = False) -> dict[str, Any]:
@@ -136,7 +163,7 @@ def share(value: Any) -> Any:
     without kernels it is what JAX offers.) An accelerator's fusion has many results and computes each value of a lane
     once: stored ones would cut a step that is 3 kernels into 81.
     """
-    if _in_kernels():
+    if uses_kernels():
         return _kept(value)
     return lax.optimization_barrier(value) if on_cpu() else value
 
@@ -153,7 +180,7 @@ def shared(work: Callable[P, T]) -> Callable[P, T]:
 
 def kernel(work: Callable[P, T]) -> Callable[P, T]:
     """Make one kernel of a function: arithmetic, gathers, reductions and loops, no scatter, sort or library call."""
-    if not _in_kernels():
+    if not uses_kernels():
         return work
 
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -251,13 +278,13 @@ def _summed(count: Int[Array, " lane"]) -> Int[Array, " lane"]:
 
 def whole_blocks(count: int) -> int:
     """Round lanes up to what `in_blocks` parts evenly; fewer than one block stay as they are."""
-    return -(-count // _BLOCK) * _BLOCK if _in_kernels() and count > _BLOCK else count
+    return -(-count // _BLOCK) * _BLOCK if uses_kernels() and count > _BLOCK else count
 
 
 def in_blocks(work: Callable[[T], T], lanes: T) -> T:
     """Do `work` on all lanes, on the CPU block by block: lanes of one block do not wait for those of another."""
     count = jax.tree.leaves(lanes)[0].shape[0]
-    if not _in_kernels() or count <= _BLOCK:
+    if not uses_kernels() or count <= _BLOCK:
         return work(lanes)
     blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, _BLOCK, *leaf.shape[1:]), lanes)
     return jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[2:]), lax.map(work, blocks))
@@ -269,7 +296,7 @@ def put(lanes: T, part: T, rows: Int[Array, " row"], count: Int[Array, ""]) -> T
     On the CPU one after another: a scatter cannot be in a kernel, and what is merged otherwise is read in every lane.
     Elsewhere every lane looks up what replaces it: one scatter for all leaves, the rest of it fuses.
     """
-    if not _in_kernels():
+    if not uses_kernels():
         size = jax.tree.leaves(lanes)[0].shape[0]
         order = jnp.arange(rows.size, dtype=jnp.int32)
         at = jnp.where(order < count, rows, size + order)
