@@ -1,5 +1,8 @@
 """`vijax doctor`: it names what vijax runs on, and tells right numbers from wrong ones."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -31,6 +34,17 @@ def test_it_says_why_nothing_is_kept_and_why_kernels_are_off(monkeypatch):
     about = dict(doctor._programs())
     assert about["kept programs"].startswith("none: ")
     assert about["kernels"] == "off: VIJAX_KERNELS is 0"
+
+
+def test_it_says_why_xla_makes_no_kernels(monkeypatch):
+    monkeypatch.setattr(xla, "kernel_failure", lambda: "XLA ignores the mark of kernels")
+    assert doctor._kernels() == "off, planes take longer: XLA ignores the mark of kernels"
+
+
+def test_the_self_test_loads_no_tables():
+    """To load xarray takes longer than the cell that is computed."""
+    code = "import sys; from vijax.cli import doctor; doctor._checks(); sys.exit('xarray' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_the_folder_counts_programs_alone(tmp_path):
