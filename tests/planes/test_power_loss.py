@@ -1,6 +1,6 @@
 """Stores after a power cut: a map that was saved and tiles that are done are there, and a study goes on.
 
-`benchmarks/power_loss.py` has the model of a disk, and tries every state.
+`benchmarks/power_loss.py` tries every state of the model of a disk in `benchmarks/disk_model.py`.
 """
 
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from benchmarks import power_loss
+from benchmarks import disk_model, power_loss
 from tests.helpers import stand_in
 from vijax.batch import simulate
 from vijax.planes import store_folder
@@ -46,9 +46,9 @@ def test_a_power_cut_breaks_no_promise_where_the_disk_cannot_exchange_names(monk
 def test_without_flushing_promises_are_broken(monkeypatch, name):
     """The model notices what is not flushed."""
     monkeypatch.setattr(files, "_flush", lambda path: None)
-    add = power_loss.Recording.add
+    add = disk_model.Recording.add
     monkeypatch.setattr(
-        power_loss.Recording, "add", lambda self, kind, *given: None if kind == "flush" else add(self, kind, *given)
+        disk_model.Recording, "add", lambda self, kind, *given: None if kind == "flush" else add(self, kind, *given)
     )
     outcomes = power_loss.lose(power_loss.scenarios()[name], 6, seed=0)
     assert any(one.broken for one in outcomes)
@@ -59,7 +59,7 @@ def test_all_that_changes_a_store_is_recorded(tmp_path, name):
     recording = power_loss.record(power_loss.scenarios()[name], tmp_path)
     there = {path.relative_to(tmp_path).as_posix(): path for path in tmp_path.rglob("*")}
     found = {path: file.read_bytes() if file.is_file() else None for path, file in there.items()}
-    assert power_loss.last(recording) == found
+    assert disk_model.last(recording) == found
 
 
 def test_what_is_flushed_is_flushed_by_the_system(tmp_path, monkeypatch):
