@@ -1,22 +1,52 @@
 """Faults of a store in combination: random runs, of which `benchmarks/store_faults.py` makes more."""
 
+import random
+from collections import Counter
+from contextlib import closing
+
 import jax
 import pytest
 
 from benchmarks import store_faults
+from benchmarks.disk_model import random_state
+from benchmarks.store_faults import Kill, StoreMachine, files_of
 from tests.helpers import stand_in
 from vijax.batch import simulate
 
-RUNS, STEPS = 20, 8
+RUNS, STEPS = 15, 6
+TEARS = 100
 
 
-@pytest.fixture(autouse=True)
-def engine(monkeypatch):
+@pytest.fixture(scope="module", autouse=True)
+def engine():
     """A stand-in for the engine: what a store does with arrays does not depend on how they are computed."""
-    monkeypatch.setattr(simulate, "summarise", stand_in)
-    monkeypatch.setenv("VIJAX_TILE", "6")
-    monkeypatch.setattr("vijax.planes.dispatch.places", lambda: jax.devices()[:1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulate, "summarise", stand_in)
+        patch.setenv("VIJAX_TILE", "6")
+        patch.setattr("vijax.planes.dispatch.places", lambda: jax.devices()[:1])
+        yield
 
 
-def test_a_store_survives_faults_in_combination():
-    store_faults.run(RUNS, STEPS)
+@pytest.fixture(scope="module")
+def stores(engine):
+    return store_faults.undisturbed()
+
+
+def test_a_store_survives_faults_in_combination(stores):
+    store_faults.run(stores, RUNS, STEPS)
+
+
+@pytest.mark.parametrize("exchanges", [True, False])
+@pytest.mark.parametrize("at", [1, 2, 4])
+def test_names_that_a_killed_run_did_not_flush_are_flushed_by_the_next(stores, at, exchanges):
+    """A power cut after the second run takes nothing: neither the store nor names of its files."""
+    machine = StoreMachine(stores, Counter())
+    with closing(machine.stack):
+        machine.choose_disk(exchanges)
+        machine.begin_or_resume("other", None)
+        machine.overwrite("one", Kill("flush", at))
+        machine.resume(None)
+        there = {f"{machine.path.name}/{name}": content for name, content in files_of(machine.path).items()}
+        for seed in range(TEARS):
+            left = random_state(machine.recording, random.Random(seed))
+            assert {name: left.get(name) for name in there} == there

@@ -195,6 +195,16 @@ def _take_place(name: str, folder: Path, target: Path, overwrite: bool) -> None:
                 raise
 
 
+def flush_names(path: Path) -> None:
+    """Flush the names of a store and of its files: an earlier run may have been killed before it did so.
+
+    Contents need no flush, because files have their names only once their contents are on disk.
+    """
+    target = Path(os.path.realpath(path))
+    folders = (target / name for name, entry in store_names.entries(target) if entry.is_dir(follow_symlinks=False))
+    flush([target.parent, target, *folders])
+
+
 def recover(path: Path) -> None:
     """Put back the store that a killed run had put aside and not replaced, and remove what it left; log both.
 
@@ -212,6 +222,9 @@ def _recover(folder: Path, target: Path) -> None:
     with locked(folder / _LOCK) as own:
         if not own:
             return
+        # The killed run may not have flushed the names that it changed. If a power cut took that change after what is
+        # left was removed, no store would be there.
+        flush([target.parent, folder])
         # An empty one is that of a living run, which makes or removes it.
         empty = not any(os.path.lexists(folder / one) for one in (_NEW, _OLD))
         missing = not os.path.lexists(target)

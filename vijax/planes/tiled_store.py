@@ -23,9 +23,9 @@ from vijax.planes import inventory, store_metadata, store_names, tile_size
 from vijax.planes.cells import Cells
 from vijax.planes.dataset import SweepPlan, made_by
 from vijax.planes.store import chunk, encoded, void, write_files
-from vijax.planes.store_folder import check_place, check_store, exclusive_writer, lock, replacing_store
+from vijax.planes.store_folder import check_place, check_store, exclusive_writer, flush_names, lock, replacing_store
 from vijax.runtime import checks
-from vijax.runtime.files import create, make_folder, make_folders, remove, remove_part, replace_files, write_json
+from vijax.runtime.files import create, flush, make_folder, make_folders, remove, remove_part, replace_files, write_json
 from vijax.runtime.pages import see
 from vijax.runtime.tiles import places
 
@@ -189,6 +189,7 @@ def opened(planned: SweepPlan, path: str | Path, overwrite: bool = False) -> Ite
         # What was made here a moment ago is known.
         if _birth(target) != birth:
             _check_same(planned, target)
+            flush_names(target)
         yield _found(planned, target)
 
 
@@ -247,7 +248,9 @@ def _locked(path: Path, overwrite: bool = False) -> Iterator[None]:
         )
     with exclusive_writer("out", path):
         if (listed := inventory.read(path)) and "birth" in listed and listed["birth"] != _birth(path):
-            lock(path).write_text(listed["birth"], encoding="utf-8")
+            # In place: a new file under this name would not be the one that is locked.
+            create(lock(path), listed["birth"].encode())
+            flush([lock(path)])
         yield
 
 
