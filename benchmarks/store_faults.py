@@ -133,7 +133,9 @@ class Fuse:
 # Most calls are for one plane, so that most resume the store that is there.
 plane_names = st.sampled_from(["one", "one", "one", "other"])
 # Between a change of names and its flush a kill leaves what a power cut takes later.
-moments = st.builds(Kill, st.sampled_from(["flush", "flush", *CHANGES]), st.integers(0, _MOST_CHANGES))
+moments = st.builds(
+    Kill, st.sampled_from(["flush", "flush", *CHANGES]), st.integers(0, 3) | st.integers(0, _MOST_CHANGES)
+)
 kills = st.none() | moments
 
 
@@ -259,11 +261,11 @@ class StoreMachine(RuleBasedStateMachine):
         path.write_bytes(content)
         self.recording.damage(path, bytes(content))
 
-    @rule()
-    def move(self) -> None:
-        """Rename the folder of the store; the user waits until that is on disk."""
+    @rule(chance=st.integers(0, 3))
+    def move(self, chance: int) -> None:
+        """Rename the folder of the store, every fourth time; the user waits until that is on disk."""
         target = self.path.with_name(_NAMES[self.path.name == _NAMES[0]])
-        if not self.path.exists() or target.exists():
+        if chance or not self.path.exists() or target.exists():
             return
         self.steps["move"] += 1
         os.rename(self.path, target)
