@@ -162,6 +162,16 @@ def test_distances_whose_product_underflows_keep_their_sign(dtype):
     times = d[:, None].astype(float) * (np.cumsum(R**-k) - 0.5)
     np.testing.assert_allclose(run.impacts.t, times, rtol=16 * eps, atol=SHORTEST)
 
+    # From the middle a ball with 1.1 times the speed that it needs meets the right wall just before it turns back, as
+    # the push at t = 1 is -1: the distances to the wall at the start and at the turn have a product of about d^2/20.
+    d = np.geomspace(1e-12, 1e-30, 8).astype(dtype)
+    v0 = (1.1 * np.sqrt(d)).astype(dtype)
+    first = vijax.trajectory(vijax.impact_pair(d, None, r, zero), zero, v0, 1, one, max_impacts=count).impacts
+    np.testing.assert_array_equal(first.side[:, 0], np.ones(8))
+    speeds = np.sqrt(v0.astype(float) ** 2 - d.astype(float))
+    # The speed is found to a rounding of v0, and of d/v_in. A push that is not constant adds O(d).
+    np.testing.assert_allclose(first.v_in[:, 0], speeds, rtol=64 * eps + 1e-11)
+
 
 def test_speeds_whose_product_underflows_keep_their_sign():
     """Sundials #57. A ball that moves into the wall on which it starts has an impact at once, however slow it is."""
