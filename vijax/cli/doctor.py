@@ -143,6 +143,7 @@ def _checks() -> list[_Check]:
     Most of the time goes into reading kept programs, one for each quantity: threads read them side by side. The cell
     is computed without `sweep`, which loads xarray.
     """
+    import jax.numpy as jnp
     import numpy as np
 
     from vijax.batch import simulate
@@ -157,7 +158,7 @@ def _checks() -> list[_Check]:
         return float(2 * np.asarray(impacts.n)[15] + np.asarray(impacts.t)[15])
 
     def power() -> float:
-        device, one = Harvester(), np.ones(1)
+        device, one = Harvester(), jnp.ones(1)
         scale = simulate.Scale(device.length_unit * one, device.speed_unit * one, one, one)
         pair = ImpactPair(0.2 * one, 12.65 * one, 0.5 * one, 0.0 * one)
         return float(np.asarray(simulate.summarise(pair, START[0] * one, START[1] * one, scale, device).P)[0, 0])

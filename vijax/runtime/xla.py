@@ -122,7 +122,8 @@ def kernel_failure() -> str:
 
     program = jax.jit(marked, compiler_options=compiler_options(brief=True))
     try:
-        made = program.lower(jax.ShapeDtypeStruct((4,), jnp.float32)).compile().runtime_executable().serialize()
+        executable: Any = program.lower(jax.ShapeDtypeStruct((4,), jnp.float32)).compile().runtime_executable()
+        made = executable.serialize()
     except Exception as error:  # whatever a later JAX raises here, planes can be computed without kernels
         return f"XLA rejects the mark of kernels: {str(error).partition(chr(10))[0][:200]}"
     # JAX keeps this program too; read back, it has the names of kernels, not of the parts of XLA that made them.
