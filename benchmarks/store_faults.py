@@ -384,8 +384,11 @@ def run(
     def machine() -> StoreMachine:
         return StoreMachine(stores, taken)
 
+    start: Any = (
+        machine if seed is None else hypothesis.seed(seed)(machine)
+    )  # not a class, as its type says: it is called
     run_state_machine_as_test(
-        machine if seed is None else hypothesis.seed(seed)(machine),
+        start,
         settings=hypothesis.settings(
             max_examples=runs,
             stateful_step_count=steps,
