@@ -26,6 +26,7 @@ else
 fi
 "$python" -m venv "$environment"
 export PATH="$PWD/$environment/bin:$PATH"
+python --version
 # Python compiles a module when it first imports it; pip would compile ten thousand, of which most are never imported.
 export PYTHONDONTWRITEBYTECODE=
 python -m pip install --quiet --no-compile "${versions[@]}" --editable '.[test]'

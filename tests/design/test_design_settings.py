@@ -1,6 +1,7 @@
 """Settings of a design: each of them is read, none is taken that cannot be."""
 
 import dataclasses
+import inspect
 from functools import cache
 
 import jax
@@ -120,7 +121,7 @@ def test_every_setting_has_a_sentence_and_is_changed_here():
     fields = [field.name for field in dataclasses.fields(DesignSettings)]
     # Those of aperiodic motion are changed where such designs are tested.
     assert sorted(fields) == sorted([*CHANGED, "same_optimum", *ELSEWHERE])
-    assert [name for name in fields if f"\n        {name}: " not in (DesignSettings.__doc__ or "")] == []
+    assert [name for name in fields if f"\n    {name}: " not in inspect.getdoc(DesignSettings)] == []
 
 
 @pytest.mark.parametrize("name", CHANGED)

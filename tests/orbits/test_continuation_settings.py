@@ -1,6 +1,7 @@
 """Settings of a continuation: each of them is read, none is taken that cannot be."""
 
 import dataclasses
+import inspect
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ def told(start, **settings):
 def test_every_setting_has_a_sentence_and_is_changed_here():
     fields = [field.name for field in dataclasses.fields(ContinuationSettings)]
     assert fields == list(CHANGED)
-    assert [name for name in fields if f"\n        {name}: " not in (ContinuationSettings.__doc__ or "")] == []
+    assert [name for name in fields if f"\n    {name}: " not in inspect.getdoc(ContinuationSettings)] == []
 
 
 @pytest.mark.parametrize("name", CHANGED)
