@@ -25,13 +25,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-KINDS = ("level", "inclined", "two walls", "harmonics")
+import vijax
+
+CELLS = 72  # along each axis: a million impacts of every kind
+PLANES: dict[str, dict[str, Any]] = {
+    "level": {},
+    "inclined": {"gamma": 0.1},
+    "two walls": {"kappa_right": 40.0},
+    "harmonics": {"excitation": vijax.Harmonics([1.0, 0.3])},
+}
 VARIANTS: dict[str, dict[str, str]] = {
     "as shipped": {},
     "optimisation off": {"XLA_FLAGS": "--xla_backend_optimization_level=0"},
     "kernels off": {"VIJAX_KERNELS": "0"},
 }
-CELLS = 72  # along each axis: a million impacts of every kind
 LABEL = ("period", "impacts_left", "impacts_right", "status")
 OUTPUTS = [*LABEL, "P", "P_stderr", "periods_run", "impacts_per_period"]
 MOST_LABELS, MOST_PERIODIC, MOST_APERIODIC = 1e-3, 1e-9, 1.2
@@ -41,7 +48,7 @@ class Row(NamedTuple):
     """How a variant differs from the options that users get.
 
     Attributes:
-        kind: One of `KINDS`.
+        kind: One of `PLANES`.
         variant: One of `VARIANTS`.
         impacts: Number of impacts that the variant computed.
         cells: Number of cells.
@@ -67,16 +74,9 @@ class Row(NamedTuple):
 
 def plane(kind: str, cells: int) -> dict[str, np.ndarray]:
     """Compute the plane of a kind with the options of this process; arrays by name, [cell]."""
-    import vijax
-
-    kappa = np.geomspace(4, 300, cells)
-    settings: dict[str, dict[str, Any]] = {
-        "level": {"kappa": kappa},
-        "inclined": {"kappa": kappa, "gamma": 0.1},
-        "two walls": {"kappa_left": kappa, "kappa_right": 40.0},
-        "harmonics": {"kappa": kappa, "excitation": vijax.Harmonics([1.0, 0.3])},
-    }
-    found = vijax.sweep(d=np.linspace(0.05, 0.35, cells), r=0.5, outputs=OUTPUTS, **settings[kind])
+    stiffness: dict[str, Any] = {"kappa_left" if kind == "two walls" else "kappa": np.geomspace(4, 300, cells)}
+    axes: dict[str, Any] = {"d": np.linspace(0.05, 0.35, cells), "r": 0.5}
+    found = vijax.sweep(**axes, **stiffness, outputs=OUTPUTS, **PLANES[kind])
     return {name: np.ravel(found[name].values) for name in OUTPUTS}
 
 
@@ -121,7 +121,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=description, epilog=details, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--only", nargs="+", choices=KINDS, default=KINDS, metavar="KIND")
+    parser.add_argument("--only", nargs="+", choices=PLANES, default=list(PLANES), metavar="KIND")
     parser.add_argument("--cells", type=int, default=CELLS, help="cells along each axis (default: %(default)s)")
     parser.add_argument("--compute", help=argparse.SUPPRESS)  # what a process of its own does: a plane, to a file
     options = parser.parse_args()

@@ -384,9 +384,8 @@ def run(
     def machine() -> StoreMachine:
         return StoreMachine(stores, taken)
 
-    start: Any = (
-        machine if seed is None else hypothesis.seed(seed)(machine)
-    )  # not a class, as its type says: it is called
+    # The type of the argument is a class; a function that makes a machine serves as well.
+    start: Any = machine if seed is None else hypothesis.seed(seed)(machine)
     run_state_machine_as_test(
         start,
         settings=hypothesis.settings(

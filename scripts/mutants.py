@@ -52,7 +52,6 @@ _SYMMETRIC = {
     "getattr",
     "setattr",
 }
-_COPIED = ("vijax", "tests", "benchmarks", "scripts", "docs", ".ci")
 _FAILED = 1  # pytest's exit status when a test failed; others mean that the change was noticed before any test ran
 
 

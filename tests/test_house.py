@@ -203,7 +203,6 @@ def test_a_room_of_plots_is_loaded_when_it_is_asked_for():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-@pytest.mark.long
 def test_import_is_quick():
     # Time of the process, as other tests use the cores. The first import compiles bytecode; what else is slower comes
     # from the load of the machine, which both have if they run in turn.

@@ -152,7 +152,6 @@ def test_the_wheel_alone_asks_for_all_that_it_imports(installed, tmp_path):
     assert {"jax", "matplotlib", "vijax"} < set(asked)
 
 
-@pytest.mark.long
 def test_types_reach_a_user_of_the_wheel(installed, tmp_path):
     (tmp_path / "user.py").write_text(USER)
     (tmp_path / "mistakes.py").write_text(MISTAKES)

@@ -10,7 +10,6 @@ from tests.helpers import cases
 
 
 # The other kinds take a minute and more: `python tests/annotations/tour.py` is the whole tour.
-@pytest.mark.long
 @pytest.mark.parametrize("kind", cases(["planes", "motions", "orbits"], long=("motions", "orbits")))
 def test_annotations_are_true_of_a_run(kind):
     tour = Path(__file__).parent / "tour.py"

@@ -172,7 +172,6 @@ def wide():
     return summarise(wide_cells(240), 400, variants=ALONE)
 
 
-@pytest.mark.long
 def test_a_cell_with_few_impacts_runs_on_as_a_longer_run_does(wide):
     """Up to 16 times the periods, until the window has 200 impacts; with fewer than 100 the status says so."""
     for periods in (1600, 6400):

@@ -19,7 +19,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.long
 def test_a_map_is_run_and_its_curves_are_written_three_ways(folder, capsys):
     assert script.main([*PLANE, "--max-rounds", "0"]) == 0
     said = capsys.readouterr().out
@@ -46,7 +45,6 @@ def stopped(dataset, **budget):
 SEARCH = map_curves.bifurcation_curves
 
 
-@pytest.mark.long
 def test_ctrl_c_keeps_what_was_found_and_says_so(folder, capsys, monkeypatch):
     assert grid.main([*PLANE, "--kappa", "400", "--out", "map.zarr"]) == 0
     monkeypatch.setattr(map_curves, "bifurcation_curves", stopped)

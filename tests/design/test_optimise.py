@@ -183,7 +183,6 @@ def test_a_supremum_is_no_maximum(found):
     assert all(one.height < found[0].best.height for one in ends)
 
 
-@pytest.mark.long
 def test_tolerances_of_a_design(found):
     best = found[0].best
     narrow = optimise.under(best, [Tolerance("omega0", 0.05)])
@@ -243,7 +242,6 @@ def test_what_only_your_limit_forbids_is_called_physical(found, depth, ratio, sa
     assert says in "\n".join(lines(describe(found[0], diagram=diagram)))
 
 
-@pytest.mark.long
 def test_the_worst_case_design_gives_up_nominal_power_for_it(found):
     tolerance = [Tolerance("omega0", 0.05)]
     robust = optimise.optimise(
@@ -303,8 +301,7 @@ WIDE = Harvester(
 )
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("device", "swept"), [(SHAKER, 27e-9), (WIDE, 21.6e-9)])
+@pytest.mark.parametrize(("device", "swept"), [pytest.param(SHAKER, 27e-9, marks=pytest.mark.long), (WIDE, 21.6e-9)])
 def test_in_a_wide_gap_a_design_gives_more_than_a_sweep(device, swept):
     # Most starts stay on slow aperiodic motion, which gives less the longer it lasts.
     best = optimise.optimise(device, survey_points=32, max_impacts=2).best

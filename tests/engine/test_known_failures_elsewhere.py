@@ -108,7 +108,6 @@ def largest_error(name: str, row: int, start: tuple) -> float:
 def test_events_are_taken_in_their_order_and_none_is_missed(name):
     """diffrax #639, CyRK #98, and starts on the surface."""
     found = {start: largest_error(name, row, of) for row, (start, of) in enumerate(STARTS.items())}
-    print(name, found)
     assert max(found.values()) < CASES[name].bound
 
 

@@ -199,8 +199,7 @@ def test_friction_takes_what_slides_and_mirror_images_stay_such():
 
 
 @pytest.mark.long
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["sticks once", "sticks each time"])
+@pytest.mark.parametrize("name", ["sticks once", pytest.param("sticks each time", marks=pytest.mark.long)])
 def test_derivatives_are_those_of_differences(name):
     d, kappa, r, gamma, friction, u0, v0, _ = CASES[name]
 

@@ -9,6 +9,7 @@ import pytest
 
 import vijax
 from benchmarks import criticality
+from tests.helpers import cases
 from vijax.orbits import curve_events, symmetry
 from vijax.orbits.continuation_settings import DEFAULT
 
@@ -19,7 +20,7 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=list(CASES))
+@pytest.fixture(scope="module", params=cases(CASES, long=("flip",)))
 def followed(request):
     """Follow a curve through its degenerate point; return the name and place of the point, and the curve."""
     kappa, gamma, plane, name, place = CASES[request.param]
@@ -51,7 +52,6 @@ def normal_form(kind, orbit, row=0):
     return criticality.normal_form(case)
 
 
-@pytest.mark.long
 def test_the_point_has_its_name_and_the_normal_form_changes_sign_there(followed):
     name, place, curve = followed
     (point,) = (point for point in curve.points if point.kind == name)
@@ -63,7 +63,6 @@ def test_the_point_has_its_name_and_the_normal_form_changes_sign_there(followed)
     assert abs(normal_form(curve.kind, point.orbit)) < 1e-6 * max(map(abs, sides))
 
 
-@pytest.mark.long
 def test_folds_of_the_orbits_that_begin_there_end_at_a_point_of_the_same_name(followed):
     name, _, curve = followed
     (point,) = (point for point in curve.points if point.kind == name)

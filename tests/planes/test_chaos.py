@@ -99,7 +99,6 @@ def test_the_share_of_survivors_never_rises(d, kappa, r):
     assert found.survival[0] > 0.9
 
 
-@pytest.mark.long
 def test_survivors_are_those_of_trajectories():
     """Chaos that ends on an orbit of period 3, after some 2000 periods; a motion is seen to be chaotic for 200 more."""
     d, kappa, r, starts, periods, ahead = 7.129, 23.5, 0.93, 160, 2000, 300

@@ -191,14 +191,14 @@ def test_without_kernels_the_same_comes_out(tmp_path):
 
 @pytest.fixture
 def measured_anew():
-    """Forget whether XLA makes kernels, and what was traced by it, before a test and after it."""
+    """Return what forgets whether XLA makes kernels, and what was traced by it; called before a test and after it."""
 
     def forget():
         xla.kernel_failure.cache_clear()
         jax.clear_caches()
 
     forget()
-    yield
+    yield forget
     forget()
 
 
@@ -212,18 +212,20 @@ def everything_is_kept():
 
 
 @ON_CPU
-@pytest.mark.parametrize("_", ["compiled", "read"])
-def test_kernels_are_used_where_xla_makes_them(measured_anew, everything_is_kept, _):
-    assert xla.kernel_failure() == ""
-    assert xla.uses_kernels()
+def test_kernels_are_used_where_xla_makes_them(measured_anew, everything_is_kept):
+    for _ in ("compiled", "read from the kept programs"):
+        measured_anew()
+        assert xla.kernel_failure() == ""
+        assert xla.uses_kernels()
 
 
 @ON_CPU
-@pytest.mark.parametrize("_", ["compiled", "read"])
-def test_without_a_known_mark_the_plain_form_is_traced(measured_anew, everything_is_kept, monkeypatch, _):
+def test_without_a_known_mark_the_plain_form_is_traced(measured_anew, everything_is_kept, monkeypatch):
     """A mark that XLA does not know stands for an XLA that no longer knows ours."""
     monkeypatch.setattr(xla, "_ONE_KERNEL", {"no_such_mark": "true"} | xla._STAYS)
-    assert xla.kernel_failure() == "XLA ignores the mark of kernels"
+    for _ in ("compiled", "read from the kept programs"):
+        measured_anew()
+        assert xla.kernel_failure() == "XLA ignores the mark of kernels"
     text = jax.jit(lambda x: kernel(several)(x)).lower(X).as_text()
     assert "no_such_mark" not in text
     assert "inlineable" not in text

@@ -169,7 +169,7 @@ def _checks() -> list[_Check]:
     return [
         _Check("time of the 16th impact at soft walls", 15.18805892317775144521, soft.result(), 1e-11),
         _Check("time of the 16th impact at rigid walls", 12.32561093526565372993, rigid.result(), 1e-11),
-        _Check("P of a periodic cell of a map [J]", 0.00411184436875454804, cell.result(), 1e-11),
+        _Check("P of a periodic cell [J]", 0.00411184436875454804, cell.result(), 1e-11),
     ]
 
 

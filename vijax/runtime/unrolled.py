@@ -108,8 +108,10 @@ def _along_first(rows: Rows) -> list[Rows]:
     return [rows[i, ...] for i in range(len(rows))]
 
 
-def _beyond(what: str) -> NotImplementedError:
-    return NotImplementedError(f"work that is unrolled must not {what}; what it may do vijax.runtime.unrolled lists")
+def _beyond(operation: str) -> NotImplementedError:
+    return NotImplementedError(
+        f"unrolled work must not {operation}; vijax.runtime.unrolled lists the operations it may use"
+    )
 
 
 def _of_rows(eqn: Any) -> dict[str, Any]:
