@@ -58,17 +58,22 @@ def test_a_draw_is_the_same_for_a_seed_and_has_every_kind():
         ast.parse("\n".join(lines))
 
 
-@pytest.mark.parametrize("noticed", [True, False])
-def test_a_mutant_is_caught_by_the_first_test_that_fails_and_is_undone(file, monkeypatch, tmp_path, noticed):
-    (tmp_path / "test_gap.py").write_text(
-        f"from gap import LIMIT\n\n\ndef test_limit():\n    assert {noticed} is (LIMIT == 3.0)\n"
-    )
+TESTS = {
+    "noticed": ("def test_limit():\n    assert LIMIT == 3.0\n", "FAILED test_gap.py::test_limit"),
+    "not noticed": ("def test_limit():\n    assert LIMIT > 3.0\n", ""),
+    "no test to run": ("", ""),
+}
+
+
+@pytest.mark.parametrize(("tests", "caught_by"), TESTS.values(), ids=TESTS)
+def test_a_mutant_is_caught_by_the_first_test_that_fails_and_is_undone(file, monkeypatch, tmp_path, tests, caught_by):
+    (tmp_path / "test_gap.py").write_text(f"from gap import LIMIT\n\n\n{tests}")
     (tmp_path / "test_more.py").write_text("def test_more():\n    pass\n")
     files = [DependentFile("test_gap.py", 1, 0.0), DependentFile("test_more.py", 2, 500.0)]
     monkeypatch.setattr(mutants, "dependent_files", lambda module: files)
     (mutant,) = [one for one in mutants.mutants(file) if one.line == 3]
     outcome = mutants.run(mutant, tmp_path, most_seconds=100.0)
-    assert outcome.caught_by == ("FAILED test_gap.py::test_limit" if noticed else "")
+    assert outcome.caught_by == caught_by
     assert outcome.files == 1
     assert file.read_text() == SOURCE
 
